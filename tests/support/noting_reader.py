@@ -52,10 +52,6 @@ class NotingReader(McapReader):
         self.asked.append((path, tuple(topics)))
         return super().records(path, topics, window, newest_first=newest_first)
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        self.asked.append((path, (topic,)))
-        return super().newest(path, topic, window)
-
 
 def fail_reading(
     monkeypatch: pytest.MonkeyPatch, way: str, error_of: Callable[[Path], Exception | None]

@@ -151,17 +151,6 @@ class BagDirReader(BagReader):
 
         return chain.from_iterable(opened())
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the latest message that counts in this recording.
-
-        Raises:
-            BagError: as the adapter, or the path leads out of the bag directory.
-        """
-        found = self._located(path)
-        if self._rule(found, [topic], window) is not None:
-            return super().newest(found, topic, window)
-        return self._reader.newest(found, topic, window)
-
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that the file declares."""
         return self._reader.channels(self._located(path))

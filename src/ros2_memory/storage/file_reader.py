@@ -257,11 +257,6 @@ class FileReader(BagReader):
 
         return map(partial(raise_if_lost, path), found())
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the latest message of the topic inside the window."""
-        with reading(path), self._open(path) as opened:
-            return opened.bags.newest(opened.path, topic, window)
-
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file."""
         with reading(path), self._open(path) as opened:

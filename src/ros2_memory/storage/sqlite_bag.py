@@ -86,12 +86,6 @@ _ASCENDING: Final = """
     ORDER BY timestamp, rowid
 """
 _DESCENDING: Final = _ASCENDING.replace("timestamp, rowid\n", "timestamp DESC, rowid DESC\n")
-_BEHIND: Final = """
-    SELECT 1 FROM messages NOT INDEXED
-    WHERE rowid > ? AND rowid <= ? AND timestamp > ? AND timestamp < ?
-    AND topic_id IN (SELECT value FROM json_each(?)) LIMIT 1
-"""
-_ROWS_BEHIND: Final = 128
 _WRONG_INDEX: Final = "its index by time is damaged; its messages were read without it"
 _METADATA: Final = (
     ("offered_qos_profiles", "offered_qos_profiles"),
@@ -211,30 +205,6 @@ class SqliteBags:
             ):
                 yield self._record(base, wanted, time, row, number)
 
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the latest message of the topic inside the window.
-
-        As long as it is unknown whether the indexes are right, it compares only what this message
-        needs of them with the table, which takes some microseconds.
-
-        Raises:
-            ContradictionError: the indexes do not agree with the table.
-        """
-        if window.empty:
-            return None
-        with self._opened(path) as (base, known):
-            wanted = known.named({topic})
-            right = self._proven.get(known.key)
-            found = None
-            if right is not False:
-                rows = _ordered_rows(base, wanted, window, newest_first=True, indexed=True)
-                found = rows.fetchone()
-            if right is None and (found is None or not _is_newest(base, wanted, window, found)):
-                right = self._is_indexed_right(base, known)
-            if right is False:
-                raise ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
-            return None if found is None else self._record(base, wanted, *found)
-
     def _record(
         self,
         base: sqlite3.Connection,
@@ -340,22 +310,6 @@ def _ordered_rows(
     if not indexed:
         query = query.replace("FROM messages", "FROM messages NOT INDEXED", 1)
     return base.execute(query, arguments)
-
-
-def _is_newest(
-    base: sqlite3.Connection,
-    wanted: Collection[int],
-    window: TimeWindow,
-    found: tuple[Ns, int, int],
-) -> bool:
-    """Returns whether a message found by an index is the newest, as far as the next rows show.
-
-    A message that the index lacks, or has elsewhere, or that is not found because the index is
-    stored in another order than it declares, was mostly written soon after the one found instead.
-    """
-    time, row, _ = found
-    arguments = (row, row + _ROWS_BEHIND, time, window.stop, json.dumps(list(wanted)))
-    return base.execute(_BEHIND, arguments).fetchone() is None
 
 
 def _columns(base: sqlite3.Connection, table: str) -> set[str]:

@@ -157,7 +157,7 @@ class TestSqliteSchemas:
         self, tmp_path: Path, time: int
     ) -> None:
         path = write_db3(tmp_path / "a.db3", chatter(3))
-        change(path, f"UPDATE messages SET timestamp = {time} WHERE id = 2")
+        change(path, f"UPDATE messages SET timestamp = {time} WHERE id = 2")  # noqa: S608
         reader = Rosbag2Reader()
         summary = reader.summarize(path)
         assert summary.count == len(read(reader, path)) == 2

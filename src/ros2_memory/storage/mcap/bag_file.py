@@ -1,7 +1,7 @@
 """Reads MCAP files: summaries, messages and log times.
 
 It is fast because it decompresses a chunk only for a message that is wanted, and takes log times
-and offsets from the message indexes (a cold point query takes 0.30 ms, with the `mcap` library
+and offsets from the message indexes (a cold point query takes 0.6 ms, with the `mcap` library
 13.5 ms; `python -m benchmarks` measures both). It finds every message because it falls back to the
 messages themselves where the indexes of a file are missing or wrong (see `mcap.index`).
 """
@@ -57,6 +57,7 @@ from ros2_memory.storage.mcap.bulk import (
 from ros2_memory.storage.mcap.chunk import (
     NO_MESSAGES,
     NOT_THERE,
+    Chunk,
     Column,
     declarations_of,
     joined,
@@ -65,13 +66,11 @@ from ros2_memory.storage.mcap.chunk import (
 )
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
-    Chunk,
     DoubtError,
     McapIndex,
     chunk_columns,
     chunk_data,
     index_from_summary,
-    require_channels,
 )
 from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
@@ -94,9 +93,8 @@ _LARGE_BYTES: Final = 8 << 20
 _REASONS_BYTES: Final = 1 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
-_NAMED: Final = -1
-_COMPARED: Final = -2
-"""In place of a channel: the channels of a chunk, or all its indexes, were found right."""
+_COMPARED: Final = -1
+"""In place of a channel: all indexes of a chunk were found right."""
 _YES: Final = NO_MESSAGES
 _NEXT_BUT_ONE: Final = 2
 
@@ -230,10 +228,9 @@ class McapBags:
                 index = self._distrust(file, error)
                 yield ContradictionError(index.contradiction, window.start, window.stop - 1)
                 wanted = _wanted(index, topics)
-                for chunk in index.chunks:
-                    if _overlaps(chunk, window):
-                        before = passed.get(chunk.offset)
-                        yield from self._batches_of_chunk(file, chunk, wanted, window, before)
+                for chunk in _with_any(index, wanted, window):
+                    before = passed.get(chunk.offset)
+                    yield from self._batches_of_chunk(file, chunk, wanted, window, before)
 
     def _divided(
         self,
@@ -251,15 +248,13 @@ class McapBags:
         divided = _Divided([], [], [])
         if wanted:
             self._require_beside(file, index, window)
-        for chunk in index.chunks if wanted else ():
-            if not _overlaps(chunk, window):
-                continue
+        for chunk in _with_any(index, wanted, window):
             if chunk.index_places is None:
                 divided.alone.append(chunk)
-            elif not chunk.channels.isdisjoint(read) or self._has_any(file, chunk, read):
-                divided.together.append(chunk)
-            elif not chunk.channels.isdisjoint(wanted):
+            elif chunk.channels.isdisjoint(read):
                 divided.unread.append(chunk)
+            else:
+                divided.together.append(chunk)
         return divided
 
     def _batches(
@@ -328,8 +323,6 @@ class McapBags:
             _ContradictedError: the indexes of the chunk do not agree with its records; then nothing
                 was yielded.
         """
-        if not self._has_any(file, chunk, wanted):
-            return
         try:
             with as_unreadable():
                 data = self._chunk_data(file, chunk)
@@ -346,54 +339,6 @@ class McapBags:
             column = Column(column.times[new], column.places[new])
         if column.times.size:
             yield from batches_of_chunk(chunk, data, column, wanted, self._uncompressed)
-
-    def newest(self, path: Path, topic: str, window: TimeWindow) -> Record | None:
-        """Returns the latest message of the topic inside the window.
-
-        It is the first that `records` yields with `newest_first`. Most questions about a point
-        in time ask for it, and merging runs would double its cost from a warm cache (18 to 41 us).
-        """
-        if window.empty:
-            return None
-        with OpenFile(path) as file:
-            index = self._index(file)
-            if index.contradiction:
-                raise ContradictionError(index.contradiction, window.start, window.stop - 1)
-            if index.loose:
-                runs = self._runs(file, index, {topic}, window, newest_first=True)
-                first = next(merged(runs, newest_first=True), None)
-                if isinstance(first, LostError):
-                    raise first
-                return first
-            return self._newest_in_chunks(file, index, _wanted(index, {topic}), window)
-
-    def _newest_in_chunks(
-        self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
-    ) -> Record | None:
-        if not wanted:
-            return None
-        chunks = [each for each in index.chunks if _overlaps(each, window)]
-        chunks.sort(key=attrgetter("end"), reverse=True)
-        best: tuple[Ns, int, int, bytes] | None = None
-        for chunk in chunks:
-            if best is not None and chunk.end < best[0]:
-                break
-            if not self._has_any(file, chunk, wanted):
-                continue
-            data = self._chunk_data(file, chunk)
-            for column in self._chunk_columns(file, chunk, wanted, data):
-                times, places = column.between(window.start, window.stop)
-                if times.size:
-                    found = int(times[-1]), chunk.offset, int(places[-1]), data
-                    best = found if best is None else max(best, found)
-        is_covered = best is not None and best[1] == chunks[0].offset
-        if not is_covered or chunks[0].end < window.stop - 1:
-            since = window.start if best is None else best[0]
-            self._require_beside(file, index, TimeWindow(since, window.stop))
-        if best is None:
-            return None
-        time, _, place, data = best
-        return _fetch_from_chunk(data, wanted, self._uncompressed)(place, time)
 
     def _runs(
         self,
@@ -439,7 +384,9 @@ class McapBags:
                 fetch = partial(fetch_large, chunk)
             return _rows(column, fetch, newest_first=newest_first)
 
-        for chunk in self._chunks_with(file, index, wanted, window):
+        if wanted:
+            self._require_beside(file, index, window)
+        for chunk in _with_any(index, wanted, window):
             yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
         column = _loose(index, wanted, window)
         if column.times.size:
@@ -460,6 +407,8 @@ class McapBags:
             index = index_from_summary(file)
         except DoubtError as doubt:
             index = index_by_scan(file, self._limit, str(doubt))
+        except UnreadableError as error:
+            return self._distrust(file, error)
         return self._cache_index(file, index)
 
     def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
@@ -483,39 +432,6 @@ class McapBags:
             return LostError(reason, first, last)
         times = joined([each.between(window.start, window.stop) for each in columns]).times
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
-
-    def _chunks_with(
-        self, file: OpenFile, index: McapIndex, wanted: Collection[int], window: TimeWindow
-    ) -> Iterator[Chunk]:
-        """Yields the chunks that overlap the window and have messages of one of the channels.
-
-        Raises:
-            _ContradictedError: a chunk index names other channels or times than its chunk has.
-        """
-        if wanted:
-            self._require_beside(file, index, window)
-        for chunk in index.chunks if wanted else ():
-            if _overlaps(chunk, window) and self._has_any(file, chunk, wanted):
-                yield chunk
-
-    def _has_any(self, file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> bool:
-        """Returns whether a chunk has messages of one of the channels.
-
-        Before it believes the chunk index that one of them is not there, it looks at the message
-        indexes behind the chunk.
-
-        Raises:
-            _ContradictedError: the chunk index names other channels than the message indexes.
-        """
-        if chunk.index_places is not None and not chunk.channels.issuperset(wanted):
-            key = file.key, chunk.offset, _NAMED
-            if self._indexes.get(key) is None:
-                try:
-                    require_channels(file, chunk)
-                except (UnreadableError, struct.error) as error:
-                    raise _ContradictedError(reason_of(error)) from error
-                self._indexes.put(key, _YES, _YES.memory_bytes)
-        return not chunk.channels.isdisjoint(wanted)
 
     def _chunk_columns(
         self, file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes | None
@@ -599,7 +515,6 @@ class McapBags:
         left = _VERIFIED_BYTES
         try:
             for chunk in index.chunks:
-                self._has_any(file, chunk, index.channels)
                 nth = bisect_left(ends, chunk.start)
                 is_end = nth < len(ends) and ends[nth] <= chunk.end
                 if chunk.index_places is None or not (is_end or chunk.offset in looked_at):
@@ -618,7 +533,7 @@ class McapBags:
             return self._distrust(file, error)
         return index
 
-    def _distrust(self, file: OpenFile, error: _ContradictedError) -> McapIndex:
+    def _distrust(self, file: OpenFile, error: UnreadableError) -> McapIndex:
         """Returns an index of the messages themselves, in place of one that was found wrong."""
         reason = f"{error}; {READ_WITHOUT_INDEXES}"
         # Kept apart from the index: not every read that follows would find it out again.
@@ -673,8 +588,11 @@ def _loose(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Col
     return joined([column.between(window.start, window.stop) for column in loose])
 
 
-def _overlaps(chunk: Chunk, window: TimeWindow) -> bool:
-    return chunk.start < window.stop and chunk.end >= window.start
+def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
+    """Yields the chunks that overlap the window and have messages of one of the channels."""
+    for chunk in index.chunks:
+        if window.overlaps(chunk.start, chunk.end) and not chunk.channels.isdisjoint(wanted):
+            yield chunk
 
 
 def _beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
@@ -718,8 +636,7 @@ def _overlooked(
     known = {chunk.offset: chunk for chunk in believed.chunks}
     chunks = [
         chunk
-        for chunk in index.chunks
-        if _overlaps(chunk, passed) and not chunk.channels.isdisjoint(wanted)
+        for chunk in _with_any(index, wanted, passed)
         if not _describes(known.get(chunk.offset), chunk)
     ]
     if not chunks:

@@ -20,8 +20,17 @@ from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask
-from ros2_memory.storage.errors import MAX_CHUNK_MESSAGES, SizeLimit, UnreadableError
-from ros2_memory.storage.mcap.chunk import NOT_THERE, Column, chunk_head, decompressed_chunk
+from ros2_memory.storage.errors import SizeLimit, UnreadableError
+from ros2_memory.storage.mcap.chunk import (
+    NOT_THERE,
+    Chunk,
+    Column,
+    Pairs,
+    chunk_head,
+    decompressed_chunk,
+    index_groups,
+    pairs_in,
+)
 from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
 
@@ -30,21 +39,12 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.file_io import OpenFile
-    from ros2_memory.storage.mcap.index import Chunk
 
 MAX_GROUP_CHUNKS: Final = 4096
-_OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
-_OUTSIDE: Final = "damaged: a chunk holds messages outside its stated times"
 _TWICE: Final = "damaged: a message index holds a message twice"
 
-_INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
 _MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _UINT32: Final = np.dtype("<u4")
-_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
-_INDEX: Final = np.dtype(
-    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
-)
-_PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 _MESSAGE: Final = np.dtype(
     [
         ("opcode", "u1"),
@@ -157,71 +157,6 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
-class _Pairs(NamedTuple):
-    """What message indexes hold: for each message its channel, log time, offset and chunk."""
-
-    channels: IntArray
-    times: IntArray
-    offsets: IntArray
-    chunks: IntArray
-
-
-def _pairs(chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: IntArray) -> _Pairs:
-    """Returns the messages of the `wanted` channels (ascending) by the indexes of these chunks.
-
-    Raises:
-        UnreadableError: the indexes are not those that the chunk indexes name.
-    """
-    region = b"".join(indexes)
-    stated = np.frombuffer(b"".join([chunk.index_places or b"" for chunk in chunks]), _OFFSET)
-    if not stated.size:
-        raise UnreadableError(_OTHER_INDEX)
-    number = np.repeat(
-        np.arange(len(chunks)), [len(chunk.index_places or b"") // 10 for chunk in chunks]
-    )
-    ends = np.cumsum([len(index) for index in indexes])
-    begins = ends - [len(index) for index in indexes]
-    behind = np.array([chunk.offset + chunk.length for chunk in chunks])
-    at = stated["at"] - (behind - begins)[number]
-    if at.min() < 0 or at.max() + _INDEX.itemsize > len(region):
-        raise UnreadableError(_OTHER_INDEX)
-    heads = gathered(region, _INDEX, at)
-    sizes = heads["size"].astype(np.int64)
-    after = at + _INDEX.itemsize + sizes
-    order = np.argsort(at)
-    if (
-        (heads["opcode"] != _INDEX_OPCODE).any()
-        or (heads["channel"] != stated["channel"]).any()
-        or (heads["length"] != sizes + 6).any()
-        or (sizes % _PAIR.itemsize).any()
-        or sizes.max() > MAX_CHUNK_MESSAGES * _PAIR.itemsize
-        or (at < begins[number]).any()
-        or (after > ends[number]).any()
-        # Together they fill what lies behind the chunks: there is no other index.
-        or at[order[0]] != 0
-        or after[order[-1]] != len(region)
-        or (at[order[1:]] != after[order[:-1]]).any()
-    ):
-        raise UnreadableError(_OTHER_INDEX)
-    channels = heads["channel"].astype(np.int64)
-    kept = np.isin(channels, wanted, kind="sort") & (sizes > 0)
-    counts = sizes[kept] // _PAIR.itemsize
-    total = int(counts.sum())
-    before = np.cumsum(counts) - counts
-    pairs_at = np.repeat(at[kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
-    pairs_at += np.arange(total) * _PAIR.itemsize
-    pairs = gathered(region, _PAIR, pairs_at)
-    times = np.ascontiguousarray(pairs["time"])
-    chunk_of = np.repeat(number[kept], counts)
-    starts = np.array([chunk.start for chunk in chunks])[chunk_of]
-    stops = np.array([chunk.end for chunk in chunks])[chunk_of]
-    if total and ((times < starts) | (times > stops) | (times < 0) | (times >= MAX_NS)).any():
-        raise UnreadableError(_OUTSIDE)
-    return _Pairs(
-        np.repeat(channels[kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
-    )
-
-
 def batches_of(
     content: ReadChunks,
     channels: Mapping[int, Channel],
@@ -241,7 +176,7 @@ def batches_of(
             chunk.
     """
     buffer = content.buffer or b""
-    pairs = _pairs(content.chunks, content.indexes, np.array(sorted(channels), np.int64))
+    pairs = pairs_in(content.chunks, content.indexes, channels)
     if not pairs.times.size:
         return ()
     sizes = np.array(content.sizes)
@@ -294,7 +229,7 @@ def batches_of(
     return found
 
 
-def _in_window(pairs: _Pairs, window: TimeWindow) -> IntArray:
+def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
     """Returns the positions of the messages inside a window, channel by channel."""
     order: IntArray = np.argsort(pairs.channels, kind="stable")
     inside = (pairs.times >= window.start) & (pairs.times < window.stop)
@@ -385,10 +320,8 @@ def bare_batches(
     Raises:
         UnreadableError: the indexes are not those that the chunk indexes name.
     """
-    for begin in range(0, len(chunks), MAX_GROUP_CHUNKS):
-        group = chunks[begin : begin + MAX_GROUP_CHUNKS]
-        indexes = [file.read(chunk.offset + chunk.length, chunk.index_length) for chunk in group]
-        pairs = _pairs(group, indexes, np.array(sorted(channels), np.int64))
+    for group, indexes in index_groups(file, chunks):
+        pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
         steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
         of, times, places = pairs.channels[order], pairs.times[order], pairs.offsets[order] + steps

@@ -10,16 +10,17 @@ import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
-from functools import lru_cache
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # has no types
 import numpy as np
 from mcap.opcode import Opcode
 
+from ros2_memory.core.arrays import gathered
 from ros2_memory.core.large_reads import LARGE_BYTES
-from ros2_memory.core.timebase import MAX_NS
+from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.errors import (
+    MAX_CHANNELS,
     MAX_CHUNK_DECLARATIONS,
     MAX_CHUNK_MESSAGES,
     MAX_CHUNKS,
@@ -41,22 +42,23 @@ from ros2_memory.storage.mcap.records import (
 from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
+    from ros2_memory.storage.base import IntArray
     from ros2_memory.storage.file_io import OpenFile
 
-Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 
-_INDEX_HEAD: Final = struct.Struct("<BQHI")
+INDEX_HEAD: Final = struct.Struct("<BQHI")
 """A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
-_INDEX_HEAD_BYTES: Final = _INDEX_HEAD.size
-_index_head: Final = _INDEX_HEAD.unpack_from
-_PAIR_BYTES: Final = 16
-_MESSAGE_INDEX: Final = int(Opcode.MESSAGE_INDEX)
-_NO_INDEX: Final = "damaged: a message index is not where its chunk index says"
+_INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
-_LONG_INDEX: Final = "damaged: a message index holds more than a chunk can"
-_IMPOSSIBLE_TIMES: Final = "damaged: a message index holds impossible log times"
+OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
+INDEX_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
+"""In a chunk index: where in the file a channel's message index is."""
+_INDEX: Final = np.dtype(
+    [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
+)
+_PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MESSAGE_OPCODE: Final = bytes((Opcode.MESSAGE,))
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
@@ -66,13 +68,9 @@ _LOG_TIME_AT: Final = 15
 """Where these fields lie in a message record."""
 _UINT16: Final = np.dtype("<u2")
 _INT64: Final = np.dtype("<i8")
-_UINT64: Final = np.dtype("<u8")
 _EVERY_BYTE: Final = (1,)
-_EVERY_PAIR: Final = (_PAIR_BYTES,)
-_FEW: Final = 100
-"""Up to so many log times are sooner unpacked by struct than by numpy."""
-_EMPTY: Final[Ints] = np.zeros(0, dtype=np.int64)
-_ZERO: Final[Ints] = np.zeros(1, dtype=np.int64)
+_EMPTY: Final[IntArray] = np.zeros(0, dtype=np.int64)
+_ZERO: Final[IntArray] = np.zeros(1, dtype=np.int64)
 
 
 class Column(NamedTuple):
@@ -81,8 +79,8 @@ class Column(NamedTuple):
     `places` are the offsets of the message records, in the file or in the decompressed chunk.
     """
 
-    times: Ints
-    places: Ints
+    times: IntArray
+    places: IntArray
 
     @property
     def memory_bytes(self) -> int:
@@ -90,7 +88,7 @@ class Column(NamedTuple):
         return 2 * self.times.nbytes + 300
 
     @classmethod
-    def of(cls, times: Ints, places: Ints) -> Column:
+    def of(cls, times: IntArray, places: IntArray) -> Column:
         """Returns a sorted column, without log times that do not fit into 64 signed bits."""
         if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
             order = np.lexsort((places, times))
@@ -128,23 +126,121 @@ def joined(columns: list[Column]) -> Column:
     return Column(times[order], places[order])
 
 
-def columns_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Column]:
-    """Returns the columns of the message indexes of one chunk.
+class Chunk(NamedTuple):
+    """One chunk of a file (a tuple: indexing a week makes millions).
 
-    Args:
-        region: the bytes behind the chunk, where its message indexes lie.
-        offsets: where each channel's record begins in the file.
-        base: where the region begins in the file.
+    Attributes:
+        offset: where its record begins in the file.
+        length: bytes of its record.
+        start: the earliest log time in it.
+        end: the latest log time in it, inclusive.
+        channels: the channels that have messages in it.
+        index_places: the offsets of its message indexes, as they are written in the file; None if
+            there are none to rely on.
+        index_length: bytes of its message indexes, which follow it.
+        usable: how many of its decompressed bytes are whole records, if the file ends inside it.
     """
-    columns: dict[int, Column] = {}
-    for channel, offset in offsets.items():
-        at, count = _index_at(region, channel, offset - base)
-        pairs = np.frombuffer(region, "<i8", 2 * count, at).reshape(-1, 2)
-        column = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
-        if column.times.size != count:
-            raise UnreadableError(_IMPOSSIBLE_TIMES)
-        columns[channel] = column
-    return columns
+
+    offset: int
+    length: int
+    start: Ns
+    end: Ns
+    channels: frozenset[int]
+    index_places: bytes | None = None
+    index_length: int = 0
+    usable: int | None = None
+
+
+class Pairs(NamedTuple):
+    """What message indexes hold: for each message its channel, log time, offset and chunk."""
+
+    channels: IntArray
+    times: IntArray
+    offsets: IntArray
+    chunks: IntArray
+
+
+def pairs_in(
+    chunks: Sequence[Chunk], indexes: Sequence[bytes], wanted: Collection[int] | None = None
+) -> Pairs:
+    """Returns the messages of the `wanted` channels, or of all, by the indexes of these chunks.
+
+    Raises:
+        UnreadableError: the indexes are not those that the chunk indexes name, or have other times.
+    """
+    region = b"".join(indexes)
+    stated = np.frombuffer(b"".join([chunk.index_places or b"" for chunk in chunks]), INDEX_OFFSET)
+    if not stated.size:
+        raise UnreadableError(_OTHER_INDEX)
+    places = [len(chunk.index_places or b"") // INDEX_OFFSET.itemsize for chunk in chunks]
+    number = np.repeat(np.arange(len(chunks)), places)
+    ends = np.cumsum([len(index) for index in indexes])
+    begins = ends - [len(index) for index in indexes]
+    behind = np.array([chunk.offset + chunk.length for chunk in chunks])
+    at = stated["at"] - (behind - begins)[number]
+    if at.min() < 0 or at.max() + _INDEX.itemsize > len(region):
+        raise UnreadableError(_OTHER_INDEX)
+    heads = gathered(region, _INDEX, at)
+    sizes = heads["size"].astype(np.int64)
+    after = at + _INDEX.itemsize + sizes
+    order = np.argsort(at)
+    if (
+        (heads["opcode"] != _INDEX_OPCODE).any()
+        or (heads["channel"] != stated["channel"]).any()
+        or (heads["length"] != sizes + 6).any()
+        or (sizes % _PAIR.itemsize).any()
+        or sizes.max() > MAX_CHUNK_MESSAGES * _PAIR.itemsize
+        or (at < begins[number]).any()
+        or (after > ends[number]).any()
+        # Together they fill what lies behind the chunks: there is no other index.
+        or at[order[0]] != 0
+        or after[order[-1]] != len(region)
+        or (at[order[1:]] != after[order[:-1]]).any()
+    ):
+        raise UnreadableError(_OTHER_INDEX)
+    channels = heads["channel"].astype(np.int64)
+    kept = sizes > 0
+    if wanted is not None:
+        kept &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
+    counts = sizes[kept] // _PAIR.itemsize
+    total = int(counts.sum())
+    before = np.cumsum(counts) - counts
+    pairs_at = np.repeat(at[kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
+    pairs_at += np.arange(total) * _PAIR.itemsize
+    pairs = gathered(region, _PAIR, pairs_at)
+    times = np.ascontiguousarray(pairs["time"])
+    chunk_of = np.repeat(number[kept], counts)
+    starts = np.array([chunk.start for chunk in chunks])[chunk_of]
+    stops = np.array([chunk.end for chunk in chunks])[chunk_of]
+    if total and ((times < starts) | (times > stops) | (times < 0) | (times >= MAX_NS)).any():
+        raise UnreadableError(OUTSIDE)
+    return Pairs(
+        np.repeat(channels[kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
+    )
+
+
+def index_bytes(indexes: int, messages: int) -> int:
+    """Returns the bytes of so many message indexes with so many messages in all."""
+    return indexes * _INDEX.itemsize + messages * _PAIR.itemsize
+
+
+def index_groups(
+    file: OpenFile, chunks: Sequence[Chunk]
+) -> Iterator[tuple[Sequence[Chunk], list[bytes]]]:
+    """Yields chunks with the bytes of the message indexes behind each, some MB at a time.
+
+    Raises:
+        UnreadableError: an index is larger than it can be.
+    """
+    begin = size = 0
+    for nth, chunk in enumerate(chunks):
+        if chunk.index_length > index_bytes(MAX_CHANNELS, MAX_CHUNK_MESSAGES):
+            raise UnreadableError(_OTHER_INDEX)
+        size += chunk.index_length
+        if size > LARGE_BYTES or nth == len(chunks) - 1:
+            group = chunks[begin : nth + 1]
+            yield group, [file.read(each.offset + each.length, each.index_length) for each in group]
+            begin, size = nth + 1, 0
 
 
 def require_indexed(data: bytes, channel: int, column: Column) -> None:
@@ -229,72 +325,6 @@ class Extent:
     count: int
     first: int
     last: int
-
-
-def extents_from_index(region: bytes, offsets: Mapping[int, int], base: int) -> dict[int, Extent]:
-    """Returns what `columns_from_index` would amount to, for channels with messages."""
-    extents: dict[int, Extent] = {}
-    messages = 0
-    for channel, offset in offsets.items():
-        pairs_at, count = _index_at(region, channel, offset - base)
-        messages += count
-        if count > _FEW:
-            column = np.ndarray(count, _UINT64, region, pairs_at, _EVERY_PAIR)
-            first, last = int(column.min()), int(column.max())
-        elif count:
-            times = _log_times_of(count)(region, pairs_at)
-            first, last = min(times), max(times)
-        else:
-            continue
-        if last >= MAX_NS:
-            raise UnreadableError(_IMPOSSIBLE_TIMES)
-        extents[channel] = Extent(count, first, last)
-    if index_bytes(len(offsets), messages) != len(region):
-        raise UnreadableError("damaged: a chunk has message indexes that its chunk index lacks")
-    return extents
-
-
-def indexed_channels(region: bytes) -> frozenset[int]:
-    """Returns the channels whose message indexes lie in these bytes behind a chunk.
-
-    Not by `section_records`, since it is called for every chunk: indexing would be 10 % slower.
-    """
-    channels = []
-    at, size = 0, len(region)
-    while at < size:
-        if at + _INDEX_HEAD_BYTES > size:
-            raise UnreadableError(_NO_INDEX)
-        opcode, length, number, _ = _index_head(region, at)
-        if opcode != _MESSAGE_INDEX:
-            raise UnreadableError(_NO_INDEX)
-        channels.append(number)
-        at += RECORD.size + length
-    return frozenset(channels)
-
-
-def index_bytes(indexes: int, messages: int) -> int:
-    """Returns the bytes of so many message indexes with so many messages in all."""
-    return indexes * _INDEX_HEAD_BYTES + messages * _PAIR_BYTES
-
-
-@lru_cache(_FEW)
-def _log_times_of(count: int) -> Callable[[bytes, int], tuple[int, ...]]:
-    """Returns what unpacks the log times of `count` pairs: 50 of 330 us of a cold point query."""
-    return struct.Struct("<" + "Q8x" * count).unpack_from
-
-
-def _index_at(region: bytes, channel: int, at: int) -> tuple[int, int]:
-    """Returns where the pairs of log time and offset of a message index begin, and how many."""
-    pairs_at = at + _INDEX_HEAD_BYTES
-    if at < 0 or pairs_at > len(region):
-        raise UnreadableError(_NO_INDEX)
-    opcode, length, number, size = _index_head(region, at)
-    if opcode != _MESSAGE_INDEX or number != channel or length != size + 6 or size % _PAIR_BYTES:
-        raise UnreadableError(_OTHER_INDEX)
-    count = size // _PAIR_BYTES
-    if count > MAX_CHUNK_MESSAGES or pairs_at + size > len(region):
-        raise UnreadableError(_LONG_INDEX)
-    return pairs_at, count
 
 
 @dataclass(slots=True)

@@ -12,7 +12,7 @@ import struct
 import zlib
 from functools import lru_cache
 from itertools import pairwise
-from operator import attrgetter, itemgetter, le
+from operator import itemgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -28,17 +28,22 @@ from ros2_memory.storage.errors import (
     MAX_SECTION_BYTES,
     SizeLimit,
     UnreadableError,
+    as_unreadable,
     reason_of,
 )
 from ros2_memory.storage.mcap.chunk import (
+    INDEX_HEAD,
+    INDEX_OFFSET,
+    OUTSIDE,
+    Chunk,
     Column,
     Extent,
-    columns_from_index,
+    Pairs,
     decompressed_chunk,
     decompressed_prefix,
-    extents_from_index,
     index_bytes,
-    indexed_channels,
+    index_groups,
+    pairs_in,
     read_compressed_chunk,
 )
 from ros2_memory.storage.mcap.records import (
@@ -55,14 +60,12 @@ if TYPE_CHECKING:
 
     from mcap.records import Statistics
 
-    from ros2_memory.storage.base import Channel
+    from ros2_memory.storage.base import Channel, IntArray
     from ros2_memory.storage.file_io import OpenFile
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
-INDEX_OFFSET_BYTES: Final = _INDEX_OFFSET.size
-"""Bytes of a chunk index for the place of one channel's message index."""
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
 _MAX_CACHED_BYTES: Final = 128 << 10
@@ -71,36 +74,6 @@ _MAX_CACHED_BYTES: Final = 128 << 10
 _DECLARES: Final = frozenset((int(Opcode.SCHEMA), int(Opcode.CHANNEL)))
 _CHUNK_INDEX_OPCODE: Final = int(Opcode.CHUNK_INDEX)
 _STATISTICS_OPCODE: Final = int(Opcode.STATISTICS)
-
-
-class Chunk(NamedTuple):
-    """One chunk of a file (a tuple: indexing a week makes millions).
-
-    Attributes:
-        offset: where its record begins in the file.
-        length: bytes of its record.
-        start: the earliest log time in it.
-        end: the latest log time in it, inclusive.
-        channels: the channels that have messages in it.
-        index_places: the offsets of its message indexes, as they are written in the file; None if
-            there are none to rely on.
-        index_length: bytes of its message indexes, which follow it.
-        usable: how many of its decompressed bytes are whole records, if the file ends inside it.
-    """
-
-    offset: int
-    length: int
-    start: Ns
-    end: Ns
-    channels: frozenset[int]
-    index_places: bytes | None = None
-    index_length: int = 0
-    usable: int | None = None
-
-    @property
-    def index_offsets(self) -> dict[int, int]:
-        """Where each channel's message index lies in the file."""
-        return dict(_INDEX_OFFSET.iter_unpack(self.index_places or b""))
 
 
 class DoubtError(UnreadableError):
@@ -173,11 +146,11 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
     start, last, offset, length, places_size = _CHUNK_INDEX.unpack_from(section, at)
     at += _CHUNK_INDEX.size
     stop = at + places_size
-    if stop + _INDEX_LENGTH.size > end or places_size % INDEX_OFFSET_BYTES:
+    if stop + _INDEX_LENGTH.size > end or places_size % INDEX_OFFSET.itemsize:
         raise UnreadableError("damaged: a chunk index is shorter than it states")
     places = section[at:stop]
     # Slices with a step take the low and the high byte of every channel number at once.
-    channels = _numbers(places[::INDEX_OFFSET_BYTES], places[1::INDEX_OFFSET_BYTES])
+    channels = _numbers(places[:: INDEX_OFFSET.itemsize], places[1 :: INDEX_OFFSET.itemsize])
     (index_length,) = _INDEX_LENGTH.unpack_from(section, stop)
     # Past the function that takes the fields of a named tuple: it costs as much as all the rest.
     return _new_tuple(Chunk, (offset, length, start, last, channels, places, index_length, None))
@@ -202,7 +175,6 @@ _CHUNK: Final = int(Opcode.CHUNK)
 _INDEXED: Final = frozenset((_CHUNK, int(Opcode.MESSAGE_INDEX)))
 _OTHER_CHUNKS: Final = "its chunk indexes do not agree with its chunks"
 OTHER_DECLARED: Final = "its summary section declares other channels or types than its messages"
-_OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
 _STATED: Final = struct.Struct("<BQQQ")
 """A chunk record up to its times: opcode, length, first and last log time."""
 _STATED_BYTES: Final = _STATED.size
@@ -212,8 +184,6 @@ _SEAM_TIMES: Final = 4
 _SEAM_CHUNKS: Final = 3
 _MOST_SEAMS: Final = 8
 _stating: Final = _STATED.pack
-_NEVER: Final = 1 << 64
-"""Later than any time that a file can state."""
 
 
 class Seam(NamedTuple):
@@ -274,76 +244,70 @@ class McapIndex(NamedTuple):
 def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
     """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
 
-    Raises:
-        UnreadableError: the indexes are damaged, or disagree with the times that the chunk states.
-    """
-    offsets = {number: at for number, at in chunk.index_offsets.items() if number in wanted}
-    region, base = _index_region(file, chunk), chunk.offset + chunk.length
-    every = extents_from_index(region, chunk.index_offsets, base).values()
-    first, last = min([each.first for each in every]), max([each.last for each in every])
-    if (first, last) != (chunk.start, chunk.end):
-        raise UnreadableError(_OUTSIDE)
-    return columns_from_index(region, offsets, base)
-
-
-def require_channels(file: OpenFile, chunk: Chunk) -> None:
-    """Compares the channels that a chunk index names with the message indexes behind the chunk.
+    All indexes of the file were found right together (`index_from_summary`).
 
     Raises:
-        UnreadableError: they differ.
+        UnreadableError, ValueError: they have changed.
     """
-    if indexed_channels(_index_region(file, chunk)) != chunk.channels:
-        raise UnreadableError(
-            "damaged: a chunk index names other channels than have messages in its chunk"
+    base = chunk.offset + chunk.length
+    region = file.read(base, chunk.index_length)
+    columns: dict[int, Column] = {}
+    for number, offset in _INDEX_OFFSET.iter_unpack(chunk.index_places or b""):
+        if number in wanted:
+            _, _, _, size = INDEX_HEAD.unpack_from(region, offset - base)
+            at = offset - base + INDEX_HEAD.size
+            pairs = np.frombuffer(region, "<i8", size // 8, at).reshape(-1, 2)
+            columns[number] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+    return columns
+
+
+class _Contents:
+    """What the message indexes of a file hold, added some chunks at a time."""
+
+    def __init__(self) -> None:
+        self.totals: dict[int, Extent] = {}
+        self.back: Ns = 0  # as `set_back` of `McapIndex`, however little
+        self._held: list[tuple[IntArray, IntArray]] = []
+
+    def add(self, chunks: Sequence[Chunk], pairs: Pairs) -> None:
+        """Adds all messages of chunks, which follow those before in the file.
+
+        Raises:
+            UnreadableError: a chunk states other times than its messages have.
+        """
+        starts = np.array([chunk.start for chunk in chunks])
+        ends = np.array([chunk.end for chunk in chunks])
+        begins = np.searchsorted(pairs.chunks, np.arange(len(chunks)))
+        firsts = np.minimum.reduceat(pairs.times, begins)
+        lasts = np.maximum.reduceat(pairs.times, begins)
+        if not (np.array_equal(firsts, starts) and np.array_equal(lasts, ends)):
+            raise UnreadableError(OUTSIDE)
+        # Of a short chunk its bounds will do.
+        is_long = ends - starts > SHORTEST_PAUSE_NS
+        inside = pairs.times[is_long[pairs.chunks]]
+        self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
+        order = np.argsort(pairs.channels, kind="stable")
+        numbers, of, times = pairs.channels[order], pairs.chunks[order], pairs.times[order]
+        is_other = (numbers[1:] != numbers[:-1]) | (of[1:] != of[:-1])
+        parts = np.append(0, np.flatnonzero(is_other) + 1)
+        rows = zip(
+            numbers[parts].tolist(),
+            np.diff(parts, append=numbers.size).tolist(),
+            np.minimum.reduceat(times, parts).tolist(),
+            np.maximum.reduceat(times, parts).tolist(),
+            strict=True,
         )
+        for number, count, first, last in rows:
+            known = self.totals.get(number)
+            if known is not None:
+                self.back = max(self.back, known.last - first)
+            _add(self.totals, number, Extent(count, first, last))
 
-
-def _chunk_extents(file: OpenFile, chunk: Chunk) -> dict[int, Extent]:
-    """Returns what `chunk_columns` would amount to, without sorting."""
-    offsets, base = chunk.index_offsets, chunk.offset + chunk.length
-    extents = extents_from_index(_index_region(file, chunk), offsets, base)
-    start, end = chunk.start, chunk.end
-    for each in extents.values():
-        if not start <= each.first <= each.last <= end:
-            raise UnreadableError(_OUTSIDE)
-    return extents
-
-
-def _set_back(file: OpenFile, chunks: Sequence[Chunk]) -> Ns:
-    """Returns `McapIndex.set_back` for chunks with message indexes, in the order of writing.
-
-    Chunks that overlap do not prove it: some writers sort channels into chunks.
-    """
-    latest = -1
-    for chunk in chunks:
-        if chunk.start < latest - OUT_OF_ORDER_NS:
-            break
-        latest = max(latest, chunk.end)
-    else:
-        return 0
-    most: Ns = 0
-    lasts: dict[int, Ns] = {}
-    for chunk in chunks:
-        for channel, extent in _chunk_extents(file, chunk).items():
-            before = lasts.get(channel, extent.first)
-            most = max(most, before - extent.first)
-            lasts[channel] = max(before, extent.last)
-    return beyond_disorder(most)
-
-
-def _pauses(file: OpenFile, chunks: Sequence[Chunk]) -> Pauses:
-    """Returns `McapIndex.pauses`; reads the indexes of those chunks alone that may have one."""
-    firsts = np.array([chunk.start for chunk in chunks], np.int64)
-    lasts = np.array([chunk.end for chunk in chunks], np.int64)
-    is_long = lasts - firsts > SHORTEST_PAUSE_NS
-    inside = [
-        column.times
-        for nth in np.flatnonzero(is_long).tolist()
-        for column in chunk_columns(file, chunks[nth], chunks[nth].channels).values()
-    ]
-    return pauses_among(
-        np.concatenate([firsts[~is_long], *inside]), np.concatenate([lasts[~is_long], *inside])
-    )
+    @property
+    def pauses(self) -> Pauses:
+        """As `pauses` of `McapIndex`."""
+        firsts, lasts = zip(*self._held, strict=True)
+        return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
 
 
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
@@ -372,12 +336,6 @@ def beyond_disorder(back: Ns) -> Ns:
     return back if back > OUT_OF_ORDER_NS else 0
 
 
-def _index_region(file: OpenFile, chunk: Chunk) -> bytes:
-    if chunk.index_length > MAX_SECTION_BYTES:
-        raise UnreadableError("damaged: a message index is larger than any chunk")
-    return file.read(chunk.offset + chunk.length, chunk.index_length)
-
-
 def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     """Returns the decompressed records of a chunk; see `decompressed_chunk`.
 
@@ -392,20 +350,37 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
 
 
 def index_from_summary(file: OpenFile) -> McapIndex:
-    """Returns the index that the summary section gives.
+    """Returns the index that the summary section and the message indexes give.
 
     Raises:
-        DoubtError: the index is missing or unreliable; the file must be scanned.
+        DoubtError: the summary section is missing or unreliable; the file must be scanned.
+        UnreadableError: a message index is not what the summary section says.
     """
     try:
-        return _index_from_summary(file)
+        index, stated = _index_from_summary(file)
     except (DoubtError, OSError):
         raise
     except Exception as error:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
+    if not index.chunks:
+        return index
+    found = _Contents()
+    with as_unreadable():
+        for group, regions in index_groups(file, index.chunks):
+            found.add(group, pairs_in(group, regions))
+    if found.totals.keys() != stated.channel_message_counts.keys():
+        raise DoubtError
+    return index._replace(
+        totals=found.totals,
+        notes=disagreements(stated, found.totals),
+        set_back=beyond_disorder(found.back),
+        pauses=found.pauses,
+        seams=_seams(index.chunks),
+    )
 
 
-def _index_from_summary(file: OpenFile) -> McapIndex:
+def _index_from_summary(file: OpenFile) -> tuple[McapIndex, Statistics]:
+    """Returns the index without what its messages amount to, and what the file states of that."""
     start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
         raise DoubtError
@@ -422,26 +397,11 @@ def _index_from_summary(file: OpenFile) -> McapIndex:
         _require_chunks_as_indexed(file, start, chunks)
     if not _agrees(stated, chunks, filled):
         raise DoubtError
-    indexes = sum([len(chunk.index_places or b"") for chunk in filled]) // INDEX_OFFSET_BYTES
+    indexes = sum([len(chunk.index_places or b"") for chunk in filled]) // INDEX_OFFSET.itemsize
     index_length = sum([chunk.index_length for chunk in filled])
     if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
-    totals = _totals_of(file, filled, counts)
-    if totals.keys() != counts.keys() or any(each.first == _NEVER for each in totals.values()):
-        raise DoubtError
-    notes = disagreements(stated, totals)
-    back = _set_back(file, filled)
-    return McapIndex(
-        channels,
-        channel_bytes,
-        tuple(filled),
-        totals,
-        notes=notes,
-        set_back=back,
-        pauses=_pauses(file, filled),
-        seams=_seams(filled),
-        declared=declared,
-    )
+    return McapIndex(channels, channel_bytes, tuple(filled), {}, declared=declared), stated
 
 
 def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
@@ -497,46 +457,6 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
         return False
     # The messages of a chunk that ends before it begins would be in no window.
     return all(map(le, starts, ends))
-
-
-def _totals_of(
-    file: OpenFile, chunks: Sequence[Chunk], counts: Mapping[int, int]
-) -> dict[int, Extent]:
-    """Returns exact totals by channel, from the message indexes of chunks that hold messages.
-
-    Reads the indexes of only those chunks that can hold the earliest or the latest message of a
-    channel: to read all of them takes 25 ms instead of 5 in a file of 400 chunks.
-
-    Args:
-        file: the open file.
-        chunks: its chunks that hold messages.
-        counts: the messages of each channel that has some.
-    """
-    totals = {channel: Extent(0, _NEVER, -1) for channel in counts}
-    read: set[int] = set()
-    unknown = list(counts)
-    for chunk in sorted(chunks, key=attrgetter("start")):
-        unknown = [each for each in unknown if totals[each].first > chunk.start]
-        if not unknown:
-            break
-        if not chunk.channels.isdisjoint(unknown):
-            _add_extents(file, chunk, totals)
-            read.add(chunk.offset)
-    unknown = list(counts)
-    for chunk in sorted(chunks, key=attrgetter("end"), reverse=True):
-        unknown = [each for each in unknown if totals[each].last < chunk.end]
-        if not unknown:
-            break
-        if chunk.offset not in read and not chunk.channels.isdisjoint(unknown):
-            _add_extents(file, chunk, totals)
-    for channel, total in totals.items():
-        total.count = counts.get(channel, 0)
-    return totals
-
-
-def _add_extents(file: OpenFile, chunk: Chunk, totals: dict[int, Extent]) -> None:
-    for channel, extent in _chunk_extents(file, chunk).items():
-        _add(totals, channel, extent)
 
 
 def add_column(totals: dict[int, Extent], channel: int, column: Column) -> None:

@@ -19,10 +19,16 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import Closing, IntArray
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
-from ros2_memory.storage.mcap.chunk import ChunkContent, ChunkOpener, Column, Extent, column_of
+from ros2_memory.storage.mcap.chunk import (
+    Chunk,
+    ChunkContent,
+    ChunkOpener,
+    Column,
+    Extent,
+    column_of,
+)
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
-    Chunk,
     McapIndex,
     add_column,
     beyond_disorder,
