@@ -30,11 +30,6 @@ def quaternion(x: float, y: float, z: float, w: float) -> object:
     return bags.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
 
 
-def pose_stamped(orientation: object, position: object) -> object:
-    pose = bags.make("geometry_msgs/msg/Pose", position=position, orientation=orientation)
-    return bags.make("geometry_msgs/msg/PoseStamped", header=bags.header(NS, "map"), pose=pose)
-
-
 def test_the_pose_of_odometry_is_in_its_headers_frame_and_its_twist_in_the_childs() -> None:
     assert EXTRACTOR.pose(odometry(), ODOMETRY) == Pose(
         (1.23456, -2.0, 0.0), (0.0, 0.0, math.sin(0.25), math.cos(0.25)), "odom"
@@ -105,14 +100,6 @@ def test_what_carries_no_pose_has_none(message: object, type_name: str) -> None:
     assert EXTRACTOR.pose(message, type_name) is None
 
 
-def test_an_acceleration_is_no_twist() -> None:
-    accel = bags.make(
-        "geometry_msgs/msg/Accel", linear=bags.vector3(1.0), angular=bags.vector3(0.0)
-    )
-    assert EXTRACTOR.twist(accel, "geometry_msgs/msg/Accel") is None
-    assert EXTRACTOR.twist({"angular_velocity": {"x": 0}}, "sensor_msgs/msg/Imu") is None
-
-
 def test_a_point_is_a_pose_without_orientation() -> None:
     point = bags.make(
         "geometry_msgs/msg/PointStamped", header=bags.header(NS, "map"), point=bags.point(1.0, 2.0)
@@ -161,8 +148,3 @@ def test_transforms_that_tf_refuses_are_left_out() -> None:
     left = EXTRACTOR.transforms(message, NS, static=False)
     # an edge without a parent is part of what was recorded, though no lookup goes through it
     assert [edge.child for edge in left] == ["b", "base_link"]
-
-
-@pytest.mark.parametrize("message", [None, {"transforms": 3}, {"transforms": [1, None]}, "x"])
-def test_what_is_no_tf_message_has_no_transforms(message: object) -> None:
-    assert EXTRACTOR.transforms(message, NS, static=False) == ()

@@ -36,6 +36,7 @@ from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.directories import mode_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.storage.base import BAG_KINDS, COMPRESSED
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -73,9 +74,6 @@ OWN_FILES: Final = frozenset({HEARTBEAT_FILE, QOS_FILE, STORAGE_FILE})
 """Files in the bag directory itself that may be deleted: the recorder writes them again."""
 RECORDING_FILES: Final = frozenset({METADATA_FILE, HANDOVER_FILE, THINNED_NAME})
 """Files beside the bags of a recording, which mean nothing without them."""
-BAG_KINDS: Final = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-"""Suffixes of bag files, whichever adapter reads them."""
-COMPRESSED: Final = ".zstd"
 
 _TIME_FORMAT: Final = "%Y%m%dT%H%M%SZ"
 _DAY_FILE: Final = re.compile(r"\d{8}(?:-\d+)?\.thinned\.mcap")

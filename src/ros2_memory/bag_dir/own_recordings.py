@@ -44,7 +44,6 @@ from ros2_memory.bag_dir.durable_write import (
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
-    COMPRESSED,
     LIST_FILE,
     bag_kind,
     has_own_name,
@@ -54,6 +53,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core.directories import Identity, identity_of, known_identity
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.storage.base import COMPRESSED
 
 if TYPE_CHECKING:
     from collections.abc import (

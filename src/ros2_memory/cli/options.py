@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias, get_args
 import typer
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import BAG_KINDS, METADATA_FILE, bag_kind, has_recorded
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, has_recorded
 from ros2_memory.bag_dir.own_recordings import folders_with_bags
 from ros2_memory.cli.output import print_json, spinner, with_local_times
 from ros2_memory.config import NullRecorderNode, Settings, is_deployment_chosen, load_explained
@@ -40,6 +40,7 @@ from ros2_memory.core.timebase import (
     unix_from_text,
     window_end_s,
 )
+from ros2_memory.storage.base import BAG_KINDS
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.bag_dir.layout import COMPRESSED, other_form
+from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from ros2_memory.storage.base import COMPRESSED, PLAIN_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -28,10 +29,6 @@ if TYPE_CHECKING:
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
-
-KINDS: Final = (".mcap", ".db3")
-"""A compressed bag may lie beside the file it was made from, and is classified with that."""
-
 
 Unchanged: TypeAlias = "dict[str, tuple[BagFile, int]]"
 """By path, the bag and the inode of closed files that do not change any more, or not since their
@@ -271,7 +268,8 @@ class BagTable:
             and found.bag is not None
             and found.aside is None
             and notes.trusted
-            and notes.kind in KINDS
+            # A compressed bag may lie beside the file it was made from.
+            and notes.kind in PLAIN_KINDS
             and notes.stamp.mtime_ns < context.now - max(context.three_splits, YOUNG_NS)
             and path not in self._watched
             and other_form(path) not in self._files
@@ -293,7 +291,7 @@ class BagTable:
         if not known:
             return []
         last = context.now - max(context.three_splits, YOUNG_NS)
-        kinds = tuple(kind for kind in KINDS if self._reader.reads(Path(f"bag{kind}")))
+        kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
         taken = []
         for path, stamp in [*stamps.items()]:

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
 
-from ros2_memory.bag_dir.layout import COMPRESSED
 from ros2_memory.columns.pack import is_large
 from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
@@ -25,7 +24,16 @@ from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
-from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
+from ros2_memory.storage.base import (
+    COMPRESSED,
+    BagReader,
+    Batch,
+    Channel,
+    Closing,
+    Definition,
+    Record,
+    Schema,
+)
 from ros2_memory.storage.cache import ByteLru, shared
 
 if TYPE_CHECKING:

@@ -27,7 +27,6 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
-    COMPRESSED,
     HANDOVER_FILE,
     METADATA_FILE,
     THINNED_FILE,
@@ -62,7 +61,7 @@ from ros2_memory.retention.repair import (
     replace_file,
     rewritten,
 )
-from ros2_memory.storage.base import BagReader, BagWriter, Closing
+from ros2_memory.storage.base import COMPRESSED, BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

@@ -13,10 +13,8 @@ from rosbags.interfaces import Nodetype
 from rosbags.serde.utils import SIZEMAP
 
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
-from ros2_memory.storage.base import BagReader, Batch, Channel, Definition, Record, batched
+from ros2_memory.storage.base import BagReader, Batch, Channel, Definition, Record
 from ros2_memory.storage.errors import LostError, UnreadableError, raise_if_lost, reading
-from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 from ros2_memory.typestore import MessageType, Typestores
 
@@ -27,7 +25,9 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import FieldDesc, Typesdict
 
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.model import TimeWindow
+    from ros2_memory.storage.mcap.bag_file import McapBags
     from ros2_memory.storage.sqlite_bag import SqliteBags
 
 _HEADER_BYTES: Final = 4
@@ -246,14 +246,7 @@ class FileReader(BagReader):
 
         def found() -> Iterator[Batch | LostError]:
             with reading(path), self._open(path) as opened:
-                bags, here = opened.bags, opened.path
-                if isinstance(bags, McapBags):
-                    yield from bags.batches(here, topics, window, bare)
-                else:
-                    if here.stat().st_size > LARGE_BYTES:
-                        self._large.acquire()
-                    records = bags.records(here, topics, window, newest_first=False)
-                    yield from batched(enumerate(records))
+                yield from opened.bags.batches(opened.path, topics, window, bare)
 
         return map(partial(raise_if_lost, path), found())
 

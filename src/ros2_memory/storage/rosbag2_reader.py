@@ -15,13 +15,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.storage.base import BAG_KINDS, COMPRESSED
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreachableError, UnreadableError, reading
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.file_reader import FileReader, OpenedBag
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.sqlite_bag import (
     SqliteBags,
-    closing_of_db3,
     copy_with_journal,
     journals_beside,
 )
@@ -146,9 +146,6 @@ def _disk_full(error: OSError) -> UnreachableError:
     )
 
 
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-
-
 class Rosbag2Reader(FileReader):
     """Reads `.mcap` and `.db3` files, also compressed as a whole (`.zstd`).
 
@@ -174,37 +171,39 @@ class Rosbag2Reader(FileReader):
     ) -> None:
         large = large or LargeReads()
         super().__init__(custom_msg_paths, large)
-        self._mcap = McapBags(cache_mb, max_chunk_mb, large)
-        self._sqlite = SqliteBags(max_chunk_mb, large)
+        self._formats: dict[str, McapBags | SqliteBags] = {
+            ".mcap": McapBags(cache_mb, max_chunk_mb, large),
+            ".db3": SqliteBags(max_chunk_mb, large),
+        }
         self._scratch = Scratch(unpack_max_mb << 20)
 
     def reads(self, path: Path) -> bool:
         """Returns whether the name ends with one of the four suffixes."""
-        return path.name.endswith(_SUFFIXES) and path.name not in _SUFFIXES
+        return path.name.endswith(BAG_KINDS) and path.name not in BAG_KINDS
 
     def closing(self, path: Path) -> Closing:
         """Checks closing magic for MCAP, journals beside a `.db3`, whole frames for `.zstd`."""
         with reading(path):
-            if path.suffix == ".zstd":
+            if path.suffix == COMPRESSED:
                 return closing_of_zstd(path)
-            return closing_of_db3(path) if path.suffix == ".db3" else self._mcap.closing(path)
+            return self._formats[path.suffix].closing(path)
 
     @contextmanager
     def _open(self, path: Path) -> Iterator[OpenedBag]:
         """Opens the file itself, or a temporary copy, decompressed or with its journal applied."""
-        plain = path.with_suffix("") if path.suffix == ".zstd" else path
-        bags = self._sqlite if plain.suffix == ".db3" else self._mcap
+        if not self.reads(path):
+            raise UnreadableError(f"not of a kind that is read ({', '.join(BAG_KINDS)})")
+        is_compressed = path.suffix == COMPRESSED
+        bags = self._formats[path.with_suffix("").suffix if is_compressed else path.suffix]
         sources = [path]
-        if path.suffix == ".zstd":
+        if is_compressed:
             fill = partial(unpack, path)
-        elif plain.suffix == ".db3" and journals_beside(path):
+        elif isinstance(bags, SqliteBags) and journals_beside(path):
             sources += journals_beside(path)
             fill = partial(copy_with_journal, path)
-        elif self.reads(path):
+        else:
             yield OpenedBag(bags, path, "")
             return
-        else:
-            raise UnreadableError(f"not of a kind that is read ({', '.join(_SUFFIXES)})")
         keys = []
         for source in sources:
             with OpenFile(source) as file:

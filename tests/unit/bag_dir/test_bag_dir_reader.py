@@ -21,7 +21,6 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.memories import memory_of
-from tests.support.noting_reader import NotingReader
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9
@@ -60,20 +59,6 @@ def counting(bag_dir: Path) -> Memory:
 def bumps(memory: Memory) -> int:
     rows = queries.list_recorded_topics(memory, Call())
     return next(row.count for row in rows if row.topic == "/bumper")
-
-
-def test_each_message_counts_on_its_side_of_the_cut(tmp_path: Path) -> None:
-    old, new = taken_over(tmp_path)
-    cut(tmp_path, T0 + 8 * S)
-    reader = BagDirReader(McapReader())
-    everything = TimeWindow.everything()
-    before = [record.publish_time for record in reader.records(old, ["/bumper"], everything)]
-    after = [record.publish_time for record in reader.records(new, ["/bumper"], everything)]
-    assert before == [T0 + n * S // 2 for n in range(16)]
-    assert after == [T0 + n * S // 2 for n in range(16, 40)]
-    summary = reader.summarize(new)
-    assert (summary.count, summary.start) == (24, T0 + 8 * S + LATE)
-    assert bumps(counting(tmp_path)) == 40
 
 
 def test_the_cut_counts_where_nothing_else_tells_copies_apart(tmp_path: Path) -> None:
@@ -160,27 +145,6 @@ def test_a_summary_states_what_a_reading_gives(tmp_path: Path, seed: int) -> Non
         (each.topic, each.type): (each.count, each.first, each.last)
         for each in reader.summarize(bag).topics
     } == {key: (len(times), times[0], times[-1]) for key, times in found.items()}
-
-
-def test_a_relative_path_has_its_sidecar_beside_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    old, _ = taken_over(tmp_path)
-    cut(tmp_path, T0 + 8 * S)
-    monkeypatch.chdir(old.parent)
-    assert BagDirReader(McapReader()).summarize(old.relative_to(old.parent)).count == 16
-
-
-EVER = TimeWindow.everything()
-
-
-def test_nothing_is_opened_before_the_first_message_is_asked_for(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(1, "first")])
-    adapter = NotingReader()
-    records = BagDirReader(adapter).records(path, ["/chatter"], EVER)
-    assert adapter.names == []
-    next(records)
-    assert adapter.names == ["rec_0.mcap"]
 
 
 def test_every_message_is_read_where_counts_are_compared_with_the_files(tmp_path: Path) -> None:

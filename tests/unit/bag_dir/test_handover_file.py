@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 
 import pytest
@@ -60,16 +59,6 @@ def excluded(handover: Handover, file: str, publish_time: int, log_time: int) ->
 
 
 class TestCounting:
-    def test_without_a_sidecar_everything_counts(self, tmp_path: Path) -> None:
-        handover, problem = read_handover(tmp_path)
-        assert problem is None
-        assert handover == Handover()
-        assert handover.exclusions("rec_1_0.mcap") == ()
-        assert not handover.hides_all
-
-    def test_a_file_that_was_not_open_in_an_overlap_counts_whole(self) -> None:
-        assert FULL.exclusions("rec_2_3.mcap") == ()
-
     def test_a_message_received_outside_the_overlap_counts_whenever_it_was_published(self) -> None:
         assert not excluded(FULL, "rec_2_0.mcap", 10, 899)
         assert not excluded(FULL, "rec_2_0.mcap", 10, 1_100)
@@ -80,10 +69,6 @@ class TestCounting:
         old = Handover(next="b", counts_until=50, end=Overlap(0, 101, ("a_9.mcap",)))
         assert not excluded(old, "a_9.mcap", 0, 49)
         assert excluded(old, "a_9.mcap", 0, 50)
-
-    @pytest.mark.parametrize("state", [Counting.PENDING, Counting.VOID])
-    def test_a_recording_that_did_not_take_over_counts_for_nothing(self, state: Counting) -> None:
-        assert Handover(state=state, previous="rec_1").hides_all
 
     @given(
         cut=st.integers(0, 100),
@@ -108,21 +93,6 @@ class TestFile:
         folder = tmp_path_factory.mktemp("recording")
         write_handover(folder, handover)
         assert read_handover(folder) == (handover, None)
-
-    def test_it_names_the_moments_it_counts_from_and_until(self, tmp_path: Path) -> None:
-        write_handover(tmp_path, FULL)
-        content = json.loads((tmp_path / HANDOVER_FILE).read_text())
-        assert content["counts_from_ns"] == 1_000
-        assert content["counts_until_ns"] == 9_000
-        assert (content["clock"], content["previous"], content["next"]) == (
-            "publish",
-            "rec_1",
-            "rec_3",
-        )
-
-    def test_one_that_cannot_be_written_is_told(self, tmp_path: Path) -> None:
-        with pytest.raises(RecorderError, match=r"handover\.json cannot be written"):
-            write_handover(tmp_path / "gone", FULL)
 
     @pytest.mark.parametrize(
         ("change", "reason"),
@@ -153,10 +123,6 @@ class TestFile:
         handover, problem = read_handover(tmp_path)
         assert handover == Handover()
         assert problem is not None
-
-    def test_a_fifo_in_its_place_is_not_waited_for(self, tmp_path: Path) -> None:
-        os.mkfifo(tmp_path / HANDOVER_FILE)
-        assert read_handover(tmp_path).problem is not None
 
     def test_a_pair_is_written_whole_or_not_at_all(self, tmp_path: Path) -> None:
         old, new = tmp_path / "old", tmp_path / "new"

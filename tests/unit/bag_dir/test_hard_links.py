@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -23,13 +22,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 S = 10**9
-
-
-def test_what_lies_in_no_moment_is_its_own_name(tmp_path: Path) -> None:
-    names = HardLinks(tmp_path)
-    assert names.recorded_as(f"{tmp_path}/moments/a/r/r_0.mcap") == f"{tmp_path}/r/r_0.mcap"
-    for path in (f"{tmp_path}/moments/x.mcap", f"{tmp_path}/a/moments/b/x.mcap"):
-        assert names.recorded_as(path) == path
 
 
 def keep(start: Start, moment: str, *splits: int) -> None:
@@ -113,13 +105,6 @@ class TestTheIndex:
         shutil.rmtree(start.bag_dir / "moments/one")
         assert len(index.refresh().bags) == 5
         assert index.refresh().bags == start.read().bags
-
-    def test_one_that_is_recorded_anew_under_its_name_is_another(self, start: Start) -> None:
-        keep(start, "one", 1)
-        recorded = start.bag_dir / "rec/rec_1.mcap"
-        shutil.copy(recorded, start.bag_dir / "copy")
-        (start.bag_dir / "copy").replace(recorded)
-        assert len(start.read().bags) == 7
 
 
 class TestOtherNames:

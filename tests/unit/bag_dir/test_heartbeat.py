@@ -91,37 +91,6 @@ def test_a_recorder_that_was_killed_is_not_live_any_more() -> None:
     assert process_of(process.pid) is None
 
 
-def test_a_heartbeat_that_cannot_be_written_says_where_and_why(tmp_path: Path) -> None:
-    with pytest.raises(RecorderError, match=r"recorder\.json cannot be written: No such file"):
-        write_heartbeat(tmp_path / "missing", BEAT)
-
-
-def test_without_a_file_the_reason_says_that_nobody_records(tmp_path: Path) -> None:
-    assert read_heartbeat(tmp_path) == (
-        None,
-        "there is no recorder.json: no recorder has written here",
-    )
-
-
-@pytest.mark.parametrize(
-    ("content", "reason"),
-    [
-        (b"{", "not a valid heartbeat"),
-        (b"[]", "not a JSON object"),
-        (b"[" * 100_000, "not a valid heartbeat"),
-        (b'{"pid": ' + b"9" * 5000 + b"}", "not a valid heartbeat"),
-        (b" " * 2_000_000, "larger than"),
-    ],
-)
-def test_a_file_that_is_no_heartbeat_is_told_apart(
-    tmp_path: Path, content: bytes, reason: str
-) -> None:
-    (tmp_path / HEARTBEAT_FILE).write_bytes(content)
-    read = read_heartbeat(tmp_path)
-    assert read.heartbeat is None
-    assert reason in (read.reason or "")
-
-
 @pytest.mark.parametrize(
     ("key", "value"),
     [

@@ -6,13 +6,6 @@ import re
 from pathlib import Path
 
 from ros2_memory.bag_dir.layout import (
-    HANDOVER_FILE,
-    LOCK_FILE,
-    METADATA_FILE,
-    OWN_FILES,
-    QOS_FILE,
-    STORAGE_FILE,
-    bag_kind,
     has_own_name,
     node_name,
     recording_name,
@@ -40,8 +33,3 @@ def test_each_recording_has_a_node_of_its_own_with_a_valid_name(tmp_path: Path) 
     names = [node_name("rec_20261120T050000Z"), node_name(recording_name(NOW, tmp_path))]
     assert len(set(names)) == 2
     assert all(re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", name) for name in names)
-
-
-def test_the_index_takes_none_of_it_for_a_bag() -> None:
-    names = {*OWN_FILES, HANDOVER_FILE, LOCK_FILE, METADATA_FILE, QOS_FILE, STORAGE_FILE}
-    assert [name for name in names if bag_kind(name)] == []

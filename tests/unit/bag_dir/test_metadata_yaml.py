@@ -86,10 +86,6 @@ def test_compressed_files_may_be_listed_under_either_name(deleted: str, listed: 
     assert left(given, {deleted: {"/a": 5}})["relative_file_paths"] == ["r_1.mcap.zstd"]
 
 
-def test_where_none_of_the_files_is_listed_nothing_is_written() -> None:
-    assert without(yaml.safe_dump(content()), {"other.mcap": {"/a": 5}}) is None
-
-
 @pytest.mark.parametrize(
     ("given", "gone", "reason"),
     [
@@ -109,22 +105,6 @@ def test_what_cannot_be_corrected_is_refused(
 ) -> None:
     with pytest.raises(ValueError, match=reason):
         without(yaml.safe_dump(given), gone)
-
-
-def test_what_is_no_yaml_is_refused() -> None:
-    with pytest.raises(ValueError, match="not YAML"):
-        without("[", {"r_0.mcap": {}})
-
-
-def test_a_recording_without_one_has_nothing_to_correct(tmp_path: Path) -> None:
-    assert not take_out(tmp_path, {"r_0.mcap": {}})
-
-
-def test_one_that_is_a_link_is_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").write_text(yaml.safe_dump(content()))
-    (tmp_path / "metadata.yaml").symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OSError, match="symbolic"):
-        take_out(tmp_path, {"r_0.mcap": {"/a": 5}})
 
 
 @needs_recorded

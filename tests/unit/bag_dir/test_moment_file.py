@@ -53,10 +53,6 @@ class TestLabels:
         assert bag_kind(name) is None
         assert len(name) < 64
 
-    def test_a_folder_is_called_by_time_and_label(self) -> None:
-        assert folder_name(request("Küche, 2. Stock")) == "20261120T050000Z-kuche-2-stock"
-        assert folder_name(request("充電")) == "20261120T050000Z-moment"
-
 
 class TestFolders:
     def test_two_of_one_label_and_second_have_their_own(self, tmp_path: Path) -> None:

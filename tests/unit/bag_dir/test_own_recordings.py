@@ -127,17 +127,6 @@ class TestWhatARecorderLists:
         assert longest <= 2 * 20
         assert all(own.owns(tmp_path / f"rec_{number}") for number in range(197, 200))
 
-    def test_entries_of_what_has_gone_are_dropped_at_a_start(self, tmp_path: Path) -> None:
-        for name in (A, B):
-            embedding(tmp_path / name / f"{name}_0.mcap", OURS)
-        own_all(tmp_path)
-        shutil.rmtree(tmp_path / A)
-        before = lines(tmp_path)[0]
-        claimed(tmp_path)
-        header, entry = lines(tmp_path)
-        assert header == before
-        assert entry["recording"] == B
-
     def test_two_programs_that_write_lose_nothing(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -192,12 +181,6 @@ class TestWhatAKillLeaves:
         [event] = events_named(logs, "recording_not_claimed")
         assert event["recording"] == A
         assert "ros2-memory adopt" in event["reason"]
-
-    def test_a_directory_without_a_byte_is_not_claimed(self, tmp_path: Path) -> None:
-        claimed(tmp_path).begin(A)
-        (tmp_path / A).mkdir()
-        (tmp_path / A / f"{A}_0.mcap").touch()
-        assert not claimed(tmp_path).owns(tmp_path / A)
 
     @settings(max_examples=examples(60), deadline=None)
     @given(cut=st.integers(0, 200), junk=st.sampled_from([b"", b"\0\0\0\0", b"{", b"[" * 5000]))
@@ -308,14 +291,6 @@ class TestCopies:
         own = claimed(tmp_path / "disk")
         assert not any(own.owns(tmp_path / "disk" / name) for name in (A, B))
 
-    def test_a_link_to_one_is_foreign(self, tmp_path: Path) -> None:
-        embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        own = own_all(tmp_path)
-        (tmp_path / A).rename(tmp_path / "elsewhere")
-        assert not own.owns(tmp_path / "elsewhere")
-        (tmp_path / A).symlink_to(tmp_path / "elsewhere")
-        assert not own.owns(tmp_path / A)
-
     def test_a_repaired_recording_stays_its_recorders(self, tmp_path: Path) -> None:
         path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
         own = own_all(tmp_path)
@@ -366,11 +341,6 @@ class TestBags:
         own.complete(name)
         own.note(name, {path.name for path in files}, ended=True)
         return claimed(bag_dir)
-
-    def test_those_that_its_child_made(self, tmp_path: Path) -> None:
-        own = self.made(tmp_path, A, 3)
-        assert all(own.owns_bag(tmp_path / A / f"{A}_{n}.mcap") for n in range(3))
-        assert own.owns_bag(tmp_path / A / f"{A}_0.mcap.zstd")
 
     @pytest.mark.parametrize(
         "name",
@@ -499,14 +469,6 @@ class TestEmbedded:
         known = found.index(OURS)
         assert found == [None] * known + [OURS] * (len(data) - known)
         assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
-
-    def test_a_second_metadata_record_is_found(self, tmp_path: Path) -> None:
-        path = embedding(tmp_path / "a" / "a_0.mcap", {"recorded_by": "x: y # 'z'"[:1]})
-        assert custom_data(path) == {"recorded_by": "x"}
-
-    def test_a_file_that_is_not_there_is_an_error(self, tmp_path: Path) -> None:
-        with pytest.raises(OSError, match="No such file"):
-            custom_data(tmp_path / "x.mcap")
 
     @settings(max_examples=examples(100), deadline=None)
     @given(at=st.integers(0, 400), value=st.integers(0, 255))

@@ -194,18 +194,3 @@ def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:
         assert stat.S_IMODE(answer.stat().st_mode) == 0o644
     finally:
         os.umask(before)
-
-
-def test_no_folder_is_made_where_the_bag_directory_is_away(tmp_path: Path) -> None:
-    away = tmp_path / "away"
-    RequestQueue(away).open()
-    with pytest.raises(OSError, match=r"\.episodic"):
-        asked(away)
-    assert not away.exists()
-    assert not RequestQueue(away).has_requests()
-
-
-def test_an_answer_that_is_none_is_not_believed(tmp_path: Path) -> None:
-    posted = asked(tmp_path)
-    (tmp_path / REQUESTS_FOLDER / f"{posted.request.number}.answer").write_text("[]")
-    assert posted.outcome() is None

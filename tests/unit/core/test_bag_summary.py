@@ -24,15 +24,6 @@ topics = st.builds(
 several = st.lists(topics, max_size=6, unique_by=lambda each: (each.topic, each.type)).map(tuple)
 
 
-@given(several)
-def test_topics_come_back_as_they_were_given(given_topics: tuple[TopicSummary, ...]) -> None:
-    summary = BagSummary(given_topics, ("/quiet",), False, ("odd",))
-    assert summary.topics == given_topics
-    assert (summary.silent, summary.complete, summary.notes) == (("/quiet",), False, ("odd",))
-    assert summary.count == sum(each.count for each in given_topics)
-    assert summary.empty == (not given_topics)
-
-
 @given(several.filter(bool))
 def test_a_summary_spans_its_topics_and_each_topic_its_types(
     given_topics: tuple[TopicSummary, ...],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import logging
-import warnings
 from collections import Counter
 from datetime import UTC, datetime
 from types import SimpleNamespace
@@ -99,19 +98,6 @@ def test_the_end_of_a_request_is_no_event_and_a_warning_of_its_library_is(
     assert [event["level"] for event in events(capsys)] == logged
 
 
-def test_warnings_have_the_same_shape(capsys: pytest.CaptureFixture[str]) -> None:
-    # Left on by another test, it would be taken for on here, where warnings go elsewhere.
-    logging.captureWarnings(capture=False)
-    configure_logging("info", "json")
-    with warnings.catch_warnings():
-        warnings.simplefilter("default")
-        logging.captureWarnings(capture=True)
-        warnings.warn("the disk is slow", UserWarning, stacklevel=1)
-    (event,) = events(capsys)
-    assert event["logger"] == "py.warnings"
-    assert "the disk is slow" in event["event"]
-
-
 def test_a_bound_correlation_id_joins_every_event(capsys: pytest.CaptureFixture[str]) -> None:
     configure_logging("info", "json")
     with structlog.contextvars.bound_contextvars(call_id="c1"):
@@ -119,14 +105,6 @@ def test_a_bound_correlation_id_joins_every_event(capsys: pytest.CaptureFixture[
         logging.getLogger("theirs").info("read")
     get_logger("ours").info("idle")
     assert [event.get("call_id") for event in events(capsys)] == ["c1", "c1", None]
-
-
-def test_events_below_the_level_are_left_out(capsys: pytest.CaptureFixture[str]) -> None:
-    configure_logging("warning", "json")
-    for log in (get_logger("ours"), logging.getLogger("theirs")):
-        log.info("small")
-        log.warning("large")
-    assert [event["event"] for event in events(capsys)] == ["large", "large"]
 
 
 @pytest.mark.parametrize("layout", ["json", "pretty"])
@@ -139,27 +117,6 @@ def test_an_exception_does_not_show_local_variables(
     assert out == ""
     assert "ValueError: bad bag" in err
     assert "hunter2" not in err
-
-
-def test_pretty_events_are_for_people_and_plain_without_a_terminal(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    configure_logging("debug", "pretty")
-    get_logger("ours").debug("read", bags=3)
-    out, err = capsys.readouterr()
-    assert out == ""
-    assert "read" in err
-    assert "bags=3" in err
-    assert "\x1b" not in err
-
-
-def test_a_second_configuration_replaces_the_first(capsys: pytest.CaptureFixture[str]) -> None:
-    log = get_logger("ours")
-    configure_logging("error", "json")
-    log.info("early")
-    configure_logging("info", "json")
-    log.info("late")
-    assert [event["event"] for event in events(capsys)] == ["late"]
 
 
 def test_withheld_warnings_are_counted_by_event_and_errors_are_shown(

@@ -43,18 +43,3 @@ def test_threads_share_a_heap_and_large_blocks_go_back(monkeypatch: pytest.Monke
         (m_trim_threshold, 65536),
         (0,),
     ]
-
-
-def test_a_library_without_these_functions_is_left_as_it_is(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    asked: list[str] = []
-
-    class Other:
-        def __getattr__(self, name: str) -> object:
-            asked.append(name)
-            raise AttributeError(name)
-
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: Other())
-    tell_all()
-    assert asked == ["mallopt", "mallopt", "mallopt", "malloc_trim"]

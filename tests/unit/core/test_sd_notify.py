@@ -51,14 +51,6 @@ def test_it_is_told_over_an_abstract_socket(
         assert listener.recv(100) == b"STOPPING=1\nSTATUS=over"
 
 
-@pytest.mark.parametrize("env", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "/nowhere/at/all"}])
-def test_where_nobody_listens_nothing_happens(
-    env: dict[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    set_only(monkeypatch, env)
-    assert not notify(READY)
-
-
 def test_it_is_told_twice_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
     set_only(monkeypatch, {"WATCHDOG_USEC": "30000000"})
     assert watchdog_interval_s() == 15

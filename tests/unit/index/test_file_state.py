@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.core.model import BagState
+from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.index.file_state import (
     RETRY_NS,
     Classification,
@@ -16,10 +15,8 @@ from ros2_memory.index.file_state import (
     FileState,
     ScanContext,
     classify,
-    files_in_metadata,
 )
 from ros2_memory.index.scan import Stamp
-from ros2_memory.storage.base import Closing
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 S = 10**9
@@ -90,19 +87,6 @@ def scan(tmp_path: Path) -> RepeatedScan:
     return RepeatedScan(tmp_path)
 
 
-def test_a_closed_bag_is_described_from_inside_and_outside(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = plain(tmp_path / "rec" / "rec_0.mcap", [30, 10, 20])
-    assert scan.run(path, age_s=100) is FileState.CLOSED
-    assert scan.classification is not None
-    bag = scan.classification.bag
-    assert bag is not None
-    assert (bag.path, bag.state, bag.start, bag.end) == (path, BagState.CLOSED, 10, 30)
-    assert (bag.size, bag.mtime_ns) == (path.stat().st_size, NOW - 100 * S)
-    assert not scan.is_watched()
-
-
 @pytest.mark.parametrize(
     ("age_s", "state"),
     [
@@ -155,19 +139,6 @@ def test_the_growth_of_a_file_is_not_that_of_the_one_put_in_its_place(
     assert scan.run(path, age_s=3600) is FileState.ACTIVE
     plain(tmp_path / "other", [1, 2, 3, 4, 5], closed=False).rename(path)
     assert scan.run(path, age_s=3600) is FileState.INCOMPLETE
-
-
-def test_after_the_clock_was_set_back_a_growth_counts_for_three_splits_more(
-    scan: RepeatedScan, tmp_path: Path
-) -> None:
-    path = plain(tmp_path / "rec_0.mcap", [1], closed=False)
-    scan.run(path, age_s=-86_400)
-    grow(path, 2)
-    assert scan.run(path, age_s=-86_400) is FileState.ACTIVE
-    earlier = NOW - 7200 * S
-    assert scan.run(path, now=earlier) is FileState.ACTIVE
-    assert scan.run(path, now=earlier + THREE_SPLITS) is FileState.ACTIVE
-    assert scan.run(path, now=earlier + THREE_SPLITS + 1) is FileState.INCOMPLETE
 
 
 def test_a_file_of_0_bytes_is_active_while_its_recorder_writes_and_damaged_after(
@@ -243,19 +214,6 @@ def test_a_damaged_file_is_tried_again_when_it_changed_or_after_ten_minutes(
     assert scan.run(path, age_s=100) is FileState.CLOSED
 
 
-def test_a_file_that_cannot_be_opened_is_damaged(scan: RepeatedScan, tmp_path: Path) -> None:
-    class Locked(PlainReader):
-        def closing(self, path: Path) -> Closing:
-            raise BagError(str(path), "cannot be opened: Permission denied")
-
-    scan.reader = Locked()
-    path = plain(tmp_path / "rec_0.mcap", [1])
-    for _ in range(2):
-        assert scan.run(path, age_s=0) is FileState.DAMAGED
-        assert scan.reason() == "cannot be opened: Permission denied"
-    assert scan.reader.summaries.total() == 0
-
-
 def test_a_file_that_vanishes_while_it_is_read_is_not_classified(
     scan: RepeatedScan, tmp_path: Path
 ) -> None:
@@ -308,20 +266,6 @@ def test_a_compressed_bag_is_closed_as_soon_as_its_frame_is_whole(
     assert scan.run(path, age_s=0) is FileState.CLOSED
 
 
-def test_metadata_that_is_missing_or_no_file_mentions_nothing(tmp_path: Path) -> None:
-    assert files_in_metadata(tmp_path / "metadata.yaml") == frozenset()
-    (tmp_path / "metadata.yaml").mkdir()
-    assert files_in_metadata(tmp_path / "metadata.yaml") == frozenset()
-
-
-def test_metadata_of_any_bytes_is_read_for_the_lines_that_name_bags(tmp_path: Path) -> None:
-    path = tmp_path / "metadata.yaml"
-    path.write_bytes(
-        b"\xff\xfe\n  - rec_0.mcap.zstd\r\n  - path: 'a b.mcap'\nname: /odom\n- x.txt\n"
-    )
-    assert files_in_metadata(path) == {"rec_0.mcap.zstd", "a b.mcap"}
-
-
 class TestWhereNothingIsRecorded:
     """A young mtime may be that of a copy."""
 
@@ -347,12 +291,6 @@ class TestWhereNothingIsRecorded:
     ) -> None:
         path = plain(tmp_path / f"bag{kind}", [NOW - 3600 * S, NOW - 5 * S], closed=closed)
         assert self.run(path, kind, 0) == [FileState.ACTIVE]
-
-    def test_so_is_one_without_a_message_yet(self, tmp_path: Path) -> None:
-        (tmp_path / "bag.mcap").touch()
-        assert self.run(tmp_path / "bag.mcap", ".mcap", 0) == [FileState.ACTIVE]
-        begun = plain(tmp_path / "begun.mcap", closed=False)
-        assert self.run(begun, ".mcap", 0) == [FileState.ACTIVE]
 
     def test_so_is_one_that_was_seen_to_grow(self, tmp_path: Path) -> None:
         path = plain(tmp_path / "bag.mcap", [1], closed=False)

@@ -56,12 +56,6 @@ def test_from_one_split_to_the_next_the_recorder_ran_on() -> None:
     assert gaps([splits[0], bag("a/a_2", [14, 15, 20])]) == [(5.0, 14.0)]
 
 
-def test_bags_that_a_wrong_clock_dated_and_carried_messages_leave_none() -> None:
-    recorded = [bag(f"a/a_{n}", every(0.1, 10 * n, 10 * n + 9.9)) for n in range(6)]
-    carried = bag("latched/carried", [-500], "/tf_static")
-    assert gaps([carried, *recorded]) == []
-
-
 @given(
     st.lists(
         st.tuples(st.integers(0, 400), st.integers(2, 60), st.booleans()), min_size=1, max_size=12

@@ -18,7 +18,6 @@ from ros2_memory.insights.status import nothing_here
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.things.find import find_things
 from ros2_memory.tools.instructions import instructions
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
@@ -85,16 +84,6 @@ def test_what_is_announced_while_a_directory_is_read_is_held_back(
     assert names(index.snapshot()) == []
 
 
-def test_a_link_in_a_moment_is_held_back_too(tmp_path: Path) -> None:
-    bags = ScreenedBags(tmp_path / "bags")
-    name = bags.begin(0)
-    split = bags.split(name, [mode(-2, value=False), *words(0, 10)])
-    link = bags.bag_dir / "moments" / "m" / name / split.name
-    link.parent.mkdir(parents=True)
-    link.hardlink_to(split)
-    assert names(index_of(bags).snapshot()) == []
-
-
 def test_without_a_readable_state_no_recording_is_served(tmp_path: Path) -> None:
     bags = ScreenedBags(tmp_path / "bags")
     bags.split(bags.begin(0), [mode(-2, value=False), *words(0, 10)])
@@ -124,18 +113,6 @@ def test_answers_say_what_was_excluded_and_what_is_held_back(tmp_path: Path) -> 
     assert f"{HELD_BACK}: {name}/{name}_1.mcap" in [
         *unread_spans(index_of(bags).snapshot(), window)
     ]
-
-
-def test_a_search_for_things_names_what_is_held_back(tmp_path: Path) -> None:
-    bags = ScreenedBags(tmp_path / "bags")
-    name = bags.begin(0)
-    bags.split(name, [mode(-2, value=False), *words(0, 10)])
-    bags.split(name, words(10, 20))
-    bags.step()
-    memory = memory_of(bags.bag_dir, clock=SettableClock(T0 + 30 * S))
-    held = f"{HELD_BACK}: {name}/{name}_1.mcap"
-    assert held in find_things(memory, Call(), ["cup"]).notes
-    assert held not in find_things(memory, Call(), ["cup"], end_s=T0 // S + 5).notes
 
 
 def test_what_is_searched_first_answers_later_and_the_words_say_when(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.metadata_yaml import Listing
 from ros2_memory.index import listed_splits
 from ros2_memory.index.listed_splits import Absent
 from tests.support.bags import text, write_mcap
@@ -60,17 +59,6 @@ def test_what_changed_since_is_read_again(tmp_path: Path) -> None:
     assert found(memory) == []
 
 
-def test_a_folder_that_changed_just_now_is_read_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    memory = recording(tmp_path)
-    now = memory.clock.now()
-    os.utime(tmp_path / "r", ns=(now, now))
-    assert [each.files for each in found(memory)] == [ABSENT]
-    monkeypatch.setattr(listed_splits, "read_listing", lambda *_: Listing(("r_2.mcap",), {}, None))
-    assert found(memory) == []
-
-
 def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     memory = with_store(recording(tmp_path, messages=7), tmp_path)
     [absent] = found(memory)
@@ -82,23 +70,3 @@ def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.M
     later.store_listings(later.index.refresh())
     assert later.columns.store is not None
     assert later.columns.store.listings() == {}
-
-
-@pytest.mark.parametrize(
-    "damaged",
-    [
-        "",
-        "{}",
-        "[1, 2]",
-        "[[1, 2, 3], [[], [], 1, 2]]",
-        "[[1], 2]",
-        "[[1, 2, 3], [[], [], Infinity, 1, 0]]",
-    ],
-)
-def test_what_was_stored_and_is_damaged_is_read_again(tmp_path: Path, damaged: str) -> None:
-    memory = recording(tmp_path)
-    expected = found(memory)
-    store = with_store(memory, tmp_path).columns.store
-    assert store is not None
-    store.put_listings({"r": damaged})
-    assert found(with_store(memory_of(tmp_path), tmp_path)) == expected

@@ -27,13 +27,11 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartb
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
-from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.instructions import instructions
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.spec_tools import build_tools
-from tests.support.bags import McapLayout, Msg, odom, write_db3, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, memory_of, with_store
@@ -176,19 +174,6 @@ def test_by_default_the_split_being_written_does_not_answer(tmp_path: Path) -> N
     assert (aside.reason, aside.answers) == ("still being written", False)
 
 
-def test_an_active_file_answers_and_is_named_as_active_all_the_same(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
-    assert tail.states() == [BagState.ACTIVE]
-    reply = tail.asked("data_time_range")
-    assert (reply["bags"], reply["from_active"]) == (1, True)
-    assert tail.asked("memory_status")["from_active"] is True
-    assert reply["active"] == [
-        {"file": "rec/rec_0.mcap", "reason": "still being written: its complete chunks are read"}
-    ]
-    assert (reply["incomplete"], reply["damaged"]) == ([], [])
-    assert not any("ends early" in note for note in reply.get("notes", ()))
-
-
 @pytest.mark.parametrize("recall", [False, True], ids=["plain", "catalogue"])
 def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, recall: bool) -> None:
     content, ends = split(LAYOUTS[0])
@@ -202,40 +187,6 @@ def test_what_is_amiss_inside_is_reported_before_the_split_closes(tail: Tail, re
         notes
     )
     assert not any("crash" in note for note in notes)
-
-
-def test_with_the_catalogue_the_same_is_answered(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
-    tail.clock.at = T0 + 60 * S
-    catalogued = with_store(tail.memory, tail.bag_dir)
-    later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
-    near = {"condition_type": "near_position", "value": {"x": 14.2, "y": 0}}
-    for cut in range(4096, len(later), 4096):
-        tail.write("rec/rec_1.mcap", later[:cut], at=60 * S + cut)
-        for name, arguments in (
-            ("find_last_match", {"topic": "/odom", **near}),
-            ("trajectory_summary", {"start": T0 / S, "end": T0 / S + 30}),
-            ("get_topic_in_range", {"topic": "/odom", "start": T0 / S, "end": T0 / S + 30}),
-        ):
-            assert asked(catalogued, tail.bag_dir, name, **arguments) == tail.asked(
-                name, **arguments
-            )
-
-
-def test_a_file_that_is_no_bag_yet_stays_aside(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:5], at=5 * S)
-    assert tail.states() == []
-    [aside] = tail.memory.index.snapshot().active
-    assert not aside.answers
-
-
-def test_a_db3_that_is_being_written_does_not_answer(tmp_path: Path) -> None:
-    tail = Tail(tmp_path, storage="rosbag2")
-    path = write_db3(tmp_path / "rec" / "rec_0.db3", driven(0, 5))
-    os.utime(path, ns=(T0, T0))
-    assert tail.states() == []
-    [aside] = tail.memory.index.snapshot().active
-    assert (aside.reason, aside.answers) == ("still being written", False)
 
 
 def test_what_a_killed_recorder_left_is_incomplete_and_answers_the_same(tail: Tail) -> None:
@@ -323,13 +274,6 @@ def test_what_the_older_of_two_recordings_has_yet_to_write_is_no_gap(tmp_path: P
     assert tail.asked("get_position_at", **missing)["x"] == pytest.approx(8.5)
 
 
-def test_between_messages_that_are_on_disk_a_gap_is_one_while_more_is_written(tail: Tail) -> None:
-    content = written(tail.bag_dir / "x" / "x_0.mcap", [*driven(0, 30), *driven(50, 60)])
-    tail.write("rec/rec_0.mcap", content[: len(content) * 9 // 10], at=11 * S)
-    reply = tail.asked("get_position_at", timestamp=T0 / S + 4.5, tolerance_s=0.5)
-    assert reply["reason"] == "gap"
-
-
 def test_where_the_robot_was_2_s_ago_is_answered_and_says_from_what(tail: Tail) -> None:
     content, _ = split(LAYOUTS[0])
     tail.write("rec/rec_0.mcap", content, at=10 * S)
@@ -369,17 +313,6 @@ def test_a_first_split_of_which_nothing_is_on_disk_yet_is_no_empty_memory(tail: 
     assert reply["detail"] == "nothing of the first split is on disk yet; ask again in 3 s"
 
 
-def test_of_two_files_being_written_the_one_that_is_behind_is_named(tail: Tail) -> None:
-    content = written(tail.bag_dir / "x" / "x_0.mcap", driven(0, 100))
-    tail.write("a/a_0.mcap", content[:5000], at=5 * S)
-    tail.write("b/b_0.mcap", content[:9000], at=5 * S)
-    behind, ahead = sorted(aside.until or 0 for aside in tail.memory.index.snapshot().active)
-    reply = tail.asked(
-        "get_topic_in_range", topic="/odom", start=(behind + TENTH) / S, end=(ahead - TENTH) / S
-    )
-    assert reply["notes"][0] == "still being written and not all on disk yet: a/a_0.mcap"
-
-
 def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail: Tail) -> None:
     tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0], at=10 * S)
     later = written(tail.bag_dir / "x" / "x_1.mcap", driven(100, 100))
@@ -402,22 +335,3 @@ def test_each_call_says_for_itself_whether_it_drew_on_what_is_being_written(tail
 
     anyio.run(go)
     assert from_active.count(True) == from_active.count(False) == 20
-
-
-def test_lists_have_no_place_for_it_and_stay_lists(tail: Tail) -> None:
-    tail.write("rec/rec_0.mcap", split(LAYOUTS[0])[0][:9000], at=5 * S)
-    [row] = tail.asked("list_recorded_topics")
-    assert row["count"] == len(tail.ticks())
-    assert "notes" not in row
-
-
-def test_the_instructions_tell_what_this_deployment_can_answer() -> None:
-    assert "not_closed_yet" in instructions(LIVE)
-    assert "3 s" in instructions(LIVE)
-    assert "newest 10 s" in instructions(QuerySettings(kept=RetentionLimits(10**9, 0)))
-    assert "newest 10 s" not in instructions(LIVE)
-    assert "bags that are being written" in instructions(QuerySettings())
-    # Whether anything is being written is only known when a question is asked.
-    assert "bags that are being written" in instructions(QuerySettings(now="latest"))
-    assert "count from this machine's clock" in instructions(LIVE)
-    assert "count from the newest message" in instructions(QuerySettings(now="latest"))

@@ -44,15 +44,6 @@ def test_two_runs_at_once_are_named_with_the_time_that_they_share(tmp_path: Path
     assert pairs(overlapping(robot(tmp_path, spans))) == [("a", "b", 15.0, 30.0)]
 
 
-def test_splits_of_one_recording_may_overlap(tmp_path: Path) -> None:
-    assert overlapping(robot(tmp_path, {"a": [(0, 20), (5, 30)]})) == ()
-
-
-def test_a_hole_in_a_recording_is_no_part_of_it(tmp_path: Path) -> None:
-    spans = {"a": [(0, 10), (100, 110)], "b": [(20, 90)]}
-    assert overlapping(robot(tmp_path, spans)) == ()
-
-
 def test_a_short_overlap_of_long_recordings_is_that_of_a_rotation(tmp_path: Path) -> None:
     spans = {"a": [(0.0, 60.0)], "b": [(55.0, 120.0)]}
     assert overlapping(robot(tmp_path, spans)) == ()

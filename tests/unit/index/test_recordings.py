@@ -7,10 +7,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.model import BagFile
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
-from ros2_memory.index.timeline import Timeline
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
@@ -78,24 +76,3 @@ def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
     for path, bags in recordings_of(snapshot).items():
         part = RecordingFilter(tmp_path, name_of(path, bags, str(tmp_path))).narrowed(snapshot)
         assert list(part.bags) == bags
-
-
-def test_a_recording_whose_last_bag_is_deleted_is_none_any_more(tmp_path: Path) -> None:
-    write(tmp_path, "rec")
-    [one] = index_of(tmp_path).snapshot().timeline.bags
-
-    def numbered(nth: int) -> BagFile:
-        name, start = f"r{nth // 150:04d}", one.start + nth * 10 * NS_PER_S
-        file = f"{name}/{name}_{nth % 150}.mcap"
-        known = one.size, one.mtime_ns, one.state, one.summary
-        return BagFile(file, *known, start, start, one.sidecar_ns)
-
-    bags = [numbered(nth) for nth in range(200)]
-    timeline = Timeline.of(bags)
-    timeline.recordings("/odom")
-    for nth in range(200, 3000):
-        # A split is closed; a later scan finds the oldest one deleted.
-        for removed, added in (([], [numbered(nth)]), (bags[:1], [])):
-            bags = bags[len(removed) :] + added
-            timeline = timeline.changed(removed, added)
-            assert {*timeline.recordings("/odom")} == {bag.recording for bag in bags}

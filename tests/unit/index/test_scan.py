@@ -66,13 +66,6 @@ def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -
     assert _names(Tree(tmp_path).scan(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
 
 
-def test_what_a_file_system_check_put_aside_is_left_out(tmp_path: Path) -> None:
-    _file(tmp_path / "lost+found" / "a.mcap")
-    _file(tmp_path / "b.mcap")
-    scanned = Tree(tmp_path).scan(NOW, ())
-    assert (_names(scanned), scanned.damaged) == (["b.mcap"], [])
-
-
 def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) -> None:
     _file(tmp_path / ".trash" / "rec" / "a.mcap")
     _file(tmp_path / "rec" / ".cache" / "b.mcap")
@@ -86,15 +79,6 @@ def test_a_second_walk_looks_at_nothing_that_lies_in_unchanged_folders(tmp_path:
     tree = Tree(_aged(tmp_path))
     assert _names(tree.scan(NOW, ())) == ["a.mcap", "b.mcap"]
     assert tree.scan(NOW, ()) == ScanResult({}, set(), [], [])
-
-
-def test_only_the_folder_into_which_a_file_came_is_listed_again(tmp_path: Path) -> None:
-    _file(tmp_path / "rec_1" / "a.mcap")
-    _file(tmp_path / "rec_2" / "b.mcap")
-    tree = Tree(_aged(tmp_path))
-    tree.scan(NOW, ())
-    _file(tmp_path / "rec_2" / "c.mcap")
-    assert _names(tree.scan(NOW, ())) == ["b.mcap", "c.mcap"]
 
 
 @pytest.mark.parametrize("age_s", [0.0, 1.9, -1.9])
@@ -161,14 +145,6 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
             "up",
         ]
         assert all("not followed" in each.reason for each in scanned.links)
-
-
-def test_the_bag_directory_itself_may_be_a_link(tmp_path: Path) -> None:
-    _file(tmp_path / "disk" / "rec" / "a.mcap")
-    (tmp_path / "bags").symlink_to(tmp_path / "disk", target_is_directory=True)
-    assert list(Tree(tmp_path / "bags").scan(NOW, ()).stamps) == [
-        str(tmp_path / "bags" / "rec" / "a.mcap")
-    ]
 
 
 def test_a_pipe_with_the_name_of_a_bag_is_damaged_and_never_opened(tmp_path: Path) -> None:

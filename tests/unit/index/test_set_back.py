@@ -15,7 +15,7 @@ from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import data_time_range, topic_range
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
+from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of
 
@@ -51,20 +51,6 @@ def test_how_far_it_was_set_back_is_told_whatever_the_layout(
     found = set_back(tmp_path / "a.mcap", messages, layout)
     # Chunks hold two messages: what lies within one of them is not result apart.
     assert (STEP - 3) * S <= found <= (STEP - 1) * S
-
-
-def test_messages_a_little_out_of_order_are_no_sign_of_it(
-    tmp_path: Path, layout: McapLayout
-) -> None:
-    messages = [message(n - 0.9 * (n % 2)) for n in range(20)]
-    assert set_back(tmp_path / "a.mcap", messages, layout) == 0
-
-
-def test_topics_that_were_written_one_after_another_are_no_sign_of_it(
-    tmp_path: Path, layout: McapLayout
-) -> None:
-    messages = [message(n) for n in range(20)] + [boolean(T0 + n * S, data=True) for n in range(20)]
-    assert set_back(tmp_path / "a.mcap", messages, layout) == 0
 
 
 @settings(max_examples=examples(40), deadline=None)

@@ -121,11 +121,6 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
         ]
 
 
-def test_a_timeline_to_which_nothing_happens_stays_itself() -> None:
-    timeline = Timeline.of([_bag("a", ("/odom", 0, 9))])
-    assert timeline.changed([], iter(())) is timeline
-
-
 def test_which_recordings_hold_a_topic_is_known_anew_whatever_changes() -> None:
     def split(number: int, until: int = 9) -> BagFile:
         folder = f"rec_{number // 100}"

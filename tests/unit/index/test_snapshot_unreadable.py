@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
-from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, text, write_mcap
+from tests.support.bags import text, write_mcap
 from tests.support.clocks import SettableClock
 
 S = 10**9
@@ -67,23 +67,6 @@ def test_the_last_split_that_cannot_be_read_ends_with_its_file(tmp_path: Path) -
     [damaged] = snapshot.damaged
     assert damaged.written == T0 + 20 * S
     assert snapshot.unread_spans[damaged] == TimeWindow(T0 + 9 * S, T0 + 80 * S)
-
-
-def test_the_split_being_written_begins_where_the_one_before_ends(tmp_path: Path) -> None:
-    write_splits(tmp_path, 0)
-    active = write_mcap(
-        tmp_path / "rec" / "rec_1.mcap", [text(T0 + 10 * S, "a")], McapLayout(finish=False)
-    )
-    os.utime(active, ns=(T0 + 12 * S, T0 + 12 * S))
-    snapshot = snapshot_of(tmp_path, T0 + 15 * S)
-    place = snapshot.unread_spans[snapshot.active[0]]
-    assert place is not None
-    assert place.start == T0 + 9 * S
-
-
-def test_the_time_of_what_was_never_looked_into_is_unknown() -> None:
-    link = SetAside(Path("/bags/link.mcap"), "a symbolic link")
-    assert Snapshot(unread=(link,), scanned_at=T0).unread_spans == {link: None}
 
 
 def test_a_question_about_now_looks_for_newer_bags_though_one_is_from_the_future(

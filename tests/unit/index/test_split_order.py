@@ -13,7 +13,6 @@ from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
     Neighbours,
-    is_recording,
     neighbours,
     split_of,
     steps_of,
@@ -64,11 +63,6 @@ def test_a_split_is_known_by_the_count_in_its_name(name: str, number: int | None
     assert (None if place is None else place[1]) == number
 
 
-def test_only_files_named_after_their_folder_are_splits_of_one_recording() -> None:
-    places = [split_of(f"/bags/{name}") for name in ("run/run_1.mcap", "drives/drive_1.mcap")]
-    assert [place is not None and is_recording(place[0]) for place in places] == [True, False]
-
-
 def test_files_that_people_named_tell_nothing_of_a_clock() -> None:
     assert steps([bag("drive_1.mcap", 100, 110), bag("drive_2.mcap", 10, 20)]) == []
 
@@ -105,8 +99,3 @@ def test_neighbours_are_the_nearest_by_count_however_the_history_is_parted(
     assert near(f"rec_{missing}.mcap", list(bags.values()), size) == Neighbours(
         before and before.end, after and after.start
     )
-
-
-def test_a_file_of_another_series_has_no_neighbours_here() -> None:
-    assert near("other_1.mcap", [split(0, 0, 5), split(2, 9, 12)]) == Neighbours()
-    assert near("rec.mcap", [split(0, 0, 5)]) == Neighbours()

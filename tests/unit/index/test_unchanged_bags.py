@@ -110,21 +110,6 @@ def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> No
     assert [*reader.summaries] == ["rec_3.mcap"]
 
 
-def test_what_is_known_of_a_young_bag_is_believed_and_the_bag_watched(start: Start) -> None:
-    start.age(NOW - 5 * S)
-    start.remember()
-    index, reader = start.index()
-    assert index.refresh() == start.read()
-    assert reader.summaries.total() == 0
-
-
-def test_a_known_bag_of_a_kind_that_the_reader_does_not_read_is_set_aside(start: Start) -> None:
-    index, reader = start.index()
-    reader.kinds = (".db3",)
-    snapshot = index.refresh()
-    assert (len(snapshot.bags), len(snapshot.unread)) == (0, 6)
-
-
 def test_a_sidecar_that_comes_has_the_bags_beside_it_read_again(start: Start) -> None:
     index, reader = start.index()
     index.refresh()

@@ -27,28 +27,11 @@ def test_a_file_that_was_copied_here_later_is_taken_to_hold_a_day() -> None:
     assert found == TimeWindow(NOW - 1000 * HOUR, NOW - 976 * HOUR)
 
 
-def test_before_the_first_split_it_begins_with_its_recording() -> None:
-    begin = named_start(OWN)
-    assert begin is not None
-    found = unreadable_span(OWN, Neighbours(after=begin + 20 * S), NOW, NOW)
-    assert found == TimeWindow(begin, begin + 20 * S + 1)
-
-
-def test_alone_in_a_folder_it_ends_when_it_was_written_and_holds_a_day() -> None:
-    found = unreadable_span("someones", Neighbours(), NOW - HOUR, NOW)
-    assert found == TimeWindow(NOW - 25 * HOUR + 60 * S, NOW - HOUR + 60 * S)
-
-
 def test_a_file_that_is_still_being_written_has_no_end() -> None:
     found = unreadable_span("rec", Neighbours(NOW - 10 * S), NOW, NOW, growing=True)
     assert found == TimeWindow(NOW - 10 * S, MAX_NS)
     found = unreadable_span("someones", Neighbours(), NOW, NOW, growing=True)
     assert found == TimeWindow(NOW - 24 * HOUR, MAX_NS)
-
-
-def test_simulated_times_and_a_file_of_today_hold_a_day_from_the_split_before() -> None:
-    found = unreadable_span("sim", Neighbours(before=30 * S), 20 * S, NOW)
-    assert found == TimeWindow(30 * S, 30 * S + MAX_FILE_NS)
 
 
 def test_a_recording_tells_when_it_began_only_in_the_names_that_the_recorder_gives() -> None:
@@ -95,19 +78,6 @@ def test_a_copy_of_yesterday_may_hold_anything_from_before_it_was_made() -> None
     )
     assert unreadable_bounds("someones", Neighbours(), None, NOW) is None
     assert unreadable_bounds("someones", Neighbours(), 5 * S, NOW) is None
-
-
-def test_splits_around_a_file_bound_it_and_so_does_the_name_of_its_recording() -> None:
-    begin = named_start(OWN)
-    assert begin is not None
-    assert unreadable_bounds("rec", Neighbours(100 * S, 200 * S), NOW, NOW) == TimeWindow(
-        100 * S, 200 * S + 1
-    )
-    assert unreadable_bounds("rec", Neighbours(100 * S), None, NOW) == TimeWindow(100 * S, MAX_NS)
-    assert unreadable_bounds("rec", Neighbours(after=9 * S), NOW, NOW) == TimeWindow(
-        MIN_NS, 9 * S + 1
-    )
-    assert unreadable_bounds(OWN, Neighbours(), NOW, NOW) == TimeWindow(begin, NOW + 60 * S)
 
 
 def test_times_that_contradict_each_other_bound_nothing() -> None:

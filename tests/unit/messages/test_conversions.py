@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -50,16 +48,6 @@ def image(encoding: str, height: int = 2, width: int = 4, size: int = 24) -> obj
 )
 def test_an_image_is_its_size_encoding_and_shape(encoding: str, shape: list[int]) -> None:
     assert view(image(encoding), "data") == {"bytes": 24, "encoding": encoding, "shape": shape}
-
-
-def test_a_compressed_image_is_its_size_and_format() -> None:
-    jpeg = bags.make(
-        "sensor_msgs/msg/CompressedImage",
-        header=bags.header(0, ""),
-        format="jpeg",
-        data=np.zeros(9, dtype=np.uint8),
-    )
-    assert view(jpeg, "data") == {"bytes": 9, "encoding": "jpeg"}
 
 
 def test_a_point_cloud_is_its_size_and_points() -> None:
@@ -112,13 +100,6 @@ def test_a_definition_of_another_shape_under_a_standard_name_is_not_taken_for_it
     assert view(own, "yaw_deg") is ABSENT
     picture = view(store.types["sensor_msgs/msg/Image"](data="abc"), "data")
     assert picture == {"bytes": 3, "encoding": None, "shape": []}
-
-
-def test_a_quaternion_has_angles_and_no_components_in_this_view() -> None:
-    node = bags.quaternion(math.radians(30))
-    assert view(node, "yaw_deg") == pytest.approx(30)
-    assert view(node, "roll_deg") == pytest.approx(0)
-    assert view(node, "w") is ABSENT
 
 
 def test_points_are_read_from_messages_and_from_json_alike() -> None:

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,11 +9,6 @@ from ros2_memory.messages.to_json import evenly
 
 counts = st.integers(0, 5000)
 limits = st.integers(1, 600)
-
-
-@given(counts, limits)
-def test_as_many_are_kept_as_asked_or_as_there_are(count: int, at_most: int) -> None:
-    assert len(evenly(count, at_most)) == min(count, at_most)
 
 
 @given(counts, st.integers(2, 600))
@@ -35,9 +29,3 @@ def test_indices_rise_by_steps_that_differ_by_at_most_one(count: int, at_most: i
 @given(st.integers(1, 5000))
 def test_a_single_place_goes_to_the_newest(count: int) -> None:
     assert evenly(count, 1) == [count - 1]
-
-
-@pytest.mark.parametrize("at_most", [0, -1])
-def test_keeping_nothing_is_refused(at_most: int) -> None:
-    with pytest.raises(ValueError, match=f"at most {at_most} values"):
-        evenly(10, at_most)

@@ -16,7 +16,6 @@ from ros2_memory.messages.conversions import (
     names_of,
     parse_path,
 )
-from tests.support import bags
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -42,10 +41,6 @@ def test_the_constants_of_a_definition_are_no_fields() -> None:
     assert names_of(Plain(1)) == ("width",)
 
 
-def test_an_empty_message_has_no_fields() -> None:
-    assert names_of(bags.make("std_msgs/msg/Empty")) == ()
-
-
 def test_a_field_named_like_a_word_of_python_keeps_its_name() -> None:
     build = register("demo_msgs/msg/Trip", "string from\nstring to\n")
     trip = build(from_="kitchen", to="hall")
@@ -57,11 +52,6 @@ def test_a_field_named_like_a_word_of_python_keeps_its_name() -> None:
 def test_only_fields_are_walked_never_what_python_adds(name: str) -> None:
     for node in ([3, 1], np.zeros(2), "text", 1.5, None, SimpleNamespace(_private=1)):
         assert field_of(node, name) is ABSENT
-
-
-def test_the_names_of_a_list_are_those_of_its_first_element() -> None:
-    assert names_of([{"a": 1}, {"b": 2}]) == ("a",)
-    assert names_of([]) == names_of(3) == ()
 
 
 def test_an_object_of_another_decoder_is_walked_by_its_attributes() -> None:

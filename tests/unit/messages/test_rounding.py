@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.messages.to_json import (
-    round_degrees,
     round_integer,
-    round_metric,
     round_real,
     round_single,
 )
@@ -40,19 +38,6 @@ def test_a_number_of_unknown_unit_leaves_short(number: float, leaves_as: object)
     assert type(left) is type(leaves_as)
 
 
-def test_minus_zero_leaves_without_its_sign() -> None:
-    assert str(round_real(-0.0)) == "0"
-    assert str(round_metric(-0.00001)) == "0"
-    assert str(round_degrees(-0.001)) == "0"
-
-
-def test_metres_leave_to_a_tenth_of_a_millimetre_and_degrees_to_a_hundredth() -> None:
-    assert round_metric(1.23456) == 1.2346
-    assert round_degrees(28.64788975654116) == 28.65
-    assert round_metric(math.nan) is None
-    assert round_degrees(math.inf) is None
-
-
 @given(st.floats(width=32, allow_nan=False, allow_infinity=False))
 def test_a_float32_is_read_back_from_what_leaves(number: float) -> None:
     for left in (round_real(number), round_single(np.float32(number))):
@@ -64,11 +49,6 @@ def test_a_float32_is_read_back_from_what_leaves(number: float) -> None:
 def test_a_float32_leaves_as_the_decimal_that_was_written(digits: int, decimals: int) -> None:
     written = digits / 10**decimals
     assert round_real(float(np.float32(written))) == written
-
-
-def test_a_float64_that_is_a_float32_too_keeps_its_digits_where_they_are_few() -> None:
-    assert round_real(48.123046875) == 48.123046875
-    assert round_real(500000.03125) == 500000.03125
 
 
 @given(st.floats(-360, 360, allow_nan=False))

@@ -21,7 +21,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Record, Schema
+from ros2_memory.storage.base import BagReader, Batch, Closing, Record
 from tests.support.bags import Msg, boolean, detections, odom, text, tf, transform, typestore
 from tests.support.examples import examples
 from tests.support.reader_cases import FILES, Shelf
@@ -183,17 +183,6 @@ def test_a_window_includes_its_start_and_excludes_its_stop(shelf: Shelf, tmp_pat
 
 
 @on_every_shelf
-def test_both_types_of_a_topic_that_has_two_are_read(shelf: Shelf, tmp_path: Path) -> None:
-    messages = [text(1, "one", "/t"), boolean(2, True, "/t"), text(3, "three", "/t")]
-    reader, path = shelf.stocked(tmp_path, messages)
-    assert [record.type for record in read(reader, path, ["/t"])] == [STRING, BOOL, STRING]
-    assert [(t.topic, t.type, t.count) for t in reader.summarize(path).topics] == [
-        ("/t", BOOL, 1),
-        ("/t", STRING, 2),
-    ]
-
-
-@on_every_shelf
 def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path: Path) -> None:
     silent = [("/quiet", STRING), ("/still", BOOL)]
     reader, path = shelf.stocked(tmp_path, [text(1, "x")], declared=silent)
@@ -203,16 +192,6 @@ def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path:
     channels = reader.channels(path)
     assert {(c.topic, c.type) for c in channels} == {("/chatter", STRING), *silent}
     assert read(reader, path, ["/quiet"]) == []
-
-
-@on_every_shelf
-def test_an_empty_bag_has_no_topics_and_no_times(shelf: Shelf, tmp_path: Path) -> None:
-    reader, path = shelf.stocked(tmp_path, declared=[("/quiet", STRING)])
-    summary = reader.summarize(path)
-    assert summary.empty
-    assert summary.topics == ()
-    assert summary.silent == (("/quiet",) if shelf.writes_silent_topics else ())
-    assert reader.closing(path) is Closing.CLOSED
 
 
 @on_every_shelf
@@ -267,19 +246,6 @@ def test_a_payload_that_does_not_fit_is_undecodable_and_is_reported(
     with pytest.raises(UndecodableError, match=r"^/odom \(nav_msgs/msg/Odometry\): "):
         reader.decode(first)
     assert getattr(reader.decode(second), "data", None) == "whole"
-
-
-@on_every_shelf
-def test_an_unknown_type_is_undecodable_with_a_reason_that_needs_no_message(
-    shelf: Shelf, tmp_path: Path
-) -> None:
-    reader, _ = shelf.stocked(tmp_path, [])
-    channel = Channel("/oddity", "cdr", Schema("nowhere_msgs/msg/Oddity"))
-    reason = reader.undecodable(channel)
-    assert reason
-    with pytest.raises(UndecodableError) as caught:
-        reader.decode(Record(channel, 1, 1, b"\x00\x01\x00\x00\x00"))
-    assert caught.value.reason == reason
 
 
 @on_every_shelf

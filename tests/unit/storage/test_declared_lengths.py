@@ -8,8 +8,6 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import BagError
-from ros2_memory.storage.base import Channel, Schema
-from ros2_memory.storage.cache import shared, unshared_bytes
 from ros2_memory.storage.errors import MAX_DEFINITION_BYTES, MAX_NAMES_CHARS
 from ros2_memory.storage.mcap_reader import McapReader
 
@@ -56,11 +54,3 @@ def test_of_a_definition_larger_than_any_no_more_is_kept_than_shows_it(tmp_path:
     [channel] = reader.channels(path)
     assert len(channel.schema.text) == MAX_DEFINITION_BYTES + 1
     assert "larger than" in (reader.undecodable(channel) or "")
-
-
-def test_what_is_shared_is_bounded_by_its_length() -> None:
-    long = b"#" * MAX_DEFINITION_BYTES
-    one, other = (Channel("/a", "cdr", Schema("a/msg/B", "ros2msg", long)) for _ in range(2))
-    assert shared(one) is one
-    assert shared(other) is other
-    assert unshared_bytes({1: one}) > MAX_DEFINITION_BYTES

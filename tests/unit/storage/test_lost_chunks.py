@@ -5,7 +5,6 @@ A damaged index costs none, and is reported too.
 
 from __future__ import annotations
 
-import json
 import struct
 from functools import partial
 from itertools import product
@@ -84,17 +83,6 @@ def test_reading_goes_on_behind_a_damaged_chunk(
     assert all((time > lost[-1]) == newest_first for time in before)
 
 
-def test_what_of_a_damaged_chunk_is_outside_of_the_window_is_not_lost(tmp_path: Path) -> None:
-    path, lost = damaged_bag(tmp_path / "rec" / "rec_0.mcap")
-    reader = McapReader()
-    assert [
-        each.log_time for each in reader.records(path, ["/chatter"], TimeWindow(0, lost[0]))
-    ] == [*range(lost[0])]
-    with pytest.raises(BagError) as caught:
-        list(reader.records(path, ["/chatter"], TimeWindow(lost[0], lost[0] + 1)))
-    assert caught.value.lost == (lost[0], lost[0])
-
-
 def test_the_newest_message_is_before_the_damaged_chunk_where_that_is_the_last(
     tmp_path: Path,
 ) -> None:
@@ -118,14 +106,6 @@ def overlapping(folder: Path) -> Memory:
 
 def asked(memory: Memory, pattern: str, wanted: str) -> Match:
     return queries.find_last_match(memory, Call(), pattern, "contains", wanted)
-
-
-def test_a_match_behind_a_damaged_chunk_is_found_and_the_chunk_is_reported(tmp_path: Path) -> None:
-    damaged_bag(tmp_path / "rec" / "rec_0.mcap")
-    found = asked(memory_of(tmp_path), "/chatter", f"{3:0100d}")
-    assert found.found is not None
-    assert found.found.sample.time == 3
-    assert any("rec_0.mcap could not be read whole" in note for note in found.notes)
 
 
 def test_a_chunk_damaged_before_the_match_is_reported_neither_with_a_catalogue_nor_without(
@@ -188,20 +168,6 @@ def test_sightings_report_what_is_damaged_in_the_time_that_they_span(tmp_path: P
         assert not is_damage_noted(limit=1)
 
 
-def test_damaged_bags_are_reported_in_one_order_whichever_was_found_first(tmp_path: Path) -> None:
-    for name in ("a", "b"):
-        path = write_mcap(tmp_path / name / f"{name}_0.mcap", [text(ord(name) * S, "hello")])
-        spoil_chunk(path, 0)
-    notes = []
-    for newest_first in (False, True):
-        view = View(memory_of(tmp_path), Call())
-        list(view.stream.messages(["/chatter"], EVERYTHING, newest_first=newest_first))
-        notes.append(view.notes.sentences())
-    assert notes[0] == notes[1]
-    [once] = notes[0]
-    assert once.startswith("2 bags could not be read whole: a/a_0.mcap (")
-
-
 class TestAnIndexThatContradictsItsMessages:
     """One bit of a message index is another: nothing that is asked for is missed or moved."""
 
@@ -246,23 +212,6 @@ class TestAnIndexThatContradictsItsMessages:
             assert [sample["timestamp"] for sample in reply["samples"]] == [
                 pytest.approx(at_s + n / 10, abs=1e-5) for n in range(2)
             ]
-
-    def test_a_search_finds_what_it_finds_in_the_same_bag_with_a_right_index(
-        self, tmp_path: Path
-    ) -> None:
-        self.driven(tmp_path / "wrong")
-        whole = self.driven(tmp_path / "right")
-        whole.write_bytes(self.right)
-        near = json.dumps({"x": (self.at - T0) / S, "y": 0.0})
-        asks = {"topic": "/odom", "condition_type": "near_position", "value": near}
-        wrong, right = (
-            asked_tool(memory_of(tmp_path / name), tmp_path / name, "find_matches", **asks)
-            for name in ("wrong", "right")
-        )
-        [found, *same] = wrong.pop("notes")
-        assert "contradicts itself" in found
-        assert same == right.pop("notes")
-        assert wrong == right
 
 
 class TestAChunkOfWhichAllIndexesTellOneLie:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
@@ -63,15 +62,3 @@ def test_a_pause_of_all_topics_is_found_wherever_its_messages_lie(
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_slower_topic_that_goes_on_leaves_no_pause(tmp_path: Path, kind: str) -> None:
     assert pauses(tmp_path, kind, bag_of(every(50, 10, but=((3, 5),)), every(10, 10))) == ()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_what_is_published_seldom_leaves_no_pause(tmp_path: Path, kind: str) -> None:
-    assert pauses(tmp_path, kind, bag_of(every(1, 60), every(0.5, 60))) == ()
-
-
-def test_messages_that_are_written_out_of_order_leave_no_pause(tmp_path: Path) -> None:
-    messages = bag_of(every(50, 10), every(10, 10))
-    late = [message for message in messages if 3 * S < message.log_time - BEGIN < 5 * S]
-    rest = [message for message in messages if message not in late]
-    assert pauses(tmp_path, "mcap", [*rest, *(replace(message) for message in late)]) == ()

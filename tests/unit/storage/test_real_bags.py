@@ -194,18 +194,6 @@ def test_positions_that_are_not_numbers_are_reported() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", [name for name, truth in expected().items() if truth.get("rosout")]
-)
-def test_the_last_warning_in_the_logs_is_found(name: str) -> None:
-    truth = expected()[name]["rosout"]
-    asked = memory(name)
-    rows = {row.topic for row in queries.list_recorded_topics(asked, Call())}
-    assert "/rosout" in rows
-    answer = queries.find_last_match(asked, Call(), "/rosout", "equals", 30, field="level")
-    assert (answer.found is not None) == ("WARN" in truth["by_level"])
-
-
-@pytest.mark.parametrize(
     ("name", "cut"),
     [(name, cut) for name, truth in expected().items() for cut in truth.get("truncate", [])],
 )

@@ -89,21 +89,6 @@ every_recorded_file = pytest.mark.parametrize(
 
 @needs_real
 @every_set
-def test_messages_are_as_many_as_summarised_in_order_and_reversible(name: str) -> None:
-    for path in files_of(name):
-        for reader in readers_of(path):
-            summary = reader.summarize(path)
-            records = all_records(reader, path)
-            assert len(records) == summary.count
-            times = [record.log_time for record in records]
-            assert times == sorted(times)
-            topics = topics_of(summary)
-            backwards = list(reader.records(path, topics, EVERYTHING, newest_first=True))
-            assert backwards == records[::-1]
-
-
-@needs_real
-@every_set
 def test_only_what_may_be_refused_is_refused_and_with_its_reason(name: str) -> None:
     refused: dict[str, str] = {}
     decoded: Counter[str] = Counter()
@@ -154,16 +139,6 @@ def test_every_legal_layout_of_the_summary_section_is_read() -> None:
             assert [summary.start, summary.end] == expected["log_ns"]
 
 
-@needs_real
-def test_the_truncated_file_has_its_whole_chunk() -> None:
-    path = REAL / "tiryoh_small_and_truncated" / "test_sample_truncated.mcap"
-    whole = path.with_name("test_sample.mcap")
-    assert all_records(mcap(), path) == all_records(mcap(), whole)
-    summary = mcap().summarize(path)
-    assert not summary.complete
-    assert summary.notes == ("the file ends early: the last 58 bytes could not be read",)
-
-
 @needs_recorded
 @every_recorded_file
 def test_every_recorded_file_is_read_or_reports_why_not(path: Path) -> None:
@@ -194,15 +169,3 @@ def test_a_definition_that_the_recorder_lacked_comes_from_the_folders() -> None:
     without = mcap().undecodable(records[0].channel)
     assert without is not None
     assert "reader.custom_msg_paths" in without
-
-
-@needs_recorded
-def test_latched_transforms_lie_where_they_were_received() -> None:
-    held = {
-        path.name: [t.count for t in mcap().summarize(path).topics if t.topic == "/tf_static"]
-        for path in sorted((RECORDED / "extra" / "tfs").glob("*.mcap"))
-    }
-    assert {name: counts for name, counts in held.items() if counts} == {
-        "tfs_0.mcap": [2],
-        "tfs_3.mcap": [1],
-    }

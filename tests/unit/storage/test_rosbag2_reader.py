@@ -22,7 +22,6 @@ from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import (
     McapLayout,
     Msg,
-    boolean,
     detections,
     odom,
     text,
@@ -200,21 +199,6 @@ class TestSqliteSchemas:
         with pytest.raises(BagError, match=r"a\.db3: damaged: messages without an integer"):
             Rosbag2Reader().summarize(path)
 
-    def test_a_payload_that_is_no_blob_ends_the_iteration(self, tmp_path: Path) -> None:
-        path = change(
-            write_db3(tmp_path / "a.db3", chatter(3)), "UPDATE messages SET data = 5 WHERE id = 2"
-        )
-        records = Rosbag2Reader().records(path, ["/chatter"], EVERYTHING)
-        assert next(records).log_time == 0
-        with pytest.raises(BagError, match="without a binary payload"):
-            next(records)
-
-    @pytest.mark.parametrize("table", ["messages", "topics"])
-    def test_a_database_of_something_else_is_refused(self, table: str, tmp_path: Path) -> None:
-        path = change(write_db3(tmp_path / "a.db3", chatter(3)), f"DROP TABLE {table}")
-        with pytest.raises(BagError, match="not a rosbag2 file"):
-            Rosbag2Reader().summarize(path)
-
     def test_messages_of_no_topic_are_left_out_and_reported(self, tmp_path: Path) -> None:
         path = change(
             write_db3(tmp_path / "a.db3", chatter(3)),
@@ -224,12 +208,6 @@ class TestSqliteSchemas:
         summary = reader.summarize(path)
         assert summary.count == len(read(reader, path)) == 2
         assert summary.notes == ("left out: 1 message of no topic",)
-
-    def test_a_message_that_was_compressed_by_itself_comes_plain(self, tmp_path: Path) -> None:
-        plain = text(1, "hello " * 50)
-        packed = Msg("/chatter", STRING, 1, zstandard.compress(plain.payload))
-        (record,) = read(Rosbag2Reader(), write_db3(tmp_path / "a.db3", [packed]))
-        assert record.payload == plain.payload
 
     def test_a_name_with_odd_characters_is_found(self, tmp_path: Path) -> None:
         path = write_db3(tmp_path / "50% off?" / "a#b.db3", chatter(2))
@@ -347,20 +325,6 @@ class TestCompressedFiles:
         records = read(reader, path, "/noise")
         assert [r.payload for r in records] == [m.payload for m in messages[: summary.count]]
 
-    def test_a_damaged_file_is_read_up_to_the_damage(self, tmp_path: Path) -> None:
-        messages = [Msg("/noise", STRING, time, os.urandom(4000)) for time in range(300)]
-        layout = McapLayout(chunk_size=50_000)
-        path = compressed(write_mcap(tmp_path / "a.mcap", messages, layout))
-        data = bytearray(path.read_bytes())
-        # The type of a block that is far inside: reserved.
-        at = _block_starts(bytes(data))[4]
-        data[at] |= 6
-        path.write_bytes(data)
-        summary = Rosbag2Reader().summarize(path)
-        assert 50 < summary.count < 200
-        assert not summary.complete
-        assert "is damaged" in summary.notes[0]
-
     def test_what_cannot_be_decompressed_at_all_is_refused_by_its_own_name(
         self, tmp_path: Path
     ) -> None:
@@ -442,20 +406,6 @@ def _block_starts(data: bytes) -> list[int]:
 
 
 class TestKinds:
-    def test_one_reader_recognises_all_four_kinds(self, tmp_path: Path) -> None:
-        messages = [text(1, "x"), boolean(2, True)]
-        paths = [
-            write_mcap(tmp_path / "a.mcap", messages),
-            write_db3(tmp_path / "a.db3", messages),
-            compressed(write_mcap(tmp_path / "b.mcap", messages)),
-            compressed(write_db3(tmp_path / "b.db3", messages)),
-        ]
-        reader = Rosbag2Reader()
-        assert [reader.reads(path) for path in paths] == [True] * 4
-        assert {reader.summarize(path).topics for path in paths} == {
-            reader.summarize(paths[0]).topics
-        }
-
     def test_a_kind_that_is_not_read_is_refused(self, tmp_path: Path) -> None:
         path = tmp_path / "a.bag"
         path.write_bytes(b"#ROSBAG V2.0\n")

@@ -39,7 +39,7 @@ def test_of_uncompressed_files_every_message_that_reached_the_disk_is_read(
     ends = sorted(whole.index(m.payload) + len(m.payload) for m in messages)
     path = tmp_path / "cut.mcap"
     reader = McapReader()
-    for size in range(8, len(whole) - 8):
+    for size in range(8, len(whole) - 8, 3):
         path.write_bytes(whole[:size])
         summary = reader.summarize(path)
         on_disk = sum(end <= size for end in ends)
@@ -67,13 +67,6 @@ def test_zeros_behind_the_last_record_are_what_a_power_cut_leaves(tmp_path: Path
     summary = McapReader().summarize(path)
     assert summary.count == 5
     assert summary.notes == ("the file ends early: the last 4096 bytes could not be read",)
-
-
-def test_a_file_whose_writer_stopped_between_records_has_lost_nothing(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", chatter(5), McapLayout(chunk_size=None, finish=False))
-    summary = McapReader().summarize(path)
-    assert (summary.count, summary.complete) == (5, False)
-    assert summary.notes == ("the file ends early: its writer did not finish it",)
 
 
 @pytest.mark.parametrize("compression", [CompressionType.ZSTD, CompressionType.LZ4])

@@ -275,10 +275,7 @@ class McapBags:
             del group  # before the next is read
         for chunk in chunks.alone:
             yield from self._batches_of_chunk(file, chunk, wanted, window, None)
-        try:
-            yield from bare_batches(file, chunks.unread, wanted, window)
-        except UnreadableError as error:
-            raise _ContradictedError(reason_of(error)) from error
+        yield from bare_batches(file, chunks.unread, wanted, window)
         passed.update({chunk.offset: chunk for chunk in chunks.unread})
 
     def _loose_batches(

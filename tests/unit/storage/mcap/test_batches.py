@@ -15,7 +15,7 @@ from mcap.writer import CompressionType
 
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.mcap import bag_file, bulk
+from ros2_memory.storage.mcap import bulk
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, text, write_mcap
 from tests.support.examples import examples
@@ -123,13 +123,6 @@ def test_compressed_messages_are_decompressed(tmp_path: Path) -> None:
         for nth, time in enumerate(batch.log_times.tolist())
     }
     assert found == {each.log_time: each.payload for each in plain}
-
-
-def test_indexed_chunks_are_read_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_mcap(tmp_path / "a.mcap", chatter(40), SMALL)
-    monkeypatch.delattr(bag_file.McapBags, "_batches_of_chunk")
-    [batch] = McapReader().batches(path, TOPICS, EVERYTHING)
-    assert batch.log_times.tolist() == list(range(40))
 
 
 def test_no_buffer_has_more_than_its_share_of_small_chunks(

@@ -82,12 +82,3 @@ def test_what_other_bags_declare_is_not_taken_for_what_a_bag_declares(tmp_path: 
             each.type for each in messages[:n]
         }
         assert summary.declared.declarations.resolved
-
-
-def test_a_bag_that_repeats_another_ones_beginning_is_read_to_its_own_end(tmp_path: Path) -> None:
-    short, long = ([text(n, "x", f"/{n}") for n in range(count)] for count in (3, 9))
-    for messages in (short, long, short, long):
-        with OpenFile(write_mcap(tmp_path / "a.mcap", messages, SMALL)) as file:
-            summary = read_summary(file)
-        assert len(summary.declared.channels) == len(messages)
-        assert sum(len(chunk.channels) for chunk in summary.chunks) == len(messages)
