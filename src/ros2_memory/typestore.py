@@ -71,17 +71,10 @@ class MessageType(NamedTuple):
     """What one schema defines.
 
     Attributes:
-        name: the type, `package/msg/Name`.
-        definitions: those of the type and of its nested types.
-        fieldless: whether the definition has no field, so that any payload of more than a byte
-            contradicts it.
-        fields: the definitions again, from the root down, for readers that do not know rosbags.
+        fields: from the root down, for readers that do not know rosbags.
         store: compiles a deserializer when one is first asked for: columns need none.
     """
 
-    name: str
-    definitions: Typesdict
-    fieldless: bool
     fields: Definition
     store: Typestore
 
@@ -89,18 +82,18 @@ class MessageType(NamedTuple):
         """Returns the type with a deserializer; or why none can be made."""
         try:
             with _run_by_rosbags():
-                self.store.get_msgdef(self.name)
+                self.store.get_msgdef(self.fields.type)
         except _UnusableError as error:
             return str(error)
         return self
 
     def deserialize(self, payload: bytes) -> object:
         """Decodes a payload."""
-        return self.store.deserialize_cdr(payload, self.name)
+        return self.store.deserialize_cdr(payload, self.fields.type)
 
     def serialize(self, message: object) -> bytes:
         """Encodes a decoded message as CDR."""
-        return bytes(self.store.serialize_cdr(message, self.name))
+        return bytes(self.store.serialize_cdr(message, self.fields.type))
 
 
 class _UnusableError(Exception):
@@ -160,8 +153,7 @@ class Typestores:
                 store.register(definitions)
         except _UnusableError as error:
             return " ".join(str(error).split())[:_REASON_LENGTH]
-        fields = definition_of(definitions, root)
-        return MessageType(root, definitions, not definitions[root][1], fields, store)
+        return MessageType(definition_of(definitions, root), store)
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""

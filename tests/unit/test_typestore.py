@@ -204,11 +204,11 @@ module a_msgs {{ module msg {{ struct B {{ octet value; string name; }}; }}; }};
     def test_a_type_without_fields_differs_from_one_whose_text_was_not_found(self) -> None:
         empty = lookup("a_msgs/msg/Nothing", "")
         assert isinstance(empty, MessageType)
-        assert empty.fieldless
+        assert not empty.fields.fields
         assert decoded(empty, CDR + b"\0") is not None
         standard = lookup("std_msgs/msg/String", "")
         assert isinstance(standard, MessageType)
-        assert not standard.fieldless
+        assert standard.fields.fields
         assert reason(lookup("a_msgs/msg/Nothing", "", ""))
 
 

@@ -7,7 +7,7 @@ from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -48,8 +48,7 @@ def without(spans: Iterable[tuple[Ns, Ns]], others: Sequence[tuple[Ns, Ns]]) -> 
 
 def lies_inside(spans: Sequence[tuple[Ns, Ns]], moment: Ns) -> bool:
     """Returns whether a moment lies in one of spans that are sorted and apart."""
-    index = bisect_right(spans, (moment, MAX_NS)) - 1
-    return index >= 0 and moment < spans[index][1]
+    return overlaps_any(spans, moment, moment)
 
 
 def overlaps_any(spans: Sequence[tuple[Ns, Ns]], first: Ns, last: Ns) -> bool:

@@ -131,6 +131,7 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
+        self._known_recordings: dict[str, dict[Path, Span]] = {}
 
     @cached_property
     def latest(self) -> Ns:
@@ -242,12 +243,17 @@ class Segment:
 
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
-        column = _columns(self).of(topic)
-        if column is None:
-            return {}
-        of = self._folder_rows[1][column.bags]
-        spans = _spans_of(len(self._recordings), of, column.firsts, column.lasts)
-        return {self._recordings[number]: spans[number] for number in dict.fromkeys(of.tolist())}
+        known = self._known_recordings.get(topic)
+        if known is None:
+            column = _columns(self).of(topic)
+            known = {}
+            if column is not None:
+                of = self._folder_rows[1][column.bags]
+                spans = _spans_of(len(self._recordings), of, column.firsts, column.lasts)
+                for number in dict.fromkeys(of.tolist()):
+                    known[self._recordings[number]] = spans[number]
+            self._known_recordings[topic] = known
+        return known
 
     @cached_property
     def _recordings(self) -> list[Path]:

@@ -34,7 +34,7 @@ from ros2_memory.index.segment import (
 from ros2_memory.index.unreadable_span import MAX_FILE_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
 
@@ -56,7 +56,6 @@ class Timeline:
         self.segments = tuple(segments)
         self.memo = Memo()
         self._recordings: dict[str, dict[Path, Span]] = {}
-        self._before_last: dict[str, dict[Path, Span]] = {}  # of all segments but the last
 
     @classmethod
     def of(cls, bags: Iterable[BagFile]) -> Timeline:
@@ -87,11 +86,7 @@ class Timeline:
         segments: list[Segment] = []
         for at, segment in enumerate(self.segments):
             segments += _segments_of(touched[at]) if at in touched else [segment]
-        changed = Timeline(segments)
-        if touched.keys() == {len(segments) - 1} and len(segments) == len(self.segments):
-            # Mostly the end changes, often while a file there grows.
-            changed._before_last = self._before_last
-        return changed
+        return Timeline(segments)
 
     @cached_property
     def _firsts(self) -> list[tuple[Ns, Ns, str]]:
@@ -129,10 +124,11 @@ class Timeline:
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
         if topic not in self._recordings:
-            if topic not in self._before_last:
-                self._before_last[topic] = _recordings(self.segments[:-1], topic, {})
-            known = self._before_last[topic]
-            self._recordings[topic] = _recordings(self.segments[-1:], topic, known)
+            spans: dict[Path, Span] = {}
+            for segment in self.segments:
+                for folder, span in segment.recordings(topic).items():
+                    spans[folder] = wider(spans.get(folder), span)
+            self._recordings[topic] = spans
         return self._recordings[topic]
 
     @cached_property
@@ -309,14 +305,3 @@ def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
 def _starts_segment(bag: BagFile) -> bool:
     """Whether a bag begins a segment whatever comes before it: chosen evenly, by its name."""
     return crc32(os.fsencode(bag.file[bag.file.rfind("/") + 1 :])) % _STARTS == 0
-
-
-def _recordings(
-    segments: Iterable[Segment], topic: str, known: Mapping[Path, Span]
-) -> dict[Path, Span]:
-    """Returns the recordings that hold the topic in some segments, added to those known."""
-    spans = dict(known)
-    for segment in segments:
-        for folder, span in segment.recordings(topic).items():
-            spans[folder] = wider(spans.get(folder), span)
-    return spans

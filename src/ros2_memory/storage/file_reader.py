@@ -9,11 +9,10 @@ from contextlib import AbstractContextManager, suppress
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from rosbags.interfaces import Nodetype
 from rosbags.serde.utils import SIZEMAP
 
 from ros2_memory.core.errors import UndecodableError
-from ros2_memory.storage.base import BagReader, Batch, Channel, Definition, Record
+from ros2_memory.storage.base import SEQUENCE, BagReader, Batch, Channel, Definition, Record
 from ros2_memory.storage.errors import LostError, UnreadableError, raise_if_lost, reading
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC
 from ros2_memory.typestore import MessageType, Typestores
@@ -21,8 +20,6 @@ from ros2_memory.typestore import MessageType, Typestores
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
-
-    from rosbags.interfaces.typing import FieldDesc, Typesdict
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.core.large_reads import LargeReads
@@ -45,7 +42,7 @@ class _StoppedError(Exception):
     """There are more objects than are counted, or the payload does not fit its definition."""
 
 
-def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
+def holds_too_many(definition: Definition, payload: bytes) -> bool:
     """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
     One byte of it can become an object of a hundred. The length that a sequence states counts. A
@@ -53,61 +50,53 @@ def holds_too_many(definitions: Typesdict, root: str, payload: bytes) -> bool:
     """
     if len(payload) < _COUNTED_FROM_BYTES:
         return False
-    walk = _Walk(definitions, payload)
+    walk = _Walk(payload)
     with suppress(_StoppedError, struct.error, IndexError):
-        walk.message(root)
+        walk.message(definition)
     return walk.objects > MAX_OBJECTS
 
 
 class _Walk:
     """Goes through the fields of a payload, in either byte order, and counts texts and messages."""
 
-    def __init__(self, definitions: Typesdict, payload: bytes) -> None:
+    def __init__(self, payload: bytes) -> None:
         self.objects = 0
-        self._definitions = definitions
         self._payload = payload
         self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
         self._position = _HEADER_BYTES
 
-    def message(self, name: str) -> None:
+    def message(self, definition: Definition) -> None:
         self._count()
-        fields = self._definitions[name][1]
-        if not fields:
+        if not definition.fields:
             self._advance(1, 1)
-        for _, field in fields:
-            self._field(field)
+        for field in definition.fields:
+            if field.length is None:
+                self._one(field.kind)
+            else:
+                length = self._length() if field.length == SEQUENCE else field.length
+                self._elements(field.kind, length)
 
-    def _field(self, field: FieldDesc) -> None:
-        if field[0] == Nodetype.BASE:
-            self._primitive(field[1][0])
-        elif field[0] == Nodetype.NAME:
-            self.message(str(field[1]))
-        elif field[0] == Nodetype.ARRAY:
-            element, count = field[1]
-            self._elements(element, count)
-        else:
-            self._elements(field[1][0], self._length())
-
-    def _elements(self, element: FieldDesc, count: int) -> None:
+    def _elements(self, kind: str | Definition, count: int) -> None:
         """Goes past some elements: at once where all have one size."""
-        size = _SIZES.get(element[1][0]) if element[0] == Nodetype.BASE else None
-        if size is not None:
+        if isinstance(kind, str) and kind in _SIZES:
             if count:  # without elements there is no padding either
-                self._advance(size, size * count)
+                self._advance(_SIZES[kind], _SIZES[kind] * count)
             return
-        if element[0] == Nodetype.NAME and self.objects + count > MAX_OBJECTS:
+        if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
             # Each is an object: none of them needs to be read.
             self.objects += count
             raise _StoppedError
         for _ in range(count):
-            self._field(element)
+            self._one(kind)
 
-    def _primitive(self, name: str) -> None:
-        if name == "string":
+    def _one(self, kind: str | Definition) -> None:
+        if isinstance(kind, Definition):
+            self.message(kind)
+        elif kind == "string":
             self._count()
             self._advance(1, self._length())
-        elif name in _SIZES:
-            self._advance(_SIZES[name], _SIZES[name])
+        elif kind in _SIZES:
+            self._advance(_SIZES[kind], _SIZES[kind])
         else:
             raise _StoppedError
 
@@ -147,12 +136,12 @@ def _json(payload: bytes) -> object:
 def _deserialized(found: MessageType, payload: bytes) -> object:
     """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
     # The recorder may not have found the text of an empty definition.
-    if found.fieldless and len(payload) > _EMPTY_MESSAGE_BYTES:
+    if not found.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
         raise UnreadableError(
             "the definition in the bag is empty and the message is not; put the package's .msg"
             " folder into reader.custom_msg_paths"
         )
-    if holds_too_many(found.definitions, found.name, payload):
+    if holds_too_many(found.fields, payload):
         raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
     return found.deserialize(payload)
 

@@ -36,9 +36,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.index.file_state import files_in_metadata
 from ros2_memory.index.scan import Tree
-from ros2_memory.recorder import ros2bag
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
-from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -312,13 +310,6 @@ class TestDeletions:
         assert not remove_if_empty(bags / "run")
         assert contents(outside) == before
 
-    def test_no_metadata_is_corrected_behind_a_link(self, bags: Path, outside: Path) -> None:
-        before = contents(outside)
-        (bags / "linked").symlink_to(outside)
-        with pytest.raises(OSError, match="symbolic link"):
-            build_repairer().correct_metadata(bags / "linked")
-        assert contents(outside) == before
-
     def test_nothing_is_asked_for_or_answered_behind_a_link(
         self, bags: Path, outside: Path
     ) -> None:
@@ -396,21 +387,6 @@ class TestWhatTheRecorderKeepsBesideBags:
             _write_through(bags / "x.mcap", kept)
         assert contents(outside) == before
 
-    def test_old_logs_of_ros_are_deleted_and_none_behind_a_link(
-        self, bags: Path, outside: Path
-    ) -> None:
-        for folder in (bags / ".ros_log", outside / "logs"):
-            folder.mkdir()
-            for number in range(ros2bag.LOGS_KEPT + 3):
-                (folder / f"{number}.log").touch()
-        before = contents(outside)
-        ros2bag._prune(bags / ".ros_log")
-        assert len(list((bags / ".ros_log").iterdir())) == ros2bag.LOGS_KEPT
-        shutil.rmtree(bags / ".ros_log")
-        (bags / ".ros_log").symlink_to(outside / "logs")
-        ros2bag._prune(bags / ".ros_log")
-        assert contents(outside) == before
-
     def test_no_handover_is_settled_behind_a_link(self, bags: Path, outside: Path) -> None:
         sidecar = {
             "format": 1,
@@ -485,11 +461,3 @@ class TestArguments:
                     await told(server, hostile, {})
             assert [each for each in heard if str(bags) not in each and "sqlite3" not in each] == []
             assert [each for each in heard if "passwd" in each or "outside" in each] == []
-
-
-def test_a_hard_link_is_read_since_it_is_a_file_of_the_directory(bags: Path, outside: Path) -> None:
-    os.link(outside / "rec_0.mcap", bags / "run" / "hard.mcap")
-    with OpenFile(bags / "run" / "hard.mcap") as file:
-        assert file.size
-    clear_bags(bags)
-    assert (outside / "rec_0.mcap").exists()

@@ -82,13 +82,6 @@ class TestWhatARecorderLists:
         assert OwnRecordings(tmp_path).owns(recorder.directory)
         world.supervisor.stop()
 
-    def test_nothing_is_recorded_that_cannot_be_listed(self, tmp_path: Path) -> None:
-        (tmp_path / ".episodic").write_text("in the way")
-        world = World(tmp_path)
-        with pytest.raises(RecorderError, match=r"recordings\.jsonl cannot be (read|written)"):
-            world.supervisor.start()
-        assert world.recorders == []
-
     def test_the_list_is_not_written_through_a_link(self, tmp_path: Path) -> None:
         (tmp_path / "elsewhere").mkdir()
         bags = tmp_path / "bags"
@@ -290,14 +283,6 @@ class TestCopies:
         shutil.copytree(tmp_path / "bags", tmp_path / "disk")
         own = claimed(tmp_path / "disk")
         assert not any(own.owns(tmp_path / "disk" / name) for name in (A, B))
-
-    def test_a_repaired_recording_stays_its_recorders(self, tmp_path: Path) -> None:
-        path = embedding(tmp_path / A / f"{A}_0.mcap", OURS)
-        own = own_all(tmp_path)
-        path.write_bytes(path.read_bytes()[:-500])
-        assert Repairer(McapReader(), McapWriter()).repair(path)
-        assert own.owns(tmp_path / A)
-        assert custom_data(path) == OURS
 
 
 class TestWithoutAList:

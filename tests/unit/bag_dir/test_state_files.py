@@ -31,7 +31,6 @@ from ros2_memory.bag_dir.state_files import (
     TRIGGERS,
     ConditionInterval,
     Erasure,
-    Forgetting,
     Loss,
     Receipt,
     RecordingScreen,
@@ -202,7 +201,7 @@ class TestLogs:
         row = text.splitlines()[-1].encode()
         laid(tmp_path, log, row)
         [right] = log.rows(tmp_path)
-        for bit in range(8 * len(row)):
+        for bit in range(0, 8 * len(row), 13):
             flipped = bytearray(row)
             flipped[bit // 8] ^= 1 << bit % 8
             laid(tmp_path, log, bytes(flipped) + b"\n" + row)
@@ -275,14 +274,6 @@ class TestDocuments:
         laid(tmp_path, document, text)
         laid(tmp_path, document, content)
         with pytest.raises(ValueError, match=told):
-            document.read(tmp_path)
-
-    def test_one_that_is_too_long_is_told(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, document: Document, text: str
-    ) -> None:
-        laid(tmp_path, document, text)
-        monkeypatch.setattr(document, "_most_bytes", len(text.encode()) - 1)
-        with pytest.raises(ValueError, match="larger than"):
             document.read(tmp_path)
 
     def test_the_other_program_may_read_it_whatever_the_umask(
@@ -419,12 +410,4 @@ class TestForgotten:
         lines[at] = line
         laid(tmp_path, FORGOTTEN, "".join(f"{each}\n" for each in lines))
         with pytest.raises(ValueError, match=f"line {at + 1}: {told}"):
-            read_forgettings(tmp_path)
-
-    def test_a_file_that_is_too_long_is_an_error(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        FORGOTTEN.append(tmp_path, [Forgetting(1, 2, ("/a",))] * 3)
-        monkeypatch.setattr(FORGOTTEN, "_most_bytes", 100)
-        with pytest.raises(ValueError, match="larger than 100 bytes"):
             read_forgettings(tmp_path)

@@ -232,8 +232,3 @@ def test_a_spiral_whose_splits_stay_lopsided_is_simplified_in_bounded_time() -> 
     kept, error_m = drawn(path, 0.0, len(path))
     assert kept == sorted(set(kept))
     assert error_m == 0.0
-
-
-def test_the_fewest_vertices_show_the_largest_features_first() -> None:
-    path = [(0.0, 0.0, 0.0), (1.0, 0.1, 0.0), (2.0, 0.0, 0.0), (3.0, 5.0, 0.0), (4.0, 0.0, 0.0)]
-    assert drawn(path, 0.01, 3)[0] == [0, 3, 4]

@@ -58,14 +58,6 @@ def test_a_bag_is_known_by_the_end_of_its_name(name: str, kind: str | None) -> N
     assert bag_kind(name) == kind
 
 
-def test_bags_are_found_at_any_depth_and_foreign_files_are_not(tmp_path: Path) -> None:
-    for name in ("a.mcap", "rec/b.db3", "2026/rec/c.mcap.zstd", "2026/rec.mcap/d.db3.zstd"):
-        _file(tmp_path / name)
-    for name in ("recorder.json", "rec/metadata.yaml", "rec/b.db3-shm", "notes.txt"):
-        _file(tmp_path / name)
-    assert _names(Tree(tmp_path).scan(NOW, ())) == ["a.mcap", "b.db3", "c.mcap.zstd", "d.db3.zstd"]
-
-
 def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) -> None:
     _file(tmp_path / ".trash" / "rec" / "a.mcap")
     _file(tmp_path / "rec" / ".cache" / "b.mcap")
@@ -145,16 +137,6 @@ def test_links_are_named_and_not_followed(tmp_path: Path) -> None:
             "up",
         ]
         assert all("not followed" in each.reason for each in scanned.links)
-
-
-def test_a_pipe_with_the_name_of_a_bag_is_damaged_and_never_opened(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "a.mcap")
-    tree = Tree(_aged(tmp_path))
-    for scanned in (tree.scan(NOW, ()), tree.scan(NOW, ())):
-        assert scanned.stamps == {}
-        assert [(each.path.name, each.reason) for each in scanned.damaged] == [
-            ("a.mcap", "not a regular file")
-        ]
 
 
 def test_a_folder_that_cannot_be_listed_is_damaged_and_hides_no_other(tmp_path: Path) -> None:

@@ -201,21 +201,6 @@ class TestIndexesThatAreWrong:
         path.write_bytes(data[:-60] + bytes((data[-60] ^ 1,)) + data[-59:])
         assert [each.type for each in McapReader().summarize(path).of("/chatter")] == [STRING]
 
-    def test_a_channel_that_two_chunks_declare_in_two_ways_is_noted(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", chatter(12), SMALL)
-        assert McapReader().summarize(path).notes == ()
-        data = path.read_bytes()
-        other = write_mcap(tmp_path / "b.mcap", [text(n, "x", "/chattes") for n in range(3)], SMALL)
-        cut = chunks_of(other)[0].chunk_start_offset
-        behind = other.read_bytes()[cut:]
-        last = chunks_of(path)[-1]
-        at = last.chunk_start_offset + last.chunk_length + last.message_index_length
-        path.write_bytes(data[:at] + behind)
-        assert any(
-            "declares a channel or a type twice" in note
-            for note in McapReader().summarize(path).notes
-        )
-
     def test_an_index_that_names_a_message_twice_is_not_believed(self, tmp_path: Path) -> None:
         path = write_mcap(tmp_path / "a.mcap", [text(5, f"{n:0100d}") for n in range(4)])
         (chunk,) = chunks_of(path)

@@ -383,16 +383,6 @@ class TestCompressedFiles:
         gc.collect()
         assert list(scratch_root.iterdir()) == []
 
-    def test_a_temporary_file_that_somebody_deleted_is_made_again(
-        self, tmp_path: Path, scratch_root: Path
-    ) -> None:
-        path = compressed(write_mcap(tmp_path / "a.mcap", chatter(3)))
-        reader = Rosbag2Reader()
-        assert len(read(reader, path)) == 3
-        for file in scratch_root.rglob("*.mcap"):
-            file.unlink()
-        assert len(read(reader, path)) == 3
-
 
 def _block_starts(data: bytes) -> list[int]:
     """Where the blocks of the first frame begin, and where it ends (RFC 8878, 3.1.1.2)."""

@@ -15,7 +15,7 @@ from functools import lru_cache, partial
 from io import BytesIO
 from itertools import pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from mcap.data_stream import ReadDataStream
@@ -50,7 +50,6 @@ from ros2_memory.storage.mcap.bulk import (
     ReadChunks,
     bare_batches,
     batches_of,
-    batches_of_chunk,
     loose_place,
     read_groups,
 )
@@ -59,8 +58,11 @@ from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
     Chunk,
     Column,
+    Pairs,
     declarations_of,
+    index_groups,
     joined,
+    pairs_in,
     require_indexed,
     walk_chunk,
 )
@@ -109,14 +111,6 @@ class _ContradictedError(UnreadableError):
     def __init__(self, reason: str, chunk: Chunk | None = None) -> None:
         super().__init__(reason)
         self.chunk = chunk
-
-
-class _Divided(NamedTuple):
-    """Chunks that are read in groups; one by one, for want of indexes; and by indexes alone."""
-
-    together: list[Chunk]
-    alone: list[Chunk]
-    unread: list[Chunk]
 
 
 class McapBags:
@@ -221,9 +215,11 @@ class McapBags:
             read = {number for number, channel in wanted.items() if channel.topic not in bare}
             passed: dict[int, Chunk] = {}
             try:
-                chunks = self._divided(file, index, window, read, wanted)
-                yield from self._batches(file, chunks, wanted, window, passed)
-                yield from self._loose_batches(file, index, wanted, window)
+                yield from self._batches(file, index, wanted, read, window, passed=passed)
+                column = _loose(index, wanted, window)
+                fetch = _fetch_loose(file, wanted, self._uncompressed)
+                pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
+                yield from batched((loose_place(place), fetch(place, at)) for place, at in pairs)
             except _ContradictedError as error:
                 index = self._distrust(file, error)
                 yield ContradictionError(index.contradiction, window.start, window.stop - 1)
@@ -232,60 +228,37 @@ class McapBags:
                     before = passed.get(chunk.offset)
                     yield from self._batches_of_chunk(file, chunk, wanted, window, before)
 
-    def _divided(
-        self,
-        file: OpenFile,
-        index: McapIndex,
-        window: TimeWindow,
-        read: Collection[int],
-        wanted: Collection[int],
-    ) -> _Divided:
-        """Divides the chunks with wanted messages by how they are read.
-
-        Raises:
-            _ContradictedError: a chunk index names other channels or times than its chunk has.
-        """
-        divided = _Divided([], [], [])
-        if wanted:
-            self._require_beside(file, index, window)
-        for chunk in _with_any(index, wanted, window):
-            if chunk.index_places is None:
-                divided.alone.append(chunk)
-            elif chunk.channels.isdisjoint(read):
-                divided.unread.append(chunk)
-            else:
-                divided.together.append(chunk)
-        return divided
-
     def _batches(
         self,
         file: OpenFile,
-        chunks: _Divided,
+        index: McapIndex,
         wanted: dict[int, Channel],
+        read: Collection[int],
         window: TimeWindow,
+        *,
         passed: dict[int, Chunk],
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks, and adds these to `passed`.
 
+        Chunks without a channel that is to be `read` are known by their indexes alone.
+
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        for group in read_groups(file, chunks.together, self._limit):
+        if wanted:
+            self._require_beside(file, index, window)
+        chunks = [*_with_any(index, wanted, window)]
+        indexed = [chunk for chunk in chunks if chunk.index_places is not None]
+        together = [chunk for chunk in indexed if not chunk.channels.isdisjoint(read)]
+        for group in read_groups(file, together, self._limit):
             yield from self._batches_of_group(file, group, wanted, window, passed)
             del group  # before the next is read
-        for chunk in chunks.alone:
-            yield from self._batches_of_chunk(file, chunk, wanted, window, None)
-        yield from bare_batches(file, chunks.unread, wanted, window)
-        passed.update({chunk.offset: chunk for chunk in chunks.unread})
-
-    def _loose_batches(
-        self, file: OpenFile, index: McapIndex, wanted: dict[int, Channel], window: TimeWindow
-    ) -> Iterator[Batch | LostError]:
-        """Yields the messages outside chunks."""
-        column = _loose(index, wanted, window)
-        fetch = _fetch_loose(file, wanted, self._uncompressed)
-        pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
-        return batched((loose_place(place), fetch(place, time)) for place, time in pairs)
+        for chunk in chunks:
+            if chunk.index_places is None:
+                yield from self._batches_of_chunk(file, chunk, wanted, window, None)
+        unread = [chunk for chunk in indexed if chunk.channels.isdisjoint(read)]
+        yield from bare_batches(file, unread, wanted, window)
+        passed.update({chunk.offset: chunk for chunk in unread})
 
     def _batches_of_group(
         self,
@@ -298,7 +271,8 @@ class McapBags:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
         if group.buffer is not None:
             with suppress(UnreadableError, ValueError, IndexError):
-                batches = batches_of(group, wanted, window, self._uncompressed)
+                pairs = pairs_in(group.chunks, group.indexes, wanted)
+                batches = batches_of(group, pairs, wanted, window, self._uncompressed)
                 passed.update({chunk.offset: chunk for chunk in group.chunks})
                 yield from batches
                 return
@@ -328,14 +302,18 @@ class McapBags:
             if lost is not None:
                 yield lost
             return
-        columns = self._chunk_columns(file, chunk, wanted, data)
-        column = joined([each.between(window.start, window.stop) for each in columns])
-        if before is not None:
-            known = joined(list(chunk_columns(file, before, wanted).values()))
-            new = ~np.isin(column.places, known.places)
-            column = Column(column.times[new], column.places[new])
-        if column.times.size:
-            yield from batches_of_chunk(chunk, data, column, wanted, self._uncompressed)
+        try:
+            pairs = _pairs(file, chunk, wanted, data)
+            if before is not None:
+                known = _pairs(file, before, wanted, data)
+                pairs = pairs.taken(~np.isin(pairs.offsets, known.offsets))
+            content = ReadChunks([chunk], data, [len(data)])
+            batches = batches_of(content, pairs, wanted, window, self._uncompressed)
+        except (UnreadableError, ValueError, IndexError) as error:
+            if chunk.index_places is None:
+                raise
+            raise _ContradictedError(reason_of(error)) from error
+        yield from batches
 
     def _runs(
         self,
@@ -451,7 +429,8 @@ class McapBags:
         if not missing:
             return columns
         if chunk.index_places is None:
-            read = walk_chunk(self._chunk_data(file, chunk) if data is None else data).columns
+            walked = walk_chunk(self._chunk_data(file, chunk) if data is None else data)
+            read = walked.pairs.columns(missing)
         elif data is None:
             return [*columns, *chunk_columns(file, chunk, missing).values()]
         else:
@@ -548,6 +527,19 @@ class McapBags:
             data = chunk_data(file, chunk, self._limit)
             self._chunks.put(key, data, len(data))
         return data
+
+
+def _pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes) -> Pairs:
+    """Returns the messages of the wanted channels in a chunk, by its indexes if it has some.
+
+    Raises:
+        UnreadableError: it has other indexes than it should.
+    """
+    if chunk.index_places is None:
+        pairs = walk_chunk(data).pairs
+        return pairs.taken(np.isin(pairs.channels, sorted(wanted)))
+    [(chunks, indexes)] = index_groups(file, [chunk])
+    return pairs_in(chunks, indexes, wanted)
 
 
 def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:

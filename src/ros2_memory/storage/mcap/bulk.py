@@ -9,7 +9,7 @@ some 200 indexes of a few messages each, and takes three times as long. Whatever
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -24,7 +24,6 @@ from ros2_memory.storage.errors import SizeLimit, UnreadableError
 from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
     Chunk,
-    Column,
     Pairs,
     chunk_head,
     decompressed_chunk,
@@ -159,26 +158,26 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
 
 def batches_of(
     content: ReadChunks,
+    pairs: Pairs,
     channels: Mapping[int, Channel],
     window: TimeWindow,
     uncompressed: Uncompressed,
-) -> Sequence[Batch]:
+) -> Iterator[Batch]:
     """Returns the messages of some channels in decompressed chunks, compared with the records.
 
     Args:
         content: the chunks.
+        pairs: all of their messages of these channels.
         channels: the wanted channels by their number.
         window: of log time.
         uncompressed: decompresses messages.
 
     Raises:
-        UnreadableError: the indexes do not agree with the records, or messages end past their
-            chunk.
+        UnreadableError: a message is not in the records, or ends past its chunk.
     """
     buffer = content.buffer or b""
-    pairs = pairs_in(content.chunks, content.indexes, channels)
     if not pairs.times.size:
-        return ()
+        return iter(())
     sizes = np.array(content.sizes)
     ends = np.cumsum(sizes)
     begins = ends - sizes
@@ -225,8 +224,10 @@ def batches_of(
             starts[rows],
             lengths[rows],
         )
-        found += _decompressed(batch, uncompressed) if has_frames else [batch]
-    return found
+        found.append(batch)
+    if not has_frames:
+        return iter(found)
+    return chain.from_iterable(_decompressed(each, uncompressed) for each in found)
 
 
 def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
@@ -240,42 +241,6 @@ def _published(stated: IntArray, logged: IntArray) -> IntArray:
     # An unsigned time past the signed range has become negative.
     impossible = (stated < 0) | (stated == MAX_NS)
     return np.where(impossible, logged, stated) if impossible.any() else stated
-
-
-def batches_of_chunk(
-    chunk: Chunk,
-    data: bytes,
-    column: Column,
-    channels: Mapping[int, Channel],
-    uncompressed: Uncompressed,
-) -> Iterator[Batch]:
-    """Yields some messages of one decompressed chunk, whose indexes may be missing.
-
-    Raises:
-        UnreadableError: a message is not there, or ends past the chunk.
-    """
-    times, offsets = column
-    if offsets.min() < 0 or int(offsets.max()) > len(data) - MESSAGE.size:
-        raise UnreadableError(NOT_THERE)
-    heads = gathered(data, _MESSAGE, offsets)
-    numbers = heads["channel"]
-    ends = offsets + RECORD.size + heads["length"]
-    if (
-        (heads["opcode"] != _MESSAGE_OPCODE).any()
-        or (heads["log_time"] != times).any()
-        or (heads["length"] < 0).any()
-        or (ends > len(data)).any()
-        or not set(np.unique(numbers).tolist()) <= channels.keys()
-    ):
-        raise UnreadableError(NOT_THERE)
-    published = _published(np.ascontiguousarray(heads["publish_time"]), times)
-    starts = offsets + MESSAGE.size
-    sizes = np.maximum(ends - starts, 0)
-    places = offsets + place_of(chunk)
-    for number in np.unique(numbers).tolist():
-        channel = channels[number]
-        whole = Batch(channel, times, published, places, data, starts, sizes)
-        yield from _decompressed(whole.taken(numbers == number), uncompressed)
 
 
 def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:

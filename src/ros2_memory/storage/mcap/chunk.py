@@ -44,7 +44,7 @@ from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from ros2_memory.storage.base import IntArray
+    from ros2_memory.storage.base import IntArray, Mask
     from ros2_memory.storage.file_io import OpenFile
 
 
@@ -89,18 +89,13 @@ class Column(NamedTuple):
 
     @classmethod
     def of(cls, times: IntArray, places: IntArray) -> Column:
-        """Returns a sorted column, without log times that do not fit into 64 signed bits."""
+        """Returns a sorted column."""
         if times.size > 1 and not bool((times[1:] > times[:-1]).all()):
             order = np.lexsort((places, times))
             times, places = times[order], places[order]
             if bool(((times[1:] == times[:-1]) & (places[1:] == places[:-1])).any()):
                 raise UnreadableError("damaged: a message index holds a message twice")
-        if times.size and times[0] >= 0 and times[-1] < MAX_NS:
-            return cls(times, places)
-        # An unsigned time past the signed range has become negative.
-        first = int(np.searchsorted(times, 0))
-        stop = int(np.searchsorted(times, MAX_NS))
-        return cls(times[first:stop], places[first:stop])
+        return cls(times, places)
 
     def between(self, start: int, stop: int) -> Column:
         """Returns the part with log times in `[start, stop)`."""
@@ -152,12 +147,33 @@ class Chunk(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """What message indexes hold: for each message its channel, log time, offset and chunk."""
+    """Messages: for each its channel, log time, offset in its chunk, and the chunk's position."""
 
     channels: IntArray
     times: IntArray
     offsets: IntArray
     chunks: IntArray
+
+    @classmethod
+    def of(cls, numbers: array[int], times: array[int], offsets: array[int]) -> Pairs:
+        """Returns messages in file order, without (unsigned) log times that no clock shows."""
+        unsigned = np.array(times, np.uint64)
+        kept = unsigned < MAX_NS
+        places, channels = (np.array(each, np.int64)[kept] for each in (offsets, numbers))
+        return cls(channels, unsigned[kept].astype(np.int64), places, np.zeros_like(places))
+
+    def taken(self, rows: Mask) -> Pairs:
+        """Returns some of the messages."""
+        return Pairs(*(each[rows] for each in self))
+
+    def columns(self, wanted: Collection[int]) -> dict[int, Column]:
+        """Returns the messages of the wanted channels, which are of one chunk."""
+        return {
+            number: Column.of(self.times[here], self.offsets[here])
+            for number in wanted
+            for here in [self.channels == number]
+            if here.any()
+        }
 
 
 def pairs_in(
@@ -332,13 +348,13 @@ class ChunkContent:
     """The content of a decompressed chunk.
 
     Attributes:
-        columns: the messages by channel.
+        pairs: the messages.
         usable: how many of its bytes are whole records.
         messages: how many there are, with those of impossible log times.
         declarations: opcode and body of its schema and channel records.
     """
 
-    columns: dict[int, Column]
+    pairs: Pairs
     usable: int
     messages: int
     declarations: list[tuple[int, bytes]] = field(default_factory=list)
@@ -350,11 +366,10 @@ def walk_chunk(data: bytes) -> ChunkContent:
     Raises:
         UnreadableError: it has more messages or declarations than are indexed.
     """
-    found: dict[int, tuple[array[int], array[int]]] = {}
+    channels, times, places = array("H"), array("Q"), array("q")
     declarations: list[tuple[int, bytes]] = []
     position, end = 0, len(data)
     record, message = RECORD.unpack_from, MESSAGE.unpack_from
-    messages = 0
     while position + RECORD.size <= end:
         opcode, length = record(data, position)
         following = position + RECORD.size + length
@@ -364,28 +379,18 @@ def walk_chunk(data: bytes) -> ChunkContent:
             if length < MESSAGE_FIELDS:
                 break
             _, _, channel, _, log_time, _ = message(data, position)
-            entry = found.get(channel)
-            if entry is None:
-                entry = found[channel] = (array("Q"), array("q"))
-            entry[0].append(log_time)
-            entry[1].append(position)
-            messages += 1
-            if messages > MAX_CHUNK_MESSAGES:
+            channels.append(channel)
+            times.append(log_time)
+            places.append(position)
+            if len(times) > MAX_CHUNK_MESSAGES:
                 raise UnreadableError(f"a chunk holds more than {MAX_CHUNK_MESSAGES} messages")
         elif opcode in {Opcode.SCHEMA, Opcode.CHANNEL}:
             declarations.append((opcode, data[position + RECORD.size : following]))
             if len(declarations) > MAX_CHUNK_DECLARATIONS:
                 raise UnreadableError(_MANY_DECLARED)
         position = following
-    columns = {channel: column_of(*lists) for channel, lists in found.items()}
-    return ChunkContent(columns, position, messages, declarations)
-
-
-def column_of(times: Sequence[int], places: Sequence[int]) -> Column:
-    """Returns a column of log times (unsigned, in file order) and offsets."""
-    return Column.of(
-        np.array(times, dtype=np.uint64).astype(np.int64), np.array(places, dtype=np.int64)
-    )
+    pairs = Pairs.of(channels, times, places)
+    return ChunkContent(pairs, position, len(times), declarations)
 
 
 class ChunkHead(NamedTuple):

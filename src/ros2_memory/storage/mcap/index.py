@@ -68,6 +68,7 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
 _INDEX_LENGTH: Final = struct.Struct("<Q")
 _new_tuple: Final = tuple.__new__
+_NONE: Final = np.empty(0, np.int64)
 _MAX_CACHED_BYTES: Final = 128 << 10
 
 # Plain integers: the opcodes of records are compared with them some million times.
@@ -261,33 +262,30 @@ def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict
     return columns
 
 
-class _Contents:
-    """What the message indexes of a file hold, added some chunks at a time."""
+class Contents:
+    """What the messages of a file amount to, added some chunks at a time."""
 
     def __init__(self) -> None:
         self.totals: dict[int, Extent] = {}
         self.back: Ns = 0  # as `set_back` of `McapIndex`, however little
         self._held: list[tuple[IntArray, IntArray]] = []
 
-    def add(self, chunks: Sequence[Chunk], pairs: Pairs) -> None:
+    def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
         """Adds all messages of chunks, which follow those before in the file.
 
-        Raises:
-            UnreadableError: a chunk states other times than its messages have.
+        Returns:
+            The first and the last log time of each chunk with messages, of which there is one.
         """
-        starts = np.array([chunk.start for chunk in chunks])
-        ends = np.array([chunk.end for chunk in chunks])
-        begins = np.searchsorted(pairs.chunks, np.arange(len(chunks)))
-        firsts = np.minimum.reduceat(pairs.times, begins)
-        lasts = np.maximum.reduceat(pairs.times, begins)
-        if not (np.array_equal(firsts, starts) and np.array_equal(lasts, ends)):
-            raise UnreadableError(OUTSIDE)
+        of = pairs.chunks
+        parts = np.append(0, np.flatnonzero(of[1:] != of[:-1]) + 1)
+        starts = np.minimum.reduceat(pairs.times, parts)
+        ends = np.maximum.reduceat(pairs.times, parts)
         # Of a short chunk its bounds will do.
         is_long = ends - starts > SHORTEST_PAUSE_NS
-        inside = pairs.times[is_long[pairs.chunks]]
+        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=of.size))]
         self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
         order = np.argsort(pairs.channels, kind="stable")
-        numbers, of, times = pairs.channels[order], pairs.chunks[order], pairs.times[order]
+        numbers, of, times = pairs.channels[order], of[order], pairs.times[order]
         is_other = (numbers[1:] != numbers[:-1]) | (of[1:] != of[:-1])
         parts = np.append(0, np.flatnonzero(is_other) + 1)
         rows = zip(
@@ -301,12 +299,27 @@ class _Contents:
             known = self.totals.get(number)
             if known is not None:
                 self.back = max(self.back, known.last - first)
-            _add(self.totals, number, Extent(count, first, last))
+            self._add(number, Extent(count, first, last))
+        return starts, ends
+
+    def join(self, other: Contents) -> None:
+        """Adds other messages of the file, whose order relative to these is unknown."""
+        for number, extent in other.totals.items():
+            self._add(number, extent)
+        self.back = max(self.back, other.back)
+        self._held += other._held
+
+    def _add(self, number: int, extent: Extent) -> None:
+        total = self.totals.setdefault(number, extent)
+        if total is not extent:
+            total.count += extent.count
+            total.first = min(total.first, extent.first)
+            total.last = max(total.last, extent.last)
 
     @property
     def pauses(self) -> Pauses:
         """As `pauses` of `McapIndex`."""
-        firsts, lasts = zip(*self._held, strict=True)
+        firsts, lasts = zip(*self._held, strict=True) if self._held else ([_NONE], [_NONE])
         return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
 
 
@@ -364,10 +377,13 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
     if not index.chunks:
         return index
-    found = _Contents()
+    found = Contents()
     with as_unreadable():
         for group, regions in index_groups(file, index.chunks):
-            found.add(group, pairs_in(group, regions))
+            firsts, lasts = found.add(pairs_in(group, regions))
+            stated_times = [(chunk.start, chunk.end) for chunk in group]
+            if [*zip(firsts.tolist(), lasts.tolist(), strict=True)] != stated_times:
+                raise UnreadableError(OUTSIDE)
     if found.totals.keys() != stated.channel_message_counts.keys():
         raise DoubtError
     return index._replace(
@@ -457,26 +473,6 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
         return False
     # The messages of a chunk that ends before it begins would be in no window.
     return all(map(le, starts, ends))
-
-
-def add_column(totals: dict[int, Extent], channel: int, column: Column) -> None:
-    """Adds a column of one channel to the totals."""
-    times = column.times
-    if times.size:
-        _add(totals, channel, Extent(times.size, int(times[0]), int(times[-1])))
-
-
-def _add(totals: dict[int, Extent], channel: int, extent: Extent) -> None:
-    total = totals.get(channel)
-    if total is None:
-        totals[channel] = extent
-        return
-    total.count += extent.count
-    # Not by min() and max(), which take longer than all the rest.
-    if extent.first < total.first:  # noqa: PLR1730
-        total.first = extent.first
-    if extent.last > total.last:  # noqa: PLR1730
-        total.last = extent.last
 
 
 def disagreements(stated: Statistics, totals: Mapping[int, Extent]) -> tuple[str, ...]:

@@ -13,24 +13,15 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.storage.base import Closing, IntArray
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
-from ros2_memory.storage.mcap.chunk import (
-    Chunk,
-    ChunkContent,
-    ChunkOpener,
-    Column,
-    Extent,
-    column_of,
-)
+from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Extent, Pairs
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
+    Contents,
     McapIndex,
-    add_column,
     beyond_disorder,
     disagreements,
 )
@@ -45,8 +36,6 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
-
     from mcap.records import Statistics
 
     from ros2_memory.storage.file_io import OpenFile
@@ -85,14 +74,15 @@ class _Scan:
     in_chunks: Declarations = field(default_factory=Declarations)
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
-    totals: dict[int, Extent] = field(default_factory=dict)
-    loose: dict[int, tuple[array[int], array[int]]] = field(default_factory=dict)
+    found: Contents = field(default_factory=Contents)
+    # Of messages outside chunks: channels, log times and offsets.
+    loose: tuple[array[int], array[int], array[int]] = field(
+        default_factory=lambda: (array("H"), array("Q"), array("q"))
+    )
     stated: Statistics | None = None
     messages: int = 0
     damaged: list[str] = field(default_factory=list)
     partial: int = 0  # bytes of a last, compressed chunk that was read in part
-    held: list[IntArray] = field(default_factory=list)  # log times, or the bounds of a chunk
-    back: Ns = 0  # as `set_back` of `McapIndex`, however little
 
     def add(self, record: FileRecord) -> None:
         """Adds a record; one that is damaged is noted, since those behind it may be whole."""
@@ -116,9 +106,8 @@ class _Scan:
         if record.end - record.offset > self.max_bytes:
             raise UnreadableError(too_large("a message", self.max_bytes))
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
-        times, places = self.loose.setdefault(channel, (array("Q"), array("q")))
-        times.append(log_time)
-        places.append(record.offset)
+        for known, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
+            known.append(value)
         self.messages += 1
 
     def _declare(self, opcode: int, body: bytes, known: Declarations) -> None:
@@ -160,37 +149,27 @@ class _Scan:
             except UnreadableError as error:
                 self.damaged.append(str(error))
         self.messages += content.messages
-        columns = {channel: each for channel, each in content.columns.items() if each.times.size}
-        for channel, column in columns.items():
-            known = self.totals.get(channel)
-            if known is not None:
-                self.back = max(self.back, known.last - int(column.times[0]))
-            add_column(self.totals, channel, column)
-        if columns:
-            first = min(int(column.times[0]) for column in columns.values())
-            last = max(int(column.times[-1]) for column in columns.values())
-            inside = [column.times for column in columns.values()]
-            is_long = last - first > SHORTEST_PAUSE_NS
-            self.held += (
-                [np.stack([times, times]) for times in inside]
-                if is_long
-                else [np.array([[first], [last]], np.int64)]
-            )
-            numbers = frozenset(columns)
+        pairs = content.pairs
+        if pairs.times.size:
+            [first], [last] = (each.tolist() for each in self.found.add(pairs))
+            numbers = frozenset(pairs.channels.tolist())
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
     def index(self, note: str) -> McapIndex:
         """Returns what was found; `note` comes before the notes on it."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
-        columns = {channel: column_of(*lists) for channel, lists in self.loose.items()}
-        back = max([self.back, *(_set_back(times) for times, _ in self.loose.values())])
-        for channel, column in columns.items():
-            add_column(self.totals, channel, column)
+        loose = Pairs.of(*self.loose)
+        if loose.times.size:
+            beside = Contents()
+            beside.add(loose._replace(chunks=np.arange(loose.times.size)))
+            self.found.join(beside)
         declarations = self.repeated
         differing = declarations.update(self.declared)
         differing = declarations.update(self.in_chunks) or differing
         channels = declarations.channels()
-        totals = {channel: total for channel, total in self.totals.items() if channel in channels}
+        totals = {
+            channel: total for channel, total in self.found.totals.items() if channel in channels
+        }
         notes = self._notes(totals, complete=complete)
         if note:
             notes.insert(0, note)
@@ -203,21 +182,16 @@ class _Scan:
             unshared_bytes(channels),
             tuple(self.chunks),
             totals,
-            {channel: column for channel, column in columns.items() if column.times.size},
+            loose.columns({*loose.channels.tolist()}),
             complete=complete,
             notes=tuple(notes),
-            set_back=beyond_disorder(back),
-            pauses=self._pauses(columns.values()),
+            set_back=beyond_disorder(self.found.back),
+            pauses=self.found.pauses,
         )
-
-    def _pauses(self, loose: Iterable[Column]) -> Pauses:
-        held = [*self.held, *(np.stack([column.times, column.times]) for column in loose)]
-        firsts, lasts = np.concatenate([np.empty((2, 0), np.int64), *held], axis=1)
-        return pauses_among(firsts, lasts)
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]
-        timed = sum(total.count for total in self.totals.values())
+        timed = sum(total.count for total in self.found.totals.values())
         if orphans := timed - sum(total.count for total in totals.values()):
             notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:
@@ -242,11 +216,3 @@ class _Scan:
         if unread:
             return f"the file ends early: the last {unread} bytes could not be read"
         return "the file ends early: its writer did not finish it"
-
-
-def _set_back(times: array[int]) -> Ns:
-    """Returns by how much possible log times go back in this order, at most."""
-    possible = np.array([time for time in times if time <= MAX_NS], np.int64)
-    if not possible.size:
-        return 0
-    return int((np.maximum.accumulate(possible) - possible).max())

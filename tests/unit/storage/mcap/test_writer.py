@@ -137,13 +137,6 @@ class TestRewriting:
             assert (found.metadata, message.sequence) == ({"any": "thing"}, 77)
             assert (message.log_time, message.publish_time) == (5, 4)
 
-    def test_progress_ends_at_the_last_whole_record(self, tmp_path: Path) -> None:
-        source = write_mcap(tmp_path / "a.mcap", messages(), McapLayout(chunk_size=2000))
-        progress: list[int] = []
-        McapWriter().rewrite(source, tmp_path / "b.mcap", progress.append)
-        assert progress == sorted(progress)
-        assert 0.9 * source.stat().st_size < progress[-1] <= source.stat().st_size
-
     def test_what_is_no_mcap_file_is_refused_and_leaves_nothing(self, tmp_path: Path) -> None:
         source = tmp_path / "a.mcap"
         source.write_bytes(b"SQLite format 3\0 and more")
