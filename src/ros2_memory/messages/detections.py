@@ -52,7 +52,7 @@ class Detection(NamedTuple):
 def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
     """Returns the detections in an extracted value, in order; `frame_id` is the message's own."""
     found: list[Detection] = []
-    _collect(value, frame_id, MAX_DEPTH, found)
+    _walked(value, frame_id, MAX_DEPTH, None, found)
     return tuple(found)
 
 
@@ -63,36 +63,43 @@ def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
     also the place of each that scores less. What has no score stays. A value without any such
     detection is returned as it is.
     """
-    return _without(value, min_score, MAX_DEPTH)
+    return _walked(value, "", MAX_DEPTH, min_score, [])
 
 
-def _collect(value: JsonValue, frame_id: str, depth: int, found: list[Detection]) -> None:
-    """Appends the detections in a value. Generators within generators take half as long again."""
-    if depth == 0:
-        return
+def _walked(
+    value: JsonValue, frame: str, depth: int, least: float | None, found: list[Detection]
+) -> JsonValue:
+    """Appends the detections in a value; returns it without those of a score below `least`."""
+    if depth == 0 or not isinstance(value, str | list | dict):
+        return value
     if isinstance(value, str):
-        _collect(_from_json(value), frame_id, depth - 1, found)
-    elif isinstance(value, list):
-        for each in value:
-            if isinstance(each, dict):
-                _collect(each, frame_id, depth - 1, found)
-    elif isinstance(value, dict):
-        frame = _frame(value) or frame_id
-        detection = _detection(value, frame)
-        if detection is not None:
-            found.append(detection)
-        else:
-            _collect_in_fields(value, frame, depth, found)
-
-
-def _collect_in_fields(
-    value: dict[str, JsonValue], frame: str, depth: int, found: list[Detection]
-) -> None:
+        parsed = _from_json(value)
+        kept = _walked(parsed, frame, depth - 1, least, found)
+        return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
+    if isinstance(value, list):
+        parts = [
+            _walked(each, frame, depth - 1, least, found) if isinstance(each, dict) else each
+            for each in value
+        ]
+        return value if all(map(is_, parts, value)) else parts
+    frame = _frame(value) or frame
+    label = _label(value)
+    if label is not None:
+        found.append(Detection(label, _position(value), frame, _score(value)))
+        return None if _is_below(value, least) else value
+    best = _best_result(value.get("results"))
+    label = None if best is None else _label(_hypothesis(best))
+    if best is not None and label is not None:
+        position = _position(best) or _position(value)
+        found.append(Detection(label, position, frame, _score(_hypothesis(best))))
+        return value if least is None else _without_hypotheses(value, best, least)
+    fields: dict[str, JsonValue] = {}
     for name, inner in value.items():
         if name in LISTS_OF_LABELS and isinstance(inner, list):
             found += [Detection(each) for each in inner if isinstance(each, str) and each]
-        if _may_hold_detections(inner):
-            _collect(inner, frame, depth - 1, found)
+        is_worth_it = _may_hold_detections(inner)
+        fields[name] = _walked(inner, frame, depth - 1, least, found) if is_worth_it else inner
+    return value if all(map(is_, fields.values(), value.values())) else fields
 
 
 def _may_hold_detections(value: JsonValue) -> bool:
@@ -100,32 +107,6 @@ def _may_hold_detections(value: JsonValue) -> bool:
     if isinstance(value, str):
         return value[:1] in _JSON
     return isinstance(value, dict | list)
-
-
-def _without(value: JsonValue, least: float, depth: int) -> JsonValue:
-    # It goes where `_collect` goes.
-    if depth == 0:
-        return value
-    if isinstance(value, str):
-        parsed = _from_json(value)
-        kept = _without(parsed, least, depth - 1)
-        return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
-    if isinstance(value, list):
-        parts = [
-            _without(each, least, depth - 1) if isinstance(each, dict) else each for each in value
-        ]
-        return value if all(map(is_, parts, value)) else parts
-    return _without_in_object(value, least, depth) if isinstance(value, dict) else value
-
-
-def _without_in_object(value: dict[str, JsonValue], least: float, depth: int) -> JsonValue:
-    if _label(value) is not None:
-        return None if _is_below(value, least) else value
-    best = _best_result(value.get("results"))
-    if best is not None and _label(_hypothesis(best)) is not None:
-        return _without_hypotheses(value, best, least)
-    fields = {name: _without(inner, least, depth - 1) for name, inner in value.items()}
-    return value if all(map(is_, fields.values(), value.values())) else fields
 
 
 def _without_hypotheses(
@@ -141,23 +122,9 @@ def _without_hypotheses(
     return {**value, "results": kept} if None in kept else value
 
 
-def _is_below(value: dict[str, JsonValue], least: float) -> bool:
+def _is_below(value: dict[str, JsonValue], least: float | None) -> bool:
     score = _score(value)
-    return score is not None and score < least
-
-
-def _detection(value: dict[str, JsonValue], frame_id: str) -> Detection | None:
-    """Returns an object as a detection; None if it is not one."""
-    label = _label(value)
-    if label is not None:
-        return Detection(label, _position(value), frame_id, _score(value))
-    best = _best_result(value.get("results"))
-    if best is None:
-        return None
-    label = _label(_hypothesis(best))
-    position = _position(best) or _position(value)
-    score = _score(_hypothesis(best))
-    return None if label is None else Detection(label, position, frame_id, score)
+    return score is not None and least is not None and score < least
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
