@@ -15,6 +15,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
 from tests.support.mcap_surgery import (
@@ -374,6 +375,13 @@ class TestWhatAWriterMayDo:
         for number, chunked in enumerate((True, False)):
             path = raw_mcap(tmp_path / f"{number}.mcap", fill, use_chunking=chunked)
             assert times(read(McapReader(), path, "/t")) == [0, 1, 2, 3]
+
+    def test_a_channel_whose_metadata_is_not_utf_8_has_its_messages(self, tmp_path: Path) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(3), McapLayout(chunk_size=None))
+        path.write_bytes(path.read_bytes().replace(b"volatile", b"vol\xb8tile")[:-40])
+        assert times(read(McapReader(), path)) == [0, 1, 2]
+        McapWriter().rewrite(path, tmp_path / "b.mcap")
+        assert times(read(McapReader(), tmp_path / "b.mcap")) == [0, 1, 2]
 
     def test_json_is_read_as_what_it_says(self, tmp_path: Path) -> None:
         def fill(writer: Writer) -> None:

@@ -12,13 +12,11 @@ import struct
 from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
-from io import BytesIO
 from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import Header
 
@@ -78,6 +76,7 @@ from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
+    BodyStream,
     Declarations,
     closing_of,
     file_records,
@@ -169,7 +168,7 @@ class McapBags:
             first = next(file_records(file), None)
             if first is None or first.opcode != Opcode.HEADER:
                 return ""
-            header: Header = Header.read(ReadDataStream(BytesIO(first.body(file))))
+            header: Header = Header.read(BodyStream(first.body(file)))
             return header.profile
 
     def records(

@@ -65,6 +65,17 @@ def offered_as_latched(qos_profiles: str) -> bool:
     return _TRANSIENT_LOCAL.search(qos_profiles) is not None
 
 
+class BodyStream(ReadDataStream):
+    """The body of a record; a text in it that is not UTF-8 must not hide all else."""
+
+    def __init__(self, body: bytes) -> None:
+        super().__init__(BytesIO(body))
+
+    def read_prefixed_string(self) -> str:
+        """Returns a text."""
+        return self.read(self.read4()).decode(errors="replace")
+
+
 def section_records(section: bytes) -> Iterator[tuple[int, int, int]]:
     """Yields the opcode of each record of a section, and where its body begins and ends.
 
@@ -92,7 +103,7 @@ def statistics(body: bytes) -> Statistics:
     size = int.from_bytes(body[_COUNTS_AT - 4 : _COUNTS_AT], "little")
     if _COUNTS_AT + size > len(body) or size % _COUNT_BYTES:
         raise UnreadableError("damaged: the statistics are shorter than they state")
-    stated: Statistics = Statistics.read(ReadDataStream(BytesIO(body)))
+    stated: Statistics = Statistics.read(BodyStream(body))
     counts = stated.channel_message_counts.items()
     stated.channel_message_counts = {channel: count for channel, count in counts if count}
     return stated
@@ -174,7 +185,7 @@ class Declarations:
 # The bags of one robot declare the same, byte for byte.
 @lru_cache(512)
 def _declaration(opcode: int, body: bytes) -> tuple[int, Schema | mcap_records.Channel | None]:
-    stream = ReadDataStream(BytesIO(body))
+    stream = BodyStream(body)
     if opcode == Opcode.SCHEMA:
         schema: mcap_records.Schema = mcap_records.Schema.read(stream)
         text = schema.data[: MAX_DEFINITION_BYTES + 1]

@@ -10,13 +10,11 @@ from __future__ import annotations
 import hashlib
 import re
 import struct
-from io import BytesIO
 from itertools import starmap
 from typing import TYPE_CHECKING, Final
 
 import yaml
 from mcap import records as mcap_records
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.records import McapRecord, Metadata
 
@@ -24,11 +22,19 @@ from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.chunk import ChunkOpener
-from ros2_memory.storage.mcap.records import MAGIC_SIZE, FileRecord, file_records, section_records
+from ros2_memory.storage.mcap.records import (
+    MAGIC_SIZE,
+    BodyStream,
+    FileRecord,
+    file_records,
+    section_records,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from mcap.data_stream import ReadDataStream
 
 
 _READERS: Final[dict[int, Callable[[ReadDataStream], mcap_records.McapRecord]]] = {
@@ -116,7 +122,7 @@ def decode_record(opcode: int, body: bytes) -> mcap_records.McapRecord | None:
         return mcap_records.Message(channel, log_time, data, publish_time, sequence)
     try:
         with as_unreadable():
-            return _READERS[opcode](ReadDataStream(BytesIO(body)))
+            return _READERS[opcode](BodyStream(body))
     except UnreadableError:
         return None
 
