@@ -6,8 +6,10 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from functools import cached_property, lru_cache, reduce
 from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -137,6 +139,17 @@ class Segment:
     def latest(self) -> Ns:
         """Log time of the last message in any of the bags."""
         return max([bag.end for bag in self.bags])
+
+    @cached_property
+    def _reaches(self) -> NDArray[np.int64]:
+        """Log time of the last message in each bag or in one before it."""
+        return np.maximum.accumulate([bag.end for bag in self.bags])
+
+    def overlapping(self, window: TimeWindow) -> list[BagFile]:
+        """Returns the bags whose span overlaps a window, in order."""
+        begin = int(self._reaches.searchsorted(window.start))
+        end = bisect_left(self.bags, window.stop, key=attrgetter("start"))
+        return [bag for bag in self.bags[begin:end] if bag.end >= window.start]
 
     @cached_property
     def recorded(self) -> Segment | None:

@@ -227,12 +227,8 @@ class Timeline:
         """Returns the bags whose span overlaps the window, in order."""
         if window.empty:
             return ()
-        return tuple(
-            bag
-            for segment in self.segments_in(window)
-            for bag in segment.bags
-            if window.overlaps(bag.start, bag.end)
-        )
+        segments = self.segments_in(window)
+        return tuple(chain.from_iterable(segment.overlapping(window) for segment in segments))
 
     @cached_property
     def shared_times(self) -> Spans:
