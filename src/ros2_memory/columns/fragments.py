@@ -196,15 +196,20 @@ class Fragments(Generic[T]):
         self._waiting: deque[tuple[FragmentKey, T]] = deque(maxlen=_MOST_WAITING)
         self._lock = threading.Lock()
 
-    def get(self, key: FragmentKey) -> T | None:
-        """Returns a fragment; None if it was not made yet."""
+    def get(self, key: FragmentKey, also_before: Ns = 0) -> T | None:
+        """Returns a fragment; None if it was not made yet.
+
+        If it is stored, those that begin so long (ns) before it are remembered with it: they are
+        asked for next.
+        """
         # By name: each kind has one type.
         found = cast("T | None", self._remembered.get((self._kind.name, key)))
         if found is None and self._store is not None:
-            data = self._store.fragment(self._name, key)
-            found = None if data is None else self._loaded(data)
-            if found is not None:
-                self._remember(key, found)
+            for other, data in self._store.fragments(self._name, key, also_before):
+                made = self._loaded(data)
+                if made is not None:
+                    self._remember(other, made)
+                    found = made if other == key else found
         return found
 
     def put(self, key: FragmentKey, made: T) -> None:

@@ -45,7 +45,7 @@ from ros2_memory.columns.writing import (
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import Ns
+from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
@@ -383,18 +383,24 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def fragment(self, kind: str, key: FragmentKey) -> bytes | None:
-        """Returns a fragment of a kind; None where it is not stored."""
+    def fragments(
+        self, kind: str, key: FragmentKey, also_before: Ns = 0
+    ) -> list[tuple[FragmentKey, bytes]]:
+        """Returns a fragment of a kind, if it is stored, and those that begin so long before it.
 
-        def ask(connection: sqlite3.Connection) -> bytes | None:
-            row = connection.execute(
-                "SELECT data FROM fragment"
-                " WHERE kind = ? AND settings = ? AND start_ns = ? AND parts = ?",
-                (kind, key.settings, key.start, self._ids(key.parts)),
-            ).fetchone()
-            return None if row is None else bytes(row[0])
-
-        return self.read(ask, None)
+        They are of the same settings, the newest first.
+        """
+        own, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
+        query = (
+            "SELECT start_ns, parts, data FROM fragment"
+            " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC"
+        )
+        since = max(key.start - also_before, MIN_NS)
+        return [
+            (key._replace(start=start, parts=self._parts(parts)), data)
+            for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
+            if start < key.start or parts == own
+        ]
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
         """Returns where slices begin whose fragments all depend on other settings, newest first.
@@ -421,6 +427,9 @@ class ColumnStore(Database):
 
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])
+
+    def _parts(self, ids: str) -> tuple[int, ...]:
+        return tuple(number + self.offset for number in json.loads(ids))
 
     # Writing
 

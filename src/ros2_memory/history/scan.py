@@ -150,14 +150,16 @@ def remembered(
     key: FragmentKey | None,
     make: Callable[[], T],
     trouble: Callable[[], Hashable] = lambda: None,
+    *,
+    also_before: Ns = 0,
 ) -> T:
     """Returns what follows from whole parts: what is known of it, else made now.
 
     That is remembered unless something could not be read; see `joined_back`. A key of None stands
-    for what may still change.
+    for what may still change. `also_before`: see `Fragments.get`.
     """
     known = view.memory.columns.fragments(kind)
-    found = None if key is None else known.get(key)
+    found = None if key is None else known.get(key, also_before)
     if found is None:
         before = trouble(), view.notes.added
         found = make()

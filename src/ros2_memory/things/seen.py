@@ -39,6 +39,8 @@ if TYPE_CHECKING:
 VERSION: Final = 2
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
+_TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
+"""Sights of so long are taken from the store at once: the older ones are asked for next."""
 _SIZE: Final = Struct("<I")
 _MANY: Final = 64
 """A bag that spans more stretches may have odd times."""
@@ -294,7 +296,11 @@ class Watching:
         if around.parts is not None:
             part_key = FragmentKey(around.window.start, followed, around.parts)
             return remembered(
-                self._view, SIGHTS, part_key, lambda: SeenBytes(self._read(around))
+                self._view,
+                SIGHTS,
+                part_key,
+                lambda: SeenBytes(self._read(around)),
+                also_before=_TOGETHER_NS,
             ).data
         # Parts, as these, are of certain recordings.
         bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]

@@ -128,6 +128,22 @@ def test_a_robot_that_stands_takes_few_bytes() -> None:
     assert len(to_bytes(track, TRACKS.classes)) < 1000
 
 
+def test_fragments_shortly_before_one_are_remembered_with_it(world: World) -> None:
+    store, parts = world.store, (part_of(world.store),)
+    keys = [FragmentKey(T0 + minute * 60 * S, "any", parts) for minute in range(4)]
+    made = words_in(store)
+    for key in keys:
+        made.put(key, Words(f"at {key.start}"))
+    made.put(keys[2]._replace(settings="other"), Words("of other settings"))
+    made.write()
+    reading = words_in(store)
+    assert reading.get(keys[2], also_before=60 * S) == Words(f"at {keys[2].start}")
+    store.close()
+    known = [key for key in keys if reading.get(key) == Words(f"at {key.start}")]
+    assert known == keys[1:3]
+    assert reading.get(keys[2]._replace(settings="other")) is None
+
+
 def test_another_process_finds_a_fragment_that_was_stored_after_it_looked(world: World) -> None:
     store, key = world.store, FragmentKey(T0, "any", (part_of(world.store),))
     one, other = words_in(store), words_in(store)
