@@ -40,8 +40,6 @@ def main() -> int:
         took = time.process_time() - begun
         wrong = len(comparison.differences) - before
         print(f"{name}: {asked} calls, {wrong} differences, {took:.1f} s", flush=True)  # noqa: T201
-    for reason, count in comparison.left_out.items():
-        print(f"left to brute force: {count} values: {reason}")  # noqa: T201
     print(f"{calls} calls, {len(comparison.differences)} differences, {size} bytes")  # noqa: T201
     return 1 if comparison.differences and given.what == "compare" else 0
 

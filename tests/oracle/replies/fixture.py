@@ -1,8 +1,7 @@
 """The recorded calls and replies: for each world a file of JSON lines in tests/data/replies.
 
 The first line has the world's name, its settings and its named places; each other one a call, its
-reply from the bags alone, and, under `catalogue`, what served as a store then, the reply with it
-where that differs.
+reply from the bags alone, and, under `stored`, the reply with a store where that differs.
 """
 
 from __future__ import annotations
@@ -48,7 +47,7 @@ class Record:
         rows: list[dict[str, Any]] = [head]
         for replied in self.replies:
             row = {"call": replied.call.as_json(), "reply": replied.reply}
-            rows.append(row | ({} if replied.stored is None else {"catalogue": replied.stored}))
+            rows.append(row | ({} if replied.stored is None else {"stored": replied.stored}))
         lines = [json.dumps(row, ensure_ascii=False, separators=(",", ":")) for row in rows]
         packed = zstandard.ZstdCompressor(level=_LEVEL).compress("\n".join(lines).encode())
         FOLDER.mkdir(parents=True, exist_ok=True)
@@ -66,19 +65,9 @@ class Record:
         text = zstandard.ZstdDecompressor().decompress(packed, max_output_size=_MOST_BYTES)
         head, *rows = map(json.loads, text.decode().split("\n"))
         replies = [
-            Replied(
-                Call.from_json(row["call"]), _renamed(row["reply"]), _renamed(row.get("catalogue"))
-            )
-            for row in rows
+            Replied(Call.from_json(row["call"]), row["reply"], row.get("stored")) for row in rows
         ]
         return cls(head["world"], head["settings"], head["places"], replies)
-
-
-def _renamed(reply: Any) -> Any:
-    """A reply with today's name of how far the store is filled, which the page shows."""
-    if isinstance(reply, dict) and "catalogue" in reply:
-        return {"filling" if key == "catalogue" else key: each for key, each in reply.items()}
-    return reply
 
 
 def path_of(world: str) -> Path:
