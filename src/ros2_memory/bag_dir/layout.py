@@ -35,8 +35,8 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.core.directories import mode_of
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import BAG_KINDS, COMPRESSED
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.storage.base import BAG_KINDS, COMPRESSED
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -19,7 +19,7 @@ import yaml
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import integer
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
-from ros2_memory.storage.base import COMPRESSED
+from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -53,7 +53,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.core.directories import Identity, identity_of, known_identity
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.storage.base import COMPRESSED
+from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
     from collections.abc import (

@@ -28,7 +28,7 @@ from ros2_memory.config import NullRecorderNode, Settings, is_deployment_chosen,
 from ros2_memory.config_sources import GROUPS, Sources, quoted
 from ros2_memory.core.errors import ConfigError, EpisodicError, InvalidArgumentsError
 from ros2_memory.core.logging_setup import configure_logging, withheld_warnings, withhold_warnings
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import BAG_KINDS, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import (
     MAX_NS,
@@ -40,7 +40,6 @@ from ros2_memory.core.timebase import (
     unix_from_text,
     window_end_s,
 )
-from ros2_memory.storage.base import BAG_KINDS
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory

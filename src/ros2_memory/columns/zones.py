@@ -110,20 +110,24 @@ class Zones:
 
     def may_have(self, text: str) -> Mask:
         """Returns in which parts a casefolded text may be part of a value."""
-        return self._where([may_be_in(words, text) for words in self.words])
+        return self._where(lambda words: may_be_in(words, text))
 
     @property
     def may_be_json(self) -> Mask:
         """In which parts a text may be a JSON array or object."""
-        return self._where([any(may_be_in(words, mark) for mark in "[{") for words in self.words])
+        return self._where(lambda words: may_be_in(words, "[") or may_be_in(words, "{"))
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
         return 32 * self.parts.size + sum(60 + len(words) for words in self.words)
 
-    def _where(self, flags: Sequence[bool]) -> Mask:
-        return np.array([*flags, True], np.bool_)[self.codes]
+    def _where(self, may_have: Callable[[str], bool]) -> Mask:
+        """Returns in which parts words may have something; these may be few of many."""
+        flags = np.ones(len(self.words) + 1, np.bool_)
+        for code in np.unique(self.codes[self.codes != _ANY]).tolist():
+            flags[code] = may_have(self.words[code])
+        return flags[self.codes]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

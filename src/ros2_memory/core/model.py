@@ -26,6 +26,11 @@ from ros2_memory.core.timebase import (
 if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary
 
+PLAIN_KINDS: Final = (".mcap", ".db3")
+COMPRESSED: Final = ".zstd"
+BAG_KINDS: Final = (*PLAIN_KINDS, *(f"{kind}{COMPRESSED}" for kind in PLAIN_KINDS))
+"""Suffixes of bag files, whichever adapter reads them."""
+
 JsonValue: TypeAlias = "bool | int | float | str | list[JsonValue] | dict[str, JsonValue] | None"
 """The values of a reply; NaN and infinities are not JSON and become null before they are sent."""
 

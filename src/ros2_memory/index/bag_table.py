@@ -14,11 +14,11 @@ import numpy as np
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
+from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.storage.base import COMPRESSED, PLAIN_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping

@@ -143,7 +143,7 @@ class FileNotes:
 
     Attributes:
         file: its path as a string, to save memory.
-        kind: its suffix, one of `storage.base.BAG_KINDS`.
+        kind: its suffix, one of `core.model.BAG_KINDS`.
         stamp: its stat result.
         seen_at: when it was first seen like this.
         trusted: whether a later change would show in its mtime.

@@ -23,11 +23,11 @@ from weakref import WeakKeyDictionary
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, is_thinned
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
+from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.segment import Segment, folder_of
 from ros2_memory.index.split_order import split_of, stem_of
 from ros2_memory.index.timeline import Timeline
-from ros2_memory.storage.base import BAG_KINDS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -12,7 +12,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
-from ros2_memory.storage.base import COMPRESSED
+from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -19,21 +19,12 @@ from ros2_memory.columns.pack import is_large
 from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.model import COMPRESSED, BagFile, BagState, TimeWindow
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
-from ros2_memory.storage.base import (
-    COMPRESSED,
-    BagReader,
-    Batch,
-    Channel,
-    Closing,
-    Definition,
-    Record,
-    Schema,
-)
+from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
 from ros2_memory.storage.cache import ByteLru, shared
 
 if TYPE_CHECKING:

@@ -48,7 +48,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, EpisodicError
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import COMPRESSED, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.delete import repair_name
@@ -61,7 +61,7 @@ from ros2_memory.retention.repair import (
     replace_file,
     rewritten,
 )
-from ros2_memory.storage.base import COMPRESSED, BagReader, BagWriter, Closing
+from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence

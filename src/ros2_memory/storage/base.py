@@ -41,12 +41,6 @@ ROS2_PROFILE: Final = "ros2"
 """The profile of every rosbag2 file; other readers of ROS 2 bags refuse every other."""
 
 
-PLAIN_KINDS: Final = (".mcap", ".db3")
-COMPRESSED: Final = ".zstd"
-BAG_KINDS: Final = (*PLAIN_KINDS, *(f"{kind}{COMPRESSED}" for kind in PLAIN_KINDS))
-"""Suffixes of bag files, whichever adapter reads them."""
-
-
 class Closing(StrEnum):
     """Whether the writer of a file has finished, by the file itself."""
 

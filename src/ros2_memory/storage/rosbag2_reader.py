@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.large_reads import LargeReads
-from ros2_memory.storage.base import BAG_KINDS, COMPRESSED
+from ros2_memory.core.model import BAG_KINDS, COMPRESSED
 from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreachableError, UnreadableError, reading
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.file_reader import FileReader, OpenedBag

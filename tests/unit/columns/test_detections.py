@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.columns.detections import DetectionColumns, Detections, detections_by
@@ -69,7 +69,8 @@ def compared(table: Table, messages: Sequence[object], step: float = 0.0) -> boo
     type_name = table.channel.type
     expected = detections_by([detections_in(each, type_name) for each in messages])
     # A point of zeros is none, so that another may be the first where it is rounded to zeros.
-    assume(not (np.abs(expected.places) < step).all(axis=1).any())
+    if (np.abs(expected.places) < step).all(axis=1).any():
+        return True
     columns = DetectionColumns(EXTRACTOR)
     found = columns.of(table)
     assert columns.may_match(table) or not expected.rows.size

@@ -196,6 +196,13 @@ async def test_a_question_whose_columns_were_deleted_meanwhile_is_asked_again(
     assert reply.get("error") in {None, "busy"}
 
 
+async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
+    async with Client(served(tool("slow", until_given_up), timeout_s=1.0)) as client:
+        result = await client.call_tool("slow", {})
+        assert result.is_error
+        assert sent(result) == {"error": "timeout", "detail": "the question needs more than 0.9 s"}
+
+
 async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:
     released = threading.Event()
 
@@ -209,6 +216,21 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
     assert result.is_error
     assert sent(result)["error"] == "timeout"
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
+
+
+async def test_tools_are_listed_while_queries_run_and_wait() -> None:
+    released = threading.Event()
+
+    def stuck(_call: Call) -> Answer:
+        released.wait(10)
+        return value(1)
+
+    async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
+        for _ in range(2 * QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "stuck", {})
+        await anyio.wait_all_tasks_blocked()
+        assert len((await client.list_tools()).tools) == 1
+        released.set()
 
 
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
