@@ -1,4 +1,4 @@
-"""The kinds of fragments: what follows from the rows of some parts, and of what it consists."""
+"""The kinds of fragments, and the classes that each consists of."""
 
 from __future__ import annotations
 
@@ -27,9 +27,10 @@ if TYPE_CHECKING:
 
 
 def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
-    drops = tuple(drop for stands in found for drop in stands.drops)
-    blocks = stacked([stands.blocks for stands in found])
-    return [Stands(blocks, drops, max(stands.last for stands in found))]
+    drops = tuple(drop for part in found for drop in part.drops)
+    return [
+        Stands(stacked([part.blocks for part in found]), drops, max(part.last for part in found))
+    ]
 
 
 def _joined_events(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
-import numpy as np
-
-from ros2_memory.columns.table import Column, Elements, Table, Zone, joined_levels, joined_zone
+from ros2_memory.columns.table import Column, Elements, Table, Zone
 
 if TYPE_CHECKING:
     from ros2_memory.columns.layout import Layout
@@ -106,46 +104,6 @@ class StoredTable(Table):
         made = make()
         self.memory.put(key, made, size_of(made))
         return made
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class JoinedTable(StoredTable):
-    """The rows of several tables of one topic and layout, one after the other."""
-
-    tables: Sequence[StoredTable] = field(kw_only=True)
-
-    def error(self, path: str) -> float:
-        """Returns the greatest absolute error of a column, as of `StoredTable`."""
-        return max(table.error(path) for table in self.tables)
-
-    def zone(self, path: str) -> Zone | None:
-        """Returns what is known of a column without unpacking it, as of `StoredTable`."""
-        zones = [table.zone(path) for table in self.tables]
-        known = [zone for zone in zones if zone is not None]
-        return joined_zone(known) if len(known) == len(zones) else None
-
-
-def parts_of(table: Table) -> Sequence[StoredTable]:
-    """Returns the parts that a table is made of; none of one that is not stored."""
-    if isinstance(table, JoinedTable):
-        return table.tables
-    return [table] if isinstance(table, StoredTable) else []
-
-
-def joined_stored(tables: Sequence[StoredTable]) -> StoredTable:
-    """Returns the rows of tables of one topic and layout; columns are joined when asked for."""
-    first, none = tables[0], np.zeros(sum(map(len, tables)), np.int64)
-    return JoinedTable(
-        first.channel,
-        none,
-        none,
-        none,
-        *joined_levels(tables, Lazily),
-        first.left_out,
-        definition=first.definition,
-        packed=lambda _: None,
-        tables=tables,
-    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,12 +25,12 @@ import math
 import re
 from collections import ChainMap
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.storage.base import Channel, Definition, IntArray
 
@@ -103,23 +103,6 @@ class Zone(NamedTuple):
     def divided(self, by: int) -> Zone:
         """Returns the zone of the values divided by a positive number."""
         return Zone(self.low / by, self.high / by, self.nulls)
-
-
-def joined_zone(zones: Sequence[Zone]) -> Zone:
-    """Returns what is known of columns one after the other; there is at least one."""
-    words = list(dict.fromkeys(zone.words for zone in zones if zone.words is not None))
-    if any(zone.words is None for zone in zones):
-        joined = None
-    elif any(each.startswith(IN_PART) for each in words):
-        joined = "\n".join([IN_PART, *dict.fromkeys(letters_of("\n".join(words)))])
-    else:
-        joined = "\n".join(words)
-    return Zone(
-        min((zone.least for zone in zones if zone.least is not None), default=None),
-        max((zone.greatest for zone in zones if zone.greatest is not None), default=None),
-        sum(zone.nulls for zone in zones),
-        joined,
-    )
 
 
 def letters_of(text: str) -> list[str]:
@@ -336,7 +319,7 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate([table.log_times for table in tables]),
         np.concatenate([table.publish_times for table in tables]),
         np.concatenate([table.places for table in tables]),
-        *joined_levels(tables, lambda names, make: {name: make(name) for name in names}),
+        *_joined_levels(tables),
         dict(ChainMap(*(dict(table.left_out) for table in tables))),
         np.concatenate(hashes) if len(hashes) == len(tables) else None,
         first.definition,
@@ -355,34 +338,24 @@ def joined_column(parts: Sequence[Column]) -> Column:
     return joined_texts(texts)
 
 
-def joined_levels(
-    parts: Sequence[Table] | Sequence[Elements], mapping: _Mapping
-) -> tuple[Mapping[str, Column], Mapping[str, Elements]]:
+def _joined_levels(
+    parts: Sequence[Table] | Sequence[Elements],
+) -> tuple[dict[str, Column], dict[str, Elements]]:
     """Returns the columns and sequences of tables or elements one after the other.
 
-    Args:
-        parts: these, of one topic, type and definition; at least one.
-        mapping: returns a mapping of names to what is made of each.
+    They are of one topic, type and definition; there is at least one.
     """
     before = np.cumsum([0, *map(len, parts)]).tolist()
 
     def elements(path: str) -> Elements:
         inner = [part.elements[path] for part in parts]
         owners = [each.owners + rows for each, rows in zip(inner, before, strict=False)]
-        return Elements(np.concatenate(owners), *joined_levels(inner, mapping))
+        return Elements(np.concatenate(owners), *_joined_levels(inner))
 
-    return (
-        mapping(
-            parts[0].columns, lambda path: joined_column([part.columns[path] for part in parts])
-        ),
-        mapping(parts[0].elements, elements),
-    )
-
-
-class _Mapping(Protocol):
-    """Makes a mapping of names to what `make` returns of each."""
-
-    def __call__(self, names: Collection[str], make: Callable[[str], T], /) -> Mapping[str, T]: ...
+    columns = {
+        path: joined_column([part.columns[path] for part in parts]) for path in parts[0].columns
+    }
+    return columns, {path: elements(path) for path in parts[0].elements}
 
 
 def column_bytes(column: Column) -> int:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
-from ros2_memory.columns.stored import parts_of
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
@@ -189,12 +189,11 @@ class Values:
 
         They surely have it if it is one row of letters.
         """
-        if leaf.level is not ROWS:
+        if leaf.level is not ROWS or not isinstance(self.table, StoredTable):
             return None
-        known = [table.outline() for table in parts_of(self.table)]
-        letters = [one.letters.get(leaf.sources[0]) for one in known if one is not None]
-        found = [one.may_have(text) for one in letters if one is not None]
-        return np.concatenate(found) if found and len(found) == len(known) else None
+        outline = self.table.outline()
+        letters = None if outline is None else outline.letters.get(leaf.sources[0])
+        return None if letters is None else letters.may_have(text)
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
         """Returns a column of numbers or booleans; None where the table does not hold it."""

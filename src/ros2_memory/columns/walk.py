@@ -303,7 +303,7 @@ def add_sequence(
 
 
 def add_array(columns: dict[str, Column], entry: Array, rows: int, values: Numbers | None) -> None:
-    """Adds what is kept of a fixed array: its length, and the range of its numbers, if given."""
+    """Adds the columns of a fixed array: its length, and the range of its numbers, if given."""
     lengths = np.full(rows, entry.length)
     if values is None:
         columns[f"{entry.path}.length"] = lengths.astype(np.uint32)

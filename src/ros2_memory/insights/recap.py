@@ -280,7 +280,7 @@ def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
 
 
 def _when(event: Event) -> Ns:
-    """Returns when the robot was where an event is said to be: in the middle of a stop."""
+    """Returns at which log time (ns) to place an event: in the middle of a stop, or its start."""
     stood = event.kind == "stop" and event.end is not None
     return (event.start + (event.end or 0)) // 2 if stood else event.start
 
