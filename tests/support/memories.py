@@ -97,17 +97,19 @@ each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "cata
 """Asked of the bags alone, and of columns that are stored."""
 
 
-def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Memory:
+def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0) -> Memory:
     """The memory with a store of columns of the first `part` of the closed bags."""
-    return replace(memory, columns=stored_columns(memory, bag_dir, part=part))
+    return replace(memory, columns=stored_columns(memory, bag_dir, part=part, share=share))
 
 
-def stored_columns(memory: Memory, bag_dir: Path, *, part: float = 1.0) -> Scanner:
-    """A scanner over a store that has the first `part` of the closed bags."""
+def stored_columns(
+    memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0
+) -> Scanner:
+    """A scanner over a store that has the first `part` of the closed bags, by their `share`."""
     store = ColumnStore([bag_dir / OWN_FOLDER / FILE], memory.reader.definition)
     scanner = Scanner(store, bag_dir)
     later = SettableClock(memory.clock.now())
-    filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=1.0))
+    filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=share))
     timeline = memory.index.snapshot().timeline
     waiting = filling.waiting(timeline)[::-1]
     # The newest first, as the server does: numbers of bags are in no order of time.

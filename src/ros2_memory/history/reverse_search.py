@@ -21,6 +21,8 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
     refusal_for,
 )
+from ros2_memory.columns.shown import Kept
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import (
     BagError,
@@ -58,6 +60,10 @@ _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
+MOST_OPEN: Final = 32
+"""Messages of a bag that are read where columns leave open whether they meet a condition."""
+_MOST_LEFT: Final = 0.5
+"""Of these, the columns of their bag say little where they leave open more."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
 _TOGETHER_NS: Final[Ns] = NS_PER_S
@@ -218,6 +224,61 @@ def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
     )
 
 
+class RowCondition:
+    """Finds which rows of scans meet a condition: by their columns, also by those of their bags.
+
+    A topic beyond its share of the store has not all of its columns there; where these leave many
+    rows open, the columns of the bags mostly say it. What they leave open only messages can say.
+
+    Args:
+        view: of the call.
+        condition: what is asked.
+    """
+
+    def __init__(self, view: View, condition: Condition) -> None:
+        self._view = view
+        self._test = ColumnCondition(condition, view.extractor)
+        self._is_in_messages_alone: set[str] = set()
+
+    def may_match(self, parts: PartZones) -> bool | Mask:
+        """Returns which parts may have a row that meets it, as known without reading a column."""
+        return self._test.may_match(parts)
+
+    def truth(self, rows: Rows) -> Kept:
+        """Returns which rows of a table meet the condition; of those that do not count, perhaps."""
+        found, channel = self._test.truth(rows.table), rows.table.channel
+        index = np.arange(len(rows.table)) if rows.index is None else rows.index
+        left = np.flatnonzero(found.unsure[index])
+        is_stored = isinstance(rows.table, StoredTable)
+        if not is_stored or left.size <= MOST_OPEN or channel.type in self._is_in_messages_alone:
+            return found
+        surely, perhaps = found.surely.copy(), found.perhaps.copy()
+        for bag, positions in rows.some(left).bag_rows():
+            if positions.size <= MOST_OPEN:
+                continue
+            of_bag, times = index[left[positions]], rows.times[left[positions]]
+            window = TimeWindow(int(times[0]), int(times[-1]) + 1)
+            for table in self._view.bags.tables(bag, channel.topic, window):
+                if table.channel.type == channel.type:
+                    at, same = _alone(table.log_times, times)
+                    known = self._test.truth(table)
+                    surely[of_bag[same]] = known.surely[at]
+                    perhaps[of_bag[same]] = known.perhaps[at]
+            if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
+                self._is_in_messages_alone.add(channel.type)
+                break
+        return Kept(surely, perhaps)
+
+
+def _alone(times: IntArray, wanted: IntArray) -> tuple[IntArray, Mask]:
+    """Returns where times are among others, both ascending, and which are in each exactly once."""
+    first = np.searchsorted(times, wanted)
+    copies = np.searchsorted(times, wanted, side="right") - first
+    asked = np.searchsorted(wanted, wanted, side="right") - np.searchsorted(wanted, wanted)
+    same = (copies == 1) & (asked == 1)
+    return first[same], same
+
+
 class CandidateRows:
     """Finds the times of messages that may meet a condition, before a moment.
 
@@ -235,7 +296,7 @@ class CandidateRows:
         self._group: list[tuple[Ns, str]] = []
         self._view = view
         self._until = until
-        self._test = ColumnCondition(condition, view.extractor)
+        self._test = RowCondition(view, condition)
 
     def windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
         """Yields the times at which a match can lie, newest first, and of which topics it would be.
@@ -301,7 +362,7 @@ class CandidateRows:
 
     def _candidates(self, rows: Rows) -> IntArray:
         self.has_looked = True
-        found = self._test.truth(rows.table)
+        found = self._test.truth(rows)
         if found.is_none:
             self.ruled_out = True
             return np.empty(0, np.int64)

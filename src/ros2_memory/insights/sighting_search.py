@@ -17,11 +17,11 @@ import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.columns.shown import Kept, nowhere
-from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.history.reverse_search import RowCondition
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
@@ -90,7 +90,7 @@ class Matching:
         self.ruled_out = False
         self._view = view
         self._search = search
-        self._test = ColumnCondition(search.condition, view.extractor)
+        self._test = RowCondition(view, search.condition)
         self._numbers: dict[str, dict[tuple[Path, str], int]] = {}
 
     def newest_first(self, topic: str, window: TimeWindow) -> Iterator[Block]:
@@ -127,7 +127,7 @@ class Matching:
             yield waiting
 
     def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
-        truth = self._test.truth(rows.table) if rows.may_match else nowhere(len(rows.table))
+        truth = self._test.truth(rows) if rows.may_match else nowhere(len(rows.table))
         self.ruled_out |= truth.is_none
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
         tested = partial(self._tested, topic, rows, truth)

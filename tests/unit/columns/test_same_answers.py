@@ -14,14 +14,17 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
+from ros2_memory.columns import fill
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS
+from ros2_memory.history import reverse_search
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap, recap_or_before
+from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG, examples
 from tests.support.memories import memory_of, with_store
@@ -33,9 +36,17 @@ if TYPE_CHECKING:
 
     import pytest
 
+    from ros2_memory.core.model import JsonValue
+
 
 Question = tuple[str, "Callable[[Memory, Call], object]"]
 
+SEARCHES: list[tuple[str, str, JsonValue]] = [
+    ("/odom", "near_position", {"x": 0.5, "y": 0.5}),
+    ("/odom", "above", 0.9),
+    ("/vision/*", "contains", "cup"),
+]
+SEGMENT = timeline.SEGMENT_BAGS
 EXAMPLES = 200 if LONG else 10
 """Histories for each clock, others in every run; some dozens of questions are asked of each."""
 
@@ -44,6 +55,11 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
     yield "topics", queries.list_recorded_topics
     yield "range", queries.data_time_range
     yield "frames", queries.frames
+    for topic, condition, value in SEARCHES:
+        yield (
+            f"last of {topic} {condition} {value}",
+            partial(queries.find_last_match, topic=topic, condition_type=condition, value=value),
+        )
     for at in [(each + draw.choice([0, S // 3])) / 1e9 for each in draw.sample(moments, 2)]:
         moment = AtTime(at_s=at)
         for topic in ("/odom", "/dock", "/mixed", "/status"):
@@ -71,6 +87,10 @@ def questions(moments: list[int], draw: Random) -> Iterator[Question]:
                 partial(queries.trajectory_summary, span=span, topic=topic),
             )
         yield f"recap of {span}", partial(recap, span=span)
+        for topic, condition, value in SEARCHES:
+            search = partial(find_matches, topic=topic, condition_type=condition, value=value)
+            bounds = {"start_s": first / 1e9, "end_s": last / 1e9}
+            yield f"{topic} {condition} {value} in {span}", partial(search, **bounds)
         at = draw.choice([first, last])
         around = TimeRange(around_s=at / 1e9, before_s=draw.choice([1.0, 10.0, 60.0]))
         yield f"before {around}", partial(recap_or_before, span=around)
@@ -93,23 +113,33 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
     clock=st.sampled_from(["auto", "stamp"]),
     seed=st.integers(0, 2**32),
     part=st.sampled_from([1.0, 1.0, 0.5]),
-    size=st.sampled_from([1, 2, 4, timeline.SEGMENT_BAGS]),
+    size=st.sampled_from([1, 2, 4, SEGMENT]),
+    share=st.sampled_from([1.0, 0.0]),
     anew=st.booleans(),
 )
-@example(clock="auto", seed=572545084, part=1.0, size=timeline.SEGMENT_BAGS, anew=False)
-@example(clock="stamp", seed=246, part=1.0, size=timeline.SEGMENT_BAGS, anew=False)
-@example(clock="auto", seed=11445, part=1.0, size=timeline.SEGMENT_BAGS, anew=False)
+@example(clock="auto", seed=572545084, part=1.0, size=SEGMENT, share=1.0, anew=False)
+@example(clock="stamp", seed=246, part=1.0, size=SEGMENT, share=1.0, anew=False)
+@example(clock="auto", seed=11445, part=1.0, size=SEGMENT, share=1.0, anew=False)
 def test_every_question_is_answered_as_without_a_store(
-    clock: str, seed: int, part: float, size: int, monkeypatch: pytest.MonkeyPatch, *, anew: bool
+    clock: str,
+    seed: int,
+    part: float,
+    size: int,
+    share: float,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    anew: bool,
 ) -> None:
     monkeypatch.setattr(timeline, "SEGMENT_BAGS", size)
+    monkeypatch.setattr(fill, "LEAST_BYTES_PER_S", 0)
+    monkeypatch.setattr(reverse_search, "MOST_OPEN", 1)
     draw = random.Random(seed)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         moments = write_history(bag_dir, draw).moments
         limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
-        recalled = with_store(plain, bag_dir, part=part)
+        recalled = with_store(plain, bag_dir, part=part, share=share)
         if anew:  # as another process: nothing is in memory
             recalled = replace(plain, columns=Scanner(recalled.columns.store, bag_dir))
         for asked, ask in questions(moments, draw):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import random
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.sightings import find_matches
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
 from tests.support.memories import memory_of, with_store
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.results import Match
+    from ros2_memory.storage.base import Record
 
 T0_S = 1_700_000_000
 T0 = T0_S * NS_PER_S
@@ -102,6 +105,33 @@ def test_only_the_bag_of_the_match_is_read(bag_dir: Path) -> None:
     memory, reader = filled(bag_dir)
     assert at(last(memory, "contains", "scissors")) == 1
     assert reader.names == ["rec_0.mcap"]
+
+
+def test_a_bag_beyond_its_share_is_searched_by_its_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    draw = random.Random(7)
+    times = range(T0, T0 + 20 * NS_PER_S, NS_PER_S // 100)
+    xs = [draw.choice([-1, 1]) * draw.uniform(1, 9) for _ in times]
+    drive = [odom(time, x, draw.uniform(-9, 9)) for time, x in zip(times, xs, strict=True)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", drive)
+    plain = memory_of(tmp_path)
+    memory = with_store(plain, tmp_path, share=0.0)
+    decoded: list[object] = []
+    decode = McapReader.decode
+
+    def counted(self: McapReader, record: Record) -> object:
+        decoded.append(record)
+        return decode(self, record)
+
+    monkeypatch.setattr(McapReader, "decode", counted)
+    for asked in (memory, plain):
+        search = partial(last, asked, "near_position", topic="/odom")
+        assert search({"x": 0.0, "y": 0.0}).found is None
+        assert search({"x": 5.0, "y": 5.0}).found is not None
+        runs = find_matches(asked, Call(), "/odom", "above", 8.9, field="position.x", limit=99)
+        assert runs.total == sum(is_met for is_met, _ in itertools.groupby(x > 8.9 for x in xs))
+    assert len(decoded) < 100
 
 
 @pytest.mark.parametrize(
