@@ -42,7 +42,9 @@ from __future__ import annotations
 
 import math
 import struct
+import threading
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -59,7 +61,7 @@ if TYPE_CHECKING:
 
 Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
-FORMAT: Final = 19
+FORMAT: Final = 20
 """Version of the file. Raise it with every change of its tables, of their bytes, and of the rules
 by which fragments are made: only those of sights have a version of their own."""
 MOST_WORDS_BYTES: Final = 4_096
@@ -156,9 +158,24 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
 
 
+class _Zstd(threading.local):
+    """One of each a thread: a shared one corrupts data, a new one takes longer than a column."""
+
+    @cached_property
+    def compressor(self) -> zstandard.ZstdCompressor:
+        return zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
+
+    @cached_property
+    def decompressor(self) -> zstandard.ZstdDecompressor:
+        return zstandard.ZstdDecompressor()
+
+
+_ZSTD: Final = _Zstd()
+
+
 def compressed(data: bytes) -> bytes:
-    """Returns the bytes as a zstd frame that states its size."""
-    return zstandard.compress(data, LEVEL)
+    """Returns the bytes as a zstd frame that states its size and has a checksum."""
+    return _ZSTD.compressor.compress(data)
 
 
 def is_large(data: bytes) -> bool:
@@ -176,8 +193,8 @@ def decompressed(data: bytes) -> bytes:
         ValueError: it is no such frame, or a damaged one.
     """
     try:
-        return zstandard.decompress(data)
-    except zstandard.ZstdError as error:
+        return _ZSTD.decompressor.decompress(data)
+    except (zstandard.ZstdError, MemoryError) as error:  # a damaged frame may state any size
         raise ValueError(f"packed columns cannot be decompressed: {error}") from error
 
 

@@ -565,13 +565,16 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
         zones = parts.zone(_STAMPS)
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
+    def near(rows: Rows) -> Rows | None:
+        found = stamped_between(rows.table, rows.index, earliest, latest)
+        return None if found is None else rows.some(found)
+
     for topic in _recorded(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
             if sessions.may_hold(among, rows.recording):
-                near = stamped_between(rows.table, rows.index, earliest, latest)
-                some = rows if near is None else rows.some(near)
-                yield from decoded_transforms(view, _messages_in(view, some, among))
+                for some in of_columns(view, rows, near) or [rows]:
+                    yield from decoded_transforms(view, _messages_in(view, some, among))
 
 
 def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
