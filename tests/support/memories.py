@@ -105,11 +105,15 @@ def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float
 def stored_columns(
     memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0
 ) -> Scanner:
-    """A scanner over a store that has the first `part` of the closed bags, by their `share`."""
+    """A scanner over a store that has the first `part` of the closed bags.
+
+    With a `share` of 0 it has none of the columns that may be left out.
+    """
     store = ColumnStore([bag_dir / OWN_FOLDER / FILE], memory.reader.definition)
     scanner = Scanner(store, bag_dir)
     later = SettableClock(memory.clock.now())
-    filling = Filling(scanner, memory.reader, bag_dir, later, StoreLimits(max_share=share))
+    limits = StoreLimits(max_share=share, least_bytes_per_s=200 if share else 0)
+    filling = Filling(scanner, memory.reader, bag_dir, later, limits)
     timeline = memory.index.snapshot().timeline
     waiting = filling.waiting(timeline)[::-1]
     # The newest first, as the server does: numbers of bags are in no order of time.

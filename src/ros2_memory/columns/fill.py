@@ -37,8 +37,6 @@ log = get_logger(__name__)
 
 RETRY_NS: Final[Ns] = 600 * NS_PER_S
 """After this long a bag that could not be stored is tried again: the disk may have failed."""
-LEAST_BYTES_PER_S: Final = 200
-"""What the columns of a second may take however small the bags are."""
 IN_MEMORY_BYTES: Final = 64 << 20
 """What the store may take where no file can be written."""
 _MOST_HELD: Final = 64 << 20
@@ -53,12 +51,14 @@ class StoreLimits:
     """How much the store may take.
 
     Attributes:
-        max_share: of the bytes of the bags; or `LEAST_BYTES_PER_S`, whichever is more.
+        max_share: of the bytes of the bags.
         max_bytes: in all, where the file is not in the bag directory. The oldest bags go first.
+        least_bytes_per_s: what the columns of a second may take however small the bags are.
     """
 
     max_share: float = 0.15
     max_bytes: int = 2 * 10**9
+    least_bytes_per_s: int = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +321,7 @@ class Filling:
     def _share(self, bags: Sequence[BagFile]) -> int:
         size = sum(bag.size for bag in bags)
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
-        return max(round(self._limits.max_share * size), LEAST_BYTES_PER_S * length)
+        return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
 
     def _is_settled(self, bag: BagFile) -> bool:
         return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())

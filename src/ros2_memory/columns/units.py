@@ -203,6 +203,20 @@ class Rows:
             if among is None or bags[number].file in among:
                 yield bags[number], np.flatnonzero(numbers == number)
 
+    @property
+    def ranks(self) -> IntArray:
+        """How many rows of its bag have the log time of a row and come before it; of each."""
+        times, numbers = self._unit.times(), self._unit.bag_numbers()
+        order = np.lexsort((times, numbers))
+        is_first = np.ones(order.size, np.bool_)
+        is_first[1:] = np.diff(times[order]).astype(np.bool_) | np.diff(numbers[order]).astype(
+            np.bool_
+        )
+        firsts = np.flatnonzero(is_first)
+        ranks = np.empty(order.size, np.int64)
+        ranks[order] = np.arange(order.size) - np.repeat(firsts, np.diff(firsts, append=order.size))
+        return ranks if self.index is None else ranks[self.index]
+
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""
         index = positions if self.index is None else self.index[positions]

@@ -250,7 +250,7 @@ class PieceNumbers:
             pieces = self._pieces(rows, since)
             self._add_found(rows, [_of_rows(some, rows) for some in held], pieces)
         elif isinstance(table, StoredTable):
-            for decoded in decoded_rows(self._view, rows):
+            for _, decoded in decoded_rows(self._view, rows):
                 self._add(decoded, since)
         else:
             self._add_read(rows, since)
@@ -358,7 +358,7 @@ class PieceNumbers:
                 break
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
-            for decoded in decoded_rows(self._view, rows):
+            for _, decoded in decoded_rows(self._view, rows):
                 known = numbers(decoded.table, path, extractor)
                 if known is not None:
                     best = min(best, _first_furthest(decoded, _of_rows(known, decoded), sign))

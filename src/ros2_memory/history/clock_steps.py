@@ -33,7 +33,7 @@ from ros2_memory.core.timebase import Ns, unix_from_ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import seconds
 from ros2_memory.history.poses import pose_rows
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import of_columns, scan
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.holes import Pause
 
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.columns.units import Rows
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.view import View
 
@@ -247,12 +248,16 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.slots
 
-    for rows in scan(view, topic, window, may_match=may_match):
+    def stamped(rows: Rows) -> NDArray[np.int64] | None:
         column = rows.table.columns.get(_STAMP)
-        if column is not None and not isinstance(column, Texts):
-            stamps = np.asarray(column, np.int64)
-            stamps = stamps if rows.index is None else stamps[rows.index]
-            found[rows.recording].append(np.stack((rows.times, stamps)))
+        if column is None or isinstance(column, Texts):
+            return None
+        stamps = np.asarray(column, np.int64)
+        return np.stack((rows.times, stamps if rows.index is None else stamps[rows.index]))
+
+    for rows in scan(view, topic, window, may_match=may_match):
+        found[rows.recording] += of_columns(view, rows, stamped) or []
+    found = {path: parts for path, parts in found.items() if parts}
     return {path: np.concatenate(parts, axis=1) for path, parts in found.items()}
 
 

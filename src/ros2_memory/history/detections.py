@@ -15,7 +15,7 @@ from ros2_memory.columns.detections import (
 )
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.arrays import merged_times
-from ros2_memory.history.scan import messages_of
+from ros2_memory.history.scan import messages_of, of_columns
 from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import Detection, detections_of
 
@@ -76,9 +76,14 @@ class DetectionRows:
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""
+        found = of_columns(self._view, rows, self._held)
+        return self._decoded(rows) if found is None else joined_detected(found)
+
+    def _held(self, rows: Rows) -> Detected | None:
+        """Returns the detections of some rows; None where their columns leave something open."""
         known = self._columns.of(rows.table)
         if known is None:
-            return self._decoded(rows)
+            return None
         found, stamps = known
         if rows.index is not None:
             found = found.at(rows.index)

@@ -20,7 +20,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.scan import blocks, scan
+from ros2_memory.history.scan import blocks, of_columns, scan
 from ros2_memory.messages.to_json import round_real
 
 if TYPE_CHECKING:
@@ -177,11 +177,11 @@ class HeldValues:
             self._view, self._topic, window, newest_first=newest_first, reached=self._check
         )
         for together in blocks(scanned, newest_first=newest_first):
-            parts = [part for rows in together if (part := self._said(rows)) is not None]
-            if len(parts) < len(together):
+            parts = [of_columns(self._view, rows, self._said) for rows in together]
+            if any(part is None for part in parts):
                 runs = self._read(together, window, newest_first=newest_first)
             else:
-                joined = self._joined(parts)
+                joined = self._joined([one for part in parts for one in part or ()])
                 runs = reversed(joined) if newest_first else iter(joined)
             for run in runs:
                 older, newer = (run, waiting) if newest_first else (waiting, run)

@@ -36,7 +36,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import decoded_rows, scan
 from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, unknown_name_hint
@@ -61,9 +61,9 @@ _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
 MOST_OPEN: Final = 32
-"""Messages of a bag that are read where columns leave open whether they meet a condition."""
+"""Messages that are read where columns leave open whether they meet a condition."""
 _MOST_LEFT: Final = 0.5
-"""Of these, the columns of their bag say little where they leave open more."""
+"""Of those of a bag, its columns say little where they leave open more."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
 _TOGETHER_NS: Final[Ns] = NS_PER_S
@@ -253,30 +253,14 @@ class RowCondition:
         if not is_stored or left.size <= MOST_OPEN or channel.type in self._is_in_messages_alone:
             return found
         surely, perhaps = found.surely.copy(), found.perhaps.copy()
-        for bag, positions in rows.some(left).bag_rows():
-            if positions.size <= MOST_OPEN:
-                continue
-            of_bag, times = index[left[positions]], rows.times[left[positions]]
-            window = TimeWindow(int(times[0]), int(times[-1]) + 1)
-            for table in self._view.bags.tables(bag, channel.topic, window):
-                if table.channel.type == channel.type:
-                    at, same = _alone(table.log_times, times)
-                    known = self._test.truth(table)
-                    surely[of_bag[same]] = known.surely[at]
-                    perhaps[of_bag[same]] = known.perhaps[at]
+        for positions, decoded in decoded_rows(self._view, rows.some(left)):
+            of_bag = index[left[positions]]
+            known, at = self._test.truth(decoded.table), decoded.index
+            surely[of_bag], perhaps[of_bag] = known.surely[at], known.perhaps[at]
             if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
                 self._is_in_messages_alone.add(channel.type)
                 break
         return Kept(surely, perhaps)
-
-
-def _alone(times: IntArray, wanted: IntArray) -> tuple[IntArray, Mask]:
-    """Returns where times are among others, both ascending, and which are in each exactly once."""
-    first = np.searchsorted(times, wanted)
-    copies = np.searchsorted(times, wanted, side="right") - first
-    asked = np.searchsorted(wanted, wanted, side="right") - np.searchsorted(wanted, wanted)
-    same = (copies == 1) & (asked == 1)
-    return first[same], same
 
 
 class CandidateRows:

@@ -12,6 +12,7 @@ from ros2_memory.columns.scan import Asked, Scan, Stretch
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.timebase import MAX_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
 
 T = TypeVar("T", bound="Sized")
 V = TypeVar("V")
@@ -192,16 +193,19 @@ def _in_order(together: list[Rows]) -> list[Rows]:
     return sorted(together, key=lambda rows: rows.order) if len(together) > 1 else together
 
 
-def decoded_rows(view: View, rows: Rows) -> Iterator[Rows]:
-    """Yields some rows as their bags have them."""
+def decoded_rows(view: View, rows: Rows) -> Iterator[tuple[IntArray, Rows]]:
+    """Yields some rows as their bags have them, with their positions among those that count."""
+    times, ranks, channel = rows.times, rows.ranks, rows.table.channel
     for bag, positions in rows.bag_rows():
-        wanted = rows.times[positions]
+        wanted = times[positions]
         window = TimeWindow(int(wanted.min()), int(wanted.max()) + 1)
-        for nth, table in enumerate(view.bags.tables(bag, rows.table.channel.topic, window)):
-            index = np.flatnonzero(np.isin(table.log_times, wanted))
-            if table.channel.type == rows.table.channel.type and index.size:
-                unit = BagUnit(bag, table, nth)
-                yield Rows.of(unit, index)
+        for nth, table in enumerate(view.bags.tables(bag, channel.topic, window)):
+            if table.channel.type != channel.type:
+                continue
+            at = np.searchsorted(table.log_times, wanted) + ranks[positions]
+            same = np.append(table.log_times, MAX_NS)[np.minimum(at, len(table))] == wanted
+            if same.any():
+                yield positions[same], Rows.of(BagUnit(bag, table, nth), at[same])
 
 
 def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list[V] | None:
@@ -210,21 +214,27 @@ def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list
     A topic beyond its share has none in the store. None where only the messages have it.
     """
     found = read(rows)
-    if found is not None:
-        return [found]
-    every = [read(each) for each in decoded_rows(view, rows)]
-    known = [each for each in every if each is not None]
-    return known if every and len(known) == len(every) else None
+    if found is not None or not rows.table.left_out:
+        return None if found is None else [found]
+    known, left = list[V](), len(rows)
+    for positions, decoded in decoded_rows(view, rows):
+        found, left = read(decoded), left - positions.size
+        if found is None:
+            return None
+        known.append(found)
+    return known if known and not left else None
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
     """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
-    times, channel = rows.times, rows.table.channel
+    times, ranks, channel = rows.times, rows.ranks, rows.table.channel
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
-        left = Counter(wanted.tolist())
+        counting = {*zip(wanted.tolist(), ranks[positions].tolist(), strict=True)}
+        met = Counter[Ns]()
         for found in view.bags.read(bag, [channel.topic], window):
-            if left[found.time] and found.type == channel.type:
-                left[found.time] -= 1
-                yield found
+            if found.type == channel.type:
+                if (found.time, met[found.time]) in counting:
+                    yield found
+                met[found.time] += 1

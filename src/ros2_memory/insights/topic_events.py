@@ -23,7 +23,14 @@ from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.text import Reason, counted
 from ros2_memory.history.context import Note
-from ros2_memory.history.scan import blocks, joined_back, messages_of, open_scan, remembered
+from ros2_memory.history.scan import (
+    blocks,
+    joined_back,
+    messages_of,
+    of_columns,
+    open_scan,
+    remembered,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -141,9 +148,15 @@ def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEv
 
 def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:
     """Returns what the messages of some rows state: by their columns, else by reading them."""
+    found = of_columns(view, rows, lambda each: _held(view, columns, each))
+    return _stated_by(view, messages_of(view, rows)) if found is None else joined_stated(found)
+
+
+def _held(view: View, columns: StatedColumns, rows: Rows) -> Stated | None:
+    """Returns what the messages of some rows state; None where all of them have to be read."""
     found = columns.of(rows.table)
     if found is None:
-        return _stated_by(view, messages_of(view, rows))
+        return None
     stated, to_read = found.stated, found.to_read(rows.index)
     if rows.index is not None:
         stated = stated.at(rows.index)

@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 
 from ros2_memory import queries
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-from ros2_memory.columns import fill
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.model import TimeWindow
@@ -131,7 +130,6 @@ def test_every_question_is_answered_as_without_a_store(
     anew: bool,
 ) -> None:
     monkeypatch.setattr(timeline, "SEGMENT_BAGS", size)
-    monkeypatch.setattr(fill, "LEAST_BYTES_PER_S", 0)
     monkeypatch.setattr(reverse_search, "MOST_OPEN", 1)
     draw = random.Random(seed)
     with TemporaryDirectory() as folder:

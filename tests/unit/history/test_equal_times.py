@@ -5,7 +5,7 @@ from __future__ import annotations
 import random
 from collections import Counter, defaultdict
 from dataclasses import replace
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
@@ -167,11 +167,11 @@ def test_what_is_stored_of_messages_of_one_time_changes_no_answer(
             recordings = {name: [*map(_on_chatter, some)] for name, some in recordings.items()}
         write(bag_dir, recordings, draw)
         plain = memory_of(bag_dir)
-        stored = with_store(plain, bag_dir, part=part)
+        every = [with_store(plain, bag_dir, part=part, share=share) for share in (1.0, 0.0)]
         # A pause may look as where the clock was set ahead, which durations then leave out.
         if not has_types and not asked(plain, bag_dir, "data_time_range")["clock_steps"]:
             assert counted(plain, bag_dir) == pytest.approx(sightings(recordings), abs=0.051)
-        for name, given_ in QUESTIONS:
+        for stored, (name, given_) in product(every, QUESTIONS):
             reply = asked(stored, bag_dir, name, **given_, **SPAN)
             assert_same_counts(reply, asked(plain, bag_dir, name, **given_, **SPAN))
 

@@ -47,9 +47,10 @@ def recorded(
     return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
 
-@pytest.fixture(params=[False, True], ids=["without catalogue", "with catalogue"])
+@pytest.fixture(params=[None, 1.0, 0.0], ids=["no store", "all columns", "few columns"])
 def known(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Memory], Memory]:
-    return lambda memory: with_store(memory, tmp_path) if request.param else memory
+    share: float | None = request.param
+    return lambda memory: memory if share is None else with_store(memory, tmp_path, share=share)
 
 
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
