@@ -25,7 +25,6 @@ from ros2_memory.cli.options import (
     parse_duration,
     parse_time,
     present,
-    require_no_date,
 )
 from ros2_memory.cli.output import print_line, print_reply, spinner, stdout_console
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -217,9 +216,7 @@ def _in_seconds(value: object, schema: object, now: float) -> object:
     if isinstance(value, str) and kind == "number":
         seconds = parse_duration(value)
         return value if seconds is None else seconds
-    if isinstance(value, int) and kind == [*TIME_KINDS]:
-        require_no_date(str(value))
-    elif isinstance(value, str) and kind == [*TIME_KINDS]:
+    if isinstance(value, str) and kind == [*TIME_KINDS]:
         try:
             unix_from_text(value)  # the tool knows whether all of its last decimal counts
         except ValueError:

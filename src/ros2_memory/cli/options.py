@@ -36,6 +36,7 @@ from ros2_memory.core.timebase import (
     Ns,
     WallClock,
     ns_from_unix,
+    require_no_date,
     unix_from_ns,
     unix_from_text,
     window_end_s,
@@ -62,7 +63,6 @@ _AGO: Final = re.compile(
 _SECONDS_OF: Final = {"s": 1, "m": 60, "h": 3600, "d": 86_400}
 _LARGEST_UNIX_S: Final = 1e11
 """A larger number is in milliseconds or nanoseconds."""
-_DATE_WITHOUT_DASHES: Final = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 _TIME_OF_DAY: Final = re.compile(
     r"(?=.)(today|yesterday)?(?:(?:^| )(\d\d:\d\d(?::\d\d(?:\.\d{1,6})?)?))?"
 )
@@ -313,17 +313,6 @@ def parse_duration(text: str) -> float | None:
     return None if found is None else float(found[1]) * _SECONDS_OF[found[2][0]]
 
 
-def require_no_date(words: str) -> None:
-    """Checks that a number, as it was written, is no date without dashes.
-
-    Raises:
-        InvalidArgumentsError: it is; as Unix seconds it is in 1970.
-    """
-    if _DATE_WITHOUT_DASHES.fullmatch(words):
-        dashed = f"{words[:4]}-{words[4:6]}-{words[6:]}"
-        raise InvalidArgumentsError(f"{words} as Unix seconds is in 1970; the date is {dashed}")
-
-
 def parse_time(text: str, now: float) -> float:
     """Returns the Unix seconds of a time as people write it; see `TIMES`.
 
@@ -339,7 +328,10 @@ def parse_time(text: str, now: float) -> float:
         return now
     with suppress(ValueError):
         number = float(words)
-        require_no_date(words)
+        try:
+            require_no_date(number)
+        except ValueError as error:
+            raise InvalidArgumentsError(f"{text} {error}") from None
         if abs(number) > _LARGEST_UNIX_S:
             seconds = number / (1e9 if abs(number) > _LARGEST_UNIX_S * 1e4 else 1e3)
             raise InvalidArgumentsError(

@@ -33,6 +33,7 @@ START_SLACK_NS: Final[Ns] = 2 * AT_OR_BEFORE_SLACK_NS
 
 _WEEKDAYS: Final = ("Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun")
 _DIGITS: Final = re.compile(r"[0-9]{9,}(\.[0-9]+)?")
+_DATE_WITHOUT_DASHES: Final = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")
 # Not every text that `datetime` reads: it takes 17840232 for a day of the year 1784.
 _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
 _SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
@@ -136,6 +137,18 @@ def unix_from_text(text: str) -> float:
     if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:
         raise ValueError(f"is a {_WEEKDAYS[read.weekday()]}, not a {weekday}")
     return seconds
+
+
+def require_no_date(seconds: float) -> None:
+    """Checks that Unix seconds are no date without dashes.
+
+    Raises:
+        ValueError: they are; the message completes "the time, which".
+    """
+    digits = str(seconds).removesuffix(".0")
+    if _DATE_WITHOUT_DASHES.fullmatch(digits):
+        date = f"{digits[:4]}-{digits[4:6]}-{digits[6:]}"
+        raise ValueError(f"as Unix seconds is in 1970; the date is {date}")
 
 
 def rest_of_text_s(text: str) -> float:

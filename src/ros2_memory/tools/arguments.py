@@ -30,7 +30,13 @@ from pydantic import (
 from ros2_memory.analysis.motion.trajectory import MAX_WAYPOINTS
 from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
-from ros2_memory.core.timebase import rest_of_end_s, rest_of_text_s, unix_from_text, window_end_s
+from ros2_memory.core.timebase import (
+    require_no_date,
+    rest_of_end_s,
+    rest_of_text_s,
+    unix_from_text,
+    window_end_s,
+)
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.places.where import WhileCondition
 
@@ -88,6 +94,8 @@ def _as_names(value: object) -> object:
 
 def _read_time(value: object) -> object:
     """Returns Unix seconds for a text that is a time; anything else as it is."""
+    if isinstance(value, int | float):
+        require_no_date(value)
     if not isinstance(value, str):
         return value
     try:

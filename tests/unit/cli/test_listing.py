@@ -360,9 +360,8 @@ def test_times_and_durations_of_tools_may_be_words() -> None:
         "topic": "3d",
     }
     assert with_times({"seconds": "0s", "start": 5}, known, 0.0) == {"seconds": 0.0, "start": 5}
-    for wrong, said in (("soon", "'soon' is not a time"), (20261121, "the date is 2026-11-21")):
-        with pytest.raises(InvalidArgumentsError, match=said):
-            with_times({"start": wrong}, known, 1_700_000_000.0)
+    with pytest.raises(InvalidArgumentsError, match="'soon' is not a time"):
+        with_times({"start": "soon"}, known, 1_700_000_000.0)
 
 
 @pytest.mark.parametrize("words", [["cat"], ["plot", "signal", "-o", "x.svg"]])

@@ -123,3 +123,15 @@ def test_a_window_that_ends_with_a_date_includes_that_day_and_before_a_date_does
     wanted = {"topic": "/chatter", "condition_type": "contains", "value": "here"}
     found = asked(memory, tmp_path, "find_last_match", before="2026-11-18", **wanted)
     assert found["timestamp"] == hours[1] / NS_PER_S
+
+
+def test_a_date_without_dashes_is_refused_where_seconds_are_meant(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [text(BEGIN * NS_PER_S, "here", "/chatter")])
+    memory = memory_of(tmp_path)
+    for given in ({"start": 20261121}, {"end": 20261121.0}, {"around": 20261121}):
+        reply = asked(memory, tmp_path, "recap", **given)
+        assert reply["error"] == "invalid_arguments"
+        assert "as Unix seconds is in 1970; the date is 2026-11-21" in reply["detail"]
+    reply = asked(memory, tmp_path, "get_topic_at_time", topic="/chatter", timestamps=[20261121])
+    assert "the date is 2026-11-21" in reply["detail"]
+    assert "error" not in asked(memory, tmp_path, "recap", start=20269999, end=BEGIN)
