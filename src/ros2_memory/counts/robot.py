@@ -27,7 +27,7 @@ from ros2_memory.places.pose_frames import (
     places_in,
 )
 from ros2_memory.places.robot_tracks import Inside, robot_inside
-from ros2_memory.places.visits import asked_place
+from ros2_memory.places.visits import RegionVisits, asked_place
 from ros2_memory.places.where import joined_in_region, note_other_frame, parse_where
 
 if TYPE_CHECKING:
@@ -37,8 +37,10 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.motion.trajectory import Line
     from ros2_memory.core.arrays import Ints
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.regions import Region
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.view import View
     from ros2_memory.results import Bins
 
 
@@ -142,7 +144,7 @@ def count_visits(
     binned.add_lengths("placed_s", "duration", known)
     binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
     if place is not None and by != "place":
-        stayed = joined.inside(place.region, binned.window)
+        stayed = _stays(view, placement.frame_id, place.region, binned.window)
         if not stayed and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
@@ -150,7 +152,7 @@ def count_visits(
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
     places = places_in(view, named, placement, binned.window)
-    inside = [own.inside(each.region, binned.window) for each, own in places]
+    inside = [_stays(view, each.frame_id, each.region, binned.window) for each, _ in places]
     if by == "place":
         _add_each_place(binned, inside)
         return binned.answer()
@@ -163,6 +165,11 @@ def count_visits(
         binned.add_counts(f"{each.name}.entries", _entries(stays))
         binned.add_lengths(f"{each.name}.minutes", "minutes", _spans(stays))
     return binned.answer()
+
+
+def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Inside]:
+    """Returns when robots were in a region, as `visits` counts them, in order."""
+    return sorted(each.inside for each in RegionVisits(view, frame_id, region, window).every)
 
 
 def _add_visits(binned: BinnedWindow, inside: Sequence[Inside]) -> None:

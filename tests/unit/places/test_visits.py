@@ -387,12 +387,25 @@ def test_a_robot_that_stands_on_the_edge_of_a_region_does_not_leave_it(tmp_path:
     )
 
 
-@each_way
-@pytest.mark.parametrize(("fastest_mps", "driven_m", "visited"), [(10.0, 1.4, 1), (5.0, 0.0, 0)])
-def test_what_is_a_jump_for_the_path_is_one_for_visits(
-    tmp_path: Path, recalls: bool, fastest_mps: float, driven_m: float, visited: int
+def test_a_region_that_only_the_line_between_two_poses_touches_is_not_visited(
+    tmp_path: Path,
 ) -> None:
-    """The robot stands, and is 1.4 m farther after 0.2 s: at 7 m/s it passes what lies between."""
+    write_mcap(tmp_path / "bag.mcap", [odom(BEGIN + n * S, float(n), 0.0) for n in range(10)])
+    memory = memory_of(tmp_path)
+    for x, expected in (([4.4, 4.6], 0), ([4.4, 5.1], 1)):
+        where = {"x": x, "y": [-0.2, 0.2]}
+        assert asked(memory, tmp_path, "visits", where=where)["total"] == expected
+        by_day = asked(memory, tmp_path, "visits", where=where, by="day")
+        counted = dict(zip(by_day["columns"][1:], by_day["all"], strict=True))
+        assert (counted["entries"], counted["exits"]) == (expected, expected)
+
+
+@each_way
+@pytest.mark.parametrize(("fastest_mps", "driven_m"), [(10.0, 1.4), (5.0, 0.0)])
+def test_what_lies_between_two_poses_is_not_visited_be_it_driven_or_a_jump(
+    tmp_path: Path, recalls: bool, fastest_mps: float, driven_m: float
+) -> None:
+    """The robot stands, and is 1.4 m farther after 0.2 s: that is 7 m/s."""
     write_mcap(tmp_path / "rec" / "rec_0.mcap", line((5, 0.0), (0.2, 7.0), (5, 0.0)))
     memory = memory_of(
         tmp_path, limits=QuerySettings(max_plausible_speed_mps=fastest_mps), recalls=recalls
@@ -400,9 +413,12 @@ def test_what_is_a_jump_for_the_path_is_one_for_visits(
     span = {"start": BEGIN // S, "end": BEGIN // S + 12}
     way = asked(memory, tmp_path, "trajectory_summary", **span)
     assert way["distance_m"] == pytest.approx(driven_m)
-    between = {"x": 0.7, "y": 0.0, "radius_m": 0.3, "by": "hour"}
-    counted = asked(memory, tmp_path, "visits", **between, **span)
-    assert dict(zip(counted["columns"][1:], counted["all"], strict=True))["entries"] == visited
+    for radius_m, expected in ((0.3, 0), (0.8, 1)):
+        place = {"x": 0.7, "y": 0.0, "radius_m": radius_m, **span}
+        assert asked(memory, tmp_path, "visits", **place)["total"] == expected
+        counted = asked(memory, tmp_path, "visits", **place, by="hour")
+        [row] = counted["rows"]
+        assert (row[counted["columns"].index("minutes")] > 0) == (expected > 0)
 
 
 @pytest.mark.parametrize("body", ["base_link", "chassis"])
