@@ -175,13 +175,15 @@ class Filling:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         bags, whole = batch
         found = DecodedBags([], [])
-        done = 0
+        done = held = 0
         for bag in sorted(bags, key=in_time):
+            begin = len(found.tables)
             done += self._read(bag, found, hashed=self._is_shared(bag, timeline))
             self._large.release()
-            if sum(table.memory_bytes for table, _ in found.tables) > _MOST_HELD:
+            held += sum(table.memory_bytes for table, _ in found.tables[begin:])
+            if held > _MOST_HELD:
                 done += self._put(found, whole=whole)
-                found = DecodedBags([], [])
+                found, held = DecodedBags([], []), 0
         return done + self._put(found, whole=whole)
 
     def whole_since(self) -> list[TimeWindow]:
