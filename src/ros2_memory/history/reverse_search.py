@@ -249,7 +249,7 @@ class RowCondition:
         found, channel = self._test.truth(rows.table), rows.table.channel
         index = np.arange(len(rows.table)) if rows.index is None else rows.index
         left = np.flatnonzero(found.unsure[index])
-        is_stored = isinstance(rows.table, StoredTable)
+        is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
         if not is_stored or left.size <= MOST_OPEN or channel.type in self._is_in_messages_alone:
             return found
         surely, perhaps = found.surely.copy(), found.perhaps.copy()

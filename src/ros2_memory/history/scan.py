@@ -9,6 +9,7 @@ import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKey, Joined, Kind, Sized, joining
 from ros2_memory.columns.scan import Asked, Scan, Stretch
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
@@ -214,7 +215,10 @@ def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list
     A topic beyond its share has none in the store. None where only the messages have it.
     """
     found = read(rows)
-    if found is not None or not rows.table.left_out:
+    # All that is left out of the store for its type is of no use in the bag either ("" stands for
+    # it); all of a bag that is not stored is left out for its size, too.
+    left_out, is_stored = rows.table.left_out, isinstance(rows.table, StoredTable)
+    if found is not None or not left_out or ("" in left_out) == is_stored:
         return None if found is None else [found]
     known, left = list[V](), len(rows)
     for positions, decoded in decoded_rows(view, rows):
