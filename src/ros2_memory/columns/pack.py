@@ -42,9 +42,7 @@ from __future__ import annotations
 
 import math
 import struct
-import threading
 from dataclasses import dataclass
-from functools import cached_property
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -158,24 +156,9 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
 
 
-class _Zstd(threading.local):
-    """One of each a thread: a shared one corrupts data, a new one takes longer than a column."""
-
-    @cached_property
-    def compressor(self) -> zstandard.ZstdCompressor:
-        return zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
-
-    @cached_property
-    def decompressor(self) -> zstandard.ZstdDecompressor:
-        return zstandard.ZstdDecompressor()
-
-
-_ZSTD: Final = _Zstd()
-
-
 def compressed(data: bytes) -> bytes:
     """Returns the bytes as a zstd frame that states its size and has a checksum."""
-    return _ZSTD.compressor.compress(data)
+    return zstandard.ZstdCompressor(level=LEVEL, write_checksum=True).compress(data)
 
 
 def is_large(data: bytes) -> bool:
@@ -193,7 +176,7 @@ def decompressed(data: bytes) -> bytes:
         ValueError: it is no such frame, or a damaged one.
     """
     try:
-        return _ZSTD.decompressor.decompress(data)
+        return zstandard.decompress(data)
     except (zstandard.ZstdError, MemoryError) as error:  # a damaged frame may state any size
         raise ValueError(f"packed columns cannot be decompressed: {error}") from error
 
@@ -316,13 +299,14 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 def _arranged(column: _Whole) -> Packed:
     """Returns a column arranged so that its numbers have the fewer bits on average."""
     flat = column.numbers - _wrapped(column.least)
-    slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
-    delta = np.diff(flat) - slope
     name, head, left = "flat", b"", flat
     if column.greatest - column.least >= _FAR_APART:
         name = "plain"
-    elif _bits_of(delta) < _bits_of(flat - flat.mean()):
-        name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
+    else:
+        slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
+        delta = np.diff(flat) - slope
+        if _bits_of(delta) < _bits_of(flat - flat.mean()):
+            name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
     greatest = int(left.view(np.uint64).max(initial=0))
     width = 8 if name == "plain" else (greatest.bit_length() + 7) // 8
     data = b"".join((column.head, head, byte_planes(left, width)))

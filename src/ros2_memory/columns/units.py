@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
+from ros2_memory.columns.walk import within
+from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.errors import BusyError
 from ros2_memory.index.segment import in_time
 
@@ -205,16 +207,13 @@ class Rows:
 
     @property
     def ranks(self) -> IntArray:
-        """How many rows of its bag have the log time of a row and come before it; of each."""
-        times, numbers = self._unit.times(), self._unit.bag_numbers()
-        order = np.lexsort((times, numbers))
-        is_first = np.ones(order.size, np.bool_)
-        is_first[1:] = np.diff(times[order]).astype(np.bool_) | np.diff(numbers[order]).astype(
-            np.bool_
-        )
-        firsts = np.flatnonzero(is_first)
-        ranks = np.empty(order.size, np.int64)
-        ranks[order] = np.arange(order.size) - np.repeat(firsts, np.diff(firsts, append=order.size))
+        """For each row that counts, how many rows of its bag have its log time and precede it."""
+        times = self._unit.times()
+        if (np.diff(times) > 0).all():
+            return np.zeros(len(self), np.int64)
+        groups = Groups.of(distinct_rows((self._unit.bag_numbers(), times))[1])
+        ranks = np.empty_like(groups.order)
+        ranks[groups.order] = within(groups.sizes)
         return ranks if self.index is None else ranks[self.index]
 
     def some(self, positions: IntArray) -> Rows:

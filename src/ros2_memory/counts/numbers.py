@@ -30,7 +30,7 @@ from ros2_memory.history.context import READING_S
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.scan import decoded_rows, messages_of, scan
+from ros2_memory.history.scan import decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
 
 if TYPE_CHECKING:
@@ -243,17 +243,17 @@ class PieceNumbers:
         """Adds the numbers of a table from a log time on."""
         if self._add_totals(rows, since):
             return
-        table, extractor = rows.table, self._view.extractor
-        found = [numbers(table, field, extractor) for field in self._fields]
-        held = [some for some in found if some is not None]
-        if len(held) == len(found):
-            pieces = self._pieces(rows, since)
-            self._add_found(rows, [_of_rows(some, rows) for some in held], pieces)
-        elif isinstance(table, StoredTable):
-            for _, decoded in decoded_rows(self._view, rows):
-                self._add(decoded, since)
-        else:
+        found = of_columns(self._view, rows, self._held)
+        if found is None:
             self._add_read(rows, since)
+        for some, held in found or ():
+            self._add_found(some, held, self._pieces(some, since))
+
+    def _held(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
+        """Returns the numbers of all fields of a table; None where columns lack some."""
+        found = [numbers(rows.table, field, self._view.extractor) for field in self._fields]
+        held = [_of_rows(some, rows) for some in found if some is not None]
+        return (rows, held) if len(held) == len(found) else None
 
     def _add_found(
         self, rows: Rows, held: Sequence[FieldNumbers], pieces: Iterable[tuple[int, int, int]]

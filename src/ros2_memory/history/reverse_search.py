@@ -60,10 +60,10 @@ _CONSTANT_NAME: Final = re.compile(r"[A-Z][A-Z0-9_]*")
 _NUMBER_FIELD: Final = r"^[ \t]*(?:u?int[0-9]+|byte|char|float[0-9]+)[ \t]+{}\b"
 _MOST_EMPTY: Final = 200
 """Messages that are looked at for one with elements in its lists."""
-MOST_OPEN: Final = 32
-"""Messages that are read where columns leave open whether they meet a condition."""
+MOST_UNSURE: Final = 32
+"""Messages of a part that are read one by one, where its columns leave open what they meet."""
 _MOST_LEFT: Final = 0.5
-"""Of those of a bag, its columns say little where they leave open more."""
+"""Where a bag's columns leave open more of them, those of its type are left to the messages."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
 _TOGETHER_NS: Final[Ns] = NS_PER_S
@@ -238,19 +238,25 @@ class RowCondition:
     def __init__(self, view: View, condition: Condition) -> None:
         self._view = view
         self._test = ColumnCondition(condition, view.extractor)
-        self._is_in_messages_alone: set[str] = set()
+        self._left_to_messages: set[str] = set()
 
     def may_match(self, parts: PartZones) -> bool | Mask:
         """Returns which parts may have a row that meets it, as known without reading a column."""
         return self._test.may_match(parts)
 
     def truth(self, rows: Rows) -> Kept:
-        """Returns which rows of a table meet the condition; of those that do not count, perhaps."""
+        """Returns which rows of a table meet the condition.
+
+        Bags are read for the rows that count alone.
+
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
         found, channel = self._test.truth(rows.table), rows.table.channel
         index = np.arange(len(rows.table)) if rows.index is None else rows.index
         left = np.flatnonzero(found.unsure[index])
         is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
-        if not is_stored or left.size <= MOST_OPEN or channel.type in self._is_in_messages_alone:
+        if not is_stored or left.size <= MOST_UNSURE or channel.type in self._left_to_messages:
             return found
         surely, perhaps = found.surely.copy(), found.perhaps.copy()
         for positions, decoded in decoded_rows(self._view, rows.some(left)):
@@ -258,7 +264,7 @@ class RowCondition:
             known, at = self._test.truth(decoded.table), decoded.index
             surely[of_bag], perhaps[of_bag] = known.surely[at], known.perhaps[at]
             if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
-                self._is_in_messages_alone.add(channel.type)
+                self._left_to_messages.add(channel.type)
                 break
         return Kept(surely, perhaps)
 

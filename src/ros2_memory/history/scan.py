@@ -212,11 +212,11 @@ def decoded_rows(view: View, rows: Rows) -> Iterator[tuple[IntArray, Rows]]:
 def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list[V] | None:
     """Returns what is read of the columns of some rows: of those in the store, else in their bags.
 
-    A topic beyond its share has none in the store. None where only the messages have it.
+    A topic beyond its share has few in the store. None where only the messages have it.
     """
     found = read(rows)
-    # All that is left out of the store for its type is of no use in the bag either ("" stands for
-    # it); all of a bag that is not stored is left out for its size, too.
+    # Without any column ("") a stored table is for its type, which its bag does not change; one of
+    # a bag may be so for the size of all its messages together.
     left_out, is_stored = rows.table.left_out, isinstance(rows.table, StoredTable)
     if found is not None or not left_out or ("" in left_out) == is_stored:
         return None if found is None else [found]

@@ -134,6 +134,7 @@ def test_regular_times_and_decimals_in_single_precision_take_little() -> None:
         np.array([-(2**63), 2**63 - 1, 0], np.int64),
         np.array([-(2**63), -(2**63) + 1, -(2**63)], np.int64),
         np.array([0, 2**62, 0], np.int64),
+        np.array([7, 2**63 - 1], np.int64),
         np.array([0, 2**62 - 1, 0, 2**62 - 1], np.int64),
     ],
     ids=lambda column: f"{column.dtype}-{column[0]}",

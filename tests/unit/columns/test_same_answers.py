@@ -130,7 +130,7 @@ def test_every_question_is_answered_as_without_a_store(
     anew: bool,
 ) -> None:
     monkeypatch.setattr(timeline, "SEGMENT_BAGS", size)
-    monkeypatch.setattr(reverse_search, "MOST_OPEN", 1)
+    monkeypatch.setattr(reverse_search, "MOST_UNSURE", 1)
     draw = random.Random(seed)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
