@@ -404,7 +404,8 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
         raise InvalidArgumentsError(f"the value is NaN, which nothing is equal to; {example}")
     if condition_type == "equals":
         return Equals(value)
-    test = Contains(value, whole=condition_type == "contains_word")
+    is_whole = {"contains": False, "contains_word": True}
+    test = Contains(value, whole=is_whole[condition_type])
     if isinstance(value, str) and not (test.folded or "").strip():
         raise InvalidArgumentsError(f"'{condition_type}' takes a text that is not blank; {example}")
     return test
