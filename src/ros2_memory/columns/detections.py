@@ -33,7 +33,13 @@ from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
 from ros2_memory.columns.walk import within
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
-from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, Detection, detections_of
+from ros2_memory.messages.detections import (
+    MAX_DEPTH,
+    POSITIONS,
+    Detection,
+    detections_of,
+    looks_like_json,
+)
 from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
@@ -393,7 +399,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
 
 
 def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
-    if word[:1] not in {"[", "{"}:
+    if not looks_like_json(word):
         return ()
     value: JsonValue = word
     for _ in range(MAX_DEPTH - depth):

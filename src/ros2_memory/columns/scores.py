@@ -31,7 +31,7 @@ from ros2_memory.columns.shown import (
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.values import Kind, Leaf, Level
 from ros2_memory.core.text import LABELS
-from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES
+from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES, looks_like_json
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -253,9 +253,7 @@ def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], b
 def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
     """Returns whether one of these texts looks like JSON, or is not held."""
     columns = [values.texts(leaf) for leaf in texts]
-    return any(
-        column is None or any(word[:1] in {"[", "{"} for word in column.words) for column in columns
-    )
+    return any(column is None or any(map(looks_like_json, column.words)) for column in columns)
 
 
 def ranked(score: Floats, owners: Ints) -> tuple[Ints, Mask]:

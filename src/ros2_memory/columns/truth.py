@@ -49,7 +49,7 @@ from ros2_memory.columns.shown import (
 from ros2_memory.columns.table import MAX_NUMBERS, Table, Zone, as_float
 from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values, zone_of
 from ros2_memory.columns.zones import PartZones, Zones
-from ros2_memory.messages.detections import MAX_DEPTH, without_low_scores
+from ros2_memory.messages.detections import MAX_DEPTH, looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -369,7 +369,7 @@ class _LeafTest:
 
 def _without_low(word: str, least: float, depth: int) -> str:
     """Returns a text of a value, which lies that deep in it, without detections of a low score."""
-    if word[:1] not in {"[", "{"}:
+    if not looks_like_json(word):
         return word
     around = MAX_DEPTH - depth
     value: JsonValue = word

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ros2_memory.columns.detections import (
 )
 from ros2_memory.columns.steps import METRES
 from ros2_memory.core.arrays import merged_times
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.scan import messages_of, of_columns
 from ros2_memory.messages.conversions import nanoseconds
 from ros2_memory.messages.detections import Detection, detections_of
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
+
+_LONGEST_LATENCY_NS: Final[Ns] = 10 * NS_PER_S
+"""So long a large model may look at an image before it says what is in it."""
 
 
 class Detected(NamedTuple):
@@ -115,6 +119,8 @@ def _detected(log_times: IntArray, stamps: IntArray | None, found: Detections) -
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.
-        times = np.where(np.abs(stamps - log_times) <= AGREEMENT_NS, stamps, log_times)
+        latency = log_times - stamps
+        is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
+        times = np.where(is_of_this_clock, stamps, log_times)
     places = np.rint(found.places * METRES.per_unit) / METRES.per_unit
     return Detected(log_times, times, found._replace(places=places))

@@ -31,7 +31,7 @@ POSITIONS: Final = (
     ("pose", "pose", "position"),
     ("bbox", "center", "position"),
 )
-_MAX_JSON_CHARS: Final = 1 << 16
+_MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 5
 """Lists, objects and texts that are JSON around a detection, and it."""
 _JSON: Final = frozenset("[{")
@@ -105,8 +105,13 @@ def _walked(
 def _may_hold_detections(value: JsonValue) -> bool:
     """Returns whether a field is worth a look: most are numbers and names."""
     if isinstance(value, str):
-        return value[:1] in _JSON
+        return looks_like_json(value)
     return isinstance(value, dict | list)
+
+
+def looks_like_json(text: str) -> bool:
+    """Returns whether a text begins as a JSON array or object does."""
+    return text.lstrip()[:1] in _JSON
 
 
 def _without_hypotheses(
@@ -185,7 +190,7 @@ def _position(value: dict[str, JsonValue]) -> Vector3 | None:
 
 def _from_json(text: str) -> JsonValue:
     """Parses a string that is JSON; None for any other."""
-    if len(text) > _MAX_JSON_CHARS or text[:1] not in _JSON:
+    if len(text) > _MAX_JSON_CHARS or not looks_like_json(text):
         return None
     try:
         value: JsonValue = json.loads(text)

@@ -7,6 +7,7 @@ declared by the owner.
 from __future__ import annotations
 
 import re
+import unicodedata
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -63,8 +64,8 @@ _SIBILANTS: Final = ("sses", "shes", "ches", "xes", "zzes")
 
 
 def plain(label: str) -> str:
-    """Returns a label in lower case with single spaces."""
-    return _SPACING.sub(" ", label).strip().casefold()
+    """Returns a label in lower case with single spaces, its accents as parts of their letters."""
+    return unicodedata.normalize("NFC", _SPACING.sub(" ", label).strip().casefold())
 
 
 def singular(label: str) -> str:

@@ -75,6 +75,18 @@ def test_a_json_object_with_a_list_of_detections_in_a_text_is_looked_into() -> N
     assert detections_of(kept) == (Detection("fork"),)
 
 
+@pytest.mark.parametrize(
+    "said",
+    [
+        pytest.param('\n  {"label": "cup"}', id="behind white space"),
+        pytest.param(json.dumps({"label": "cup", "outline": [[1.5, 2.5]] * 9000}), id="100 kB"),
+    ],
+)
+def test_json_is_looked_into_wherever_it_begins_and_however_long_it_is(said: str) -> None:
+    assert detections_of({"data": said}) == (Detection("cup"),)
+    assert detections_of(without_low_scores({"data": said}, 0.9)) == (Detection("cup"),)
+
+
 def test_what_lies_too_deep_is_not_looked_into() -> None:
     value: JsonValue = [{"label": "cup"}]
     for _ in range(MAX_DEPTH - 2):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from random import Random
 from typing import TYPE_CHECKING, Any
 
@@ -307,6 +308,21 @@ def test_detections_without_a_place_are_reported(tmp_path: Path) -> None:
     reply = ask(tmp_path, label="mug")
     assert reply["total"] == 0
     assert reply["notes"][0] == "5 detections of it could not be placed, and are left out"
+
+
+@pytest.mark.parametrize("latency_s", [1, 6])
+def test_what_a_slow_detector_sees_is_placed_by_the_stamps_of_its_images(
+    tmp_path: Path, latency_s: int
+) -> None:
+    """A robot drives by at 1 m/s; a large model takes seconds for an image."""
+    messages: list[Msg] = []
+    for second in range(60):
+        poses_and_cup = scene(second, (float(second), 0.0, 0.0), [("cup", 30.0, 1.0)])
+        *poses, cup = poses_and_cup
+        messages += [*poses, replace(cup, log_time=cup.log_time + latency_s * S)]
+    write_splits(tmp_path, sorted(messages, key=lambda message: message.log_time), 20)
+    [thing] = ask(tmp_path, label="cup")["things"]
+    assert (thing["place"]["x"], thing["place"]["y"]) == (30.0, 1.0)
 
 
 def test_several_labels_are_asked_for_at_once(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from ros2_memory.things.labels import Labels, moves_by_itself
         ("photo", "photos"),
         ("cookie", "Cookies"),
         ("bus", "buses"),
+        ("caf\u00e9", "cafe\u0301"),
     ],
 )
 def test_case_spacing_and_a_plural_do_not_matter(one: str, other: str) -> None:
