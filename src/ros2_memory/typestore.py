@@ -30,7 +30,7 @@ from ros2_memory.storage.cache import ByteLru
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from rosbags.interfaces.typing import FieldDesc, Typesdict
+    from rosbags.interfaces.typing import BaseDesc, FieldDesc, Typesdict
 
 MAX_TEXT_BYTES: Final = 1 << 20
 MAX_STATEMENTS: Final = 2_000
@@ -188,7 +188,11 @@ class Typestores:
                 )
             nested = dict.fromkeys(filter(None, map(_nested_type, fields)))
             todo += [(each, (*trail, name)) for each in reversed(nested)]
-        return {name: found[name] for name in visited}
+        return {
+            name: (constants, [(field_name, _unsigned(field)) for field_name, field in fields])
+            for name, (constants, fields) in found.items()
+            if name in visited
+        }
 
     def _definition(
         self, name: str, in_bag: Mapping[str, _Section], trail: tuple[str, ...]
@@ -383,6 +387,16 @@ def _nested_type(field: FieldDesc) -> str | None:
         element = field[1][0]
         return str(element[1]) if element[0] == Nodetype.NAME else None
     return None
+
+
+def _unsigned(field: FieldDesc) -> FieldDesc:
+    """Returns a field whose bytes are unsigned, as in ROS; rosbags decodes them as int8."""
+    if _primitive(field) != "byte":
+        return field
+    byte: BaseDesc = (Nodetype.BASE, ("uint8", 0))
+    if field[0] == Nodetype.ARRAY:
+        return (Nodetype.ARRAY, (byte, field[1][1]))
+    return (Nodetype.SEQUENCE, (byte, field[1][1])) if field[0] == Nodetype.SEQUENCE else byte
 
 
 def _primitive(field: FieldDesc) -> str | None:

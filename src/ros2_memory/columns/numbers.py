@@ -151,10 +151,12 @@ def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | No
     is_finite = np.isfinite(column)
     if not is_finite.all():
         column, rows, kept = column[is_finite], rows[is_finite], kept[is_finite]
-    is_whole = column.dtype.kind in "iu" and not (column > _LARGEST_INT64).any()
+    if column.dtype.kind != "u" or not (column > _LARGEST_INT64).any():
+        is_whole = column.dtype.kind in "iu"
+        column = column.astype(np.int64 if is_whole else np.float64, copy=False)
     found = FieldNumbers(
         rows,
-        column.astype(np.int64) if is_whole else column.astype(np.float64, copy=False),
+        column,
         float(np.max(known.error, initial=0.0)),
     )
     if isinstance(known.error, np.ndarray):

@@ -26,10 +26,9 @@ MAX_COLUMNS: Final = 5_000
 _MOST_ELEMENTS: Final = 2**32 - 1
 """Of a sequence in CDR; no message holds a longer array either."""
 
-# As rosbags decodes them: a byte is signed, a char is not.
 _DTYPES: Final = {
     "bool": "u1",
-    "byte": "i1",
+    "byte": "u1",
     "char": "u1",
     "int8": "i1",
     "uint8": "u1",

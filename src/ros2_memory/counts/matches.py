@@ -32,7 +32,7 @@ from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
-from ros2_memory.insights.sightings import read_sightings
+from ros2_memory.insights.sightings import only_messages_count, read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 
@@ -103,7 +103,8 @@ def count_matches(
     if held is None:
         scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
-        held = TrueIntervals.of([(first, last, True) for first, last in spans])
+        lasting = [*_lasting_at_begin(binned, topics, condition, scope)]
+        held = TrueIntervals.of([*lasting, *((first, last, True) for first, last in spans)])
         unknown = scope.unknown
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
@@ -254,6 +255,20 @@ def _flag_held(
     spans.sort()
     gaps = _gaps_of(binned, topic)
     return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
+
+
+def _lasting_at_begin(
+    binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
+) -> Iterator[tuple[Ns, Ns, bool]]:
+    """Yields until when latched topics still met a condition, by messages before the window."""
+    view = binned.view
+    start, end = binned.counted.asked()
+    for topic in topics:
+        if scope.is_bounded:
+            if view.limits.latching.is_latched(view.snapshot, topic):
+                view.notes.add(only_messages_count(topic))
+        elif _met_before(binned, topic, condition):
+            yield start, held_until(view, topic, start, end), False
 
 
 def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:

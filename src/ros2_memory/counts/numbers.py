@@ -420,7 +420,7 @@ def _extreme(rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int)
 def _of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
     """Returns the numbers of one field, of which each message has some."""
     found = np.array([number for sample in samples for number in sample])
-    if found.dtype.kind != "i":
+    if found.dtype.kind not in "iu":
         found = found.astype(np.float64)
     return FieldNumbers(np.repeat(np.arange(len(samples)), [*map(len, samples)]), found, 0.0)
 
@@ -544,6 +544,6 @@ def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | Non
         return None
     total = math.fsum(part.total for part in parts)
     mean = float(f"{total / sum(part.size for part in parts) / SUM_SCALE:.{_MEAN_DIGITS}g}")
-    # The extremes are exact; what columns add up to is not. Plus 0.0: no reply says -0.0.
+    # The extremes are exact; what columns add up to is not. Plus 0: no reply says -0.0.
     mean = min(max(mean, least[0]), greatest[0]) + 0.0
-    return least[0] + 0.0, least[1], greatest[0] + 0.0, greatest[1], mean
+    return least[0] + 0, least[1], greatest[0] + 0, greatest[1], mean

@@ -242,8 +242,8 @@ class HeldValues:
     def _word(self, message: object, type_name: str) -> str:
         extractor = self._view.extractor
         if self._field is None:
-            return json.dumps(extractor.exact(message, type_name))
-        return json.dumps(extractor.exact_at(message, type_name, self._field))
+            return json.dumps(_as_said(extractor.exact(message, type_name)))
+        return json.dumps(_as_said(extractor.exact_at(message, type_name, self._field)))
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         return older.word == newer.word and self._end_of(older, newer) == (newer.first, True)
@@ -272,6 +272,13 @@ def _ends_of_clocks(view: View) -> Iterator[Ns]:
         yield max(before)
     if any(bag.start > latest for bag in bags):
         yield latest
+
+
+def _as_said(value: JsonValue) -> JsonValue:
+    """Returns a value in the form that all equal ones have: 2 for 2.0, and 0 for -0.0."""
+    if isinstance(value, dict):
+        return {name: _as_said(part) for name, part in value.items()}
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def is_text(view: View, topic: str) -> bool:

@@ -127,8 +127,7 @@ def find_matches(
     else:
         search = ReverseSearch(view, topic, condition)
         rows = _of_matches(view, search, scope, shown, fields)
-        if not scope.is_bounded:
-            view.notes.add(*_held_before(view, search, window))
+        view.notes.add(*_held_before(view, search, window, scope))
     elapsed = elapsed_in(view, rows.searched)
     sightings = tuple(_finished(each, elapsed, other) for each in rows.sightings)
     episodes = tuple(_finished(each, elapsed, other) for each in rows.episodes)
@@ -278,16 +277,33 @@ def read_sightings(
     return spans, spans[0][0] if found.is_over else None
 
 
-def _held_before(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
-    """Yields which latched topics met a condition when a window began, by an earlier message."""
+def _held_before(
+    view: View, search: ReverseSearch, window: TimeWindow, scope: Scope
+) -> Iterator[str]:
+    """Yields which latched topics met a condition when a window began, by an earlier message.
+
+    In a scope, which of them may have met it whenever the scope began.
+    """
     start = window.asked()[0]
     for topic in search.topics:
+        if scope.is_bounded:
+            if view.limits.latching.is_latched(view.snapshot, topic):
+                yield only_messages_count(topic)
+            continue
         before = held_at(view, topic, start)
         if before is not None and search.matches(before):
             yield (
                 f"{topic} met this already when the window began: what it said at "
                 f"{unix_text(before.time)} holds until its next message"
             )
+
+
+def only_messages_count(topic: str) -> str:
+    """Returns the note on a latched topic in a scope: what it said before is not looked for."""
+    return (
+        f"with where or while, only messages of {topic} that came then count, and not what it "
+        f"said before, which may have held on: ask about the other topic, with {topic} in while"
+    )
 
 
 def _newest(view: View, run: Run) -> StoredMessage | None:
@@ -299,8 +315,8 @@ def _newest(view: View, run: Run) -> StoredMessage | None:
 def _until(view: View, run: Run, scope: Scope) -> Ns:
     """Returns until when a state lasted: to the message that says otherwise, or the window's end.
 
-    To its last match where a silence, or the end of a scope, is next; so does a log entry. What a
-    latched topic states lasts through silences.
+    To its last match where a silence is next; so does a log entry. What a latched topic states
+    lasts through silences. Not beyond the end of a scope.
     """
     last, until = run.last, run.until
     if view.timeline.is_log(run.topic):
@@ -310,7 +326,7 @@ def _until(view: View, run: Run, scope: Scope) -> Ns:
         until = held_until(view, run.topic, last, end)
     else:
         until = max(last, min(until, end)) if until - last <= SILENCE_NS else last
-    return until if scope.holds_at(until) else last
+    return scope.holds_until(last, until)
 
 
 def _sighting(

@@ -333,6 +333,15 @@ class Scope:
             return False
         return all(state.holds_at(time) for state in self._states)
 
+    def holds_until(self, time: Ns, end: Ns) -> Ns:
+        """Returns until when matches count from a moment at which they do, at most until `end`."""
+        for start, stop in self._inside or ():
+            if start <= time < stop:
+                end = min(end, stop - 1)
+        for state in self._states:
+            end = state.holds_until(time, end)
+        return end
+
 
 def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
     """Returns when any robot was in a region, in order; raises as `joined_in_region`."""
@@ -404,6 +413,20 @@ class _States:
             return False
         since = time - self._times[number - 1]
         return self._values[number - 1] and (self._holds_on or since <= SILENCE_NS)
+
+    def holds_until(self, time: Ns, end: Ns) -> Ns:
+        """Returns until when the condition is known to be met from a moment on; at most `end`."""
+        while time < end and self.holds_at(time):
+            number = bisect_right(self._times, time)
+            last, later = self._times[number - 1], self._times[number:]
+            if not later:
+                window = TimeWindow(self._known.stop, end + 1)
+                message = self._view.stream.first(self._search.topics, window)
+                later = [MAX_NS if message is None else message.time]
+            if not self._holds_on and min(later[0], end) - last > SILENCE_NS:
+                return max(time, last)
+            time = later[0]
+        return min(time, end)
 
     def _read_around(self, time: Ns) -> None:
         """Reads the messages of the bags that may hold the newest one at a moment."""

@@ -149,7 +149,8 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
         numbers = [each for body in known if isinstance(each := body.get(key), int | float)]
         if numbers:
             whole[key] = round(sum(numbers), 3)
-    return with_notes({"all": whole, **shared, "windows": rows}, [*answer.notes, *common])
+    total: JsonObject = {"all": whole} if whole else {}
+    return with_notes({**total, **shared, "windows": rows}, [*answer.notes, *common])
 
 
 def _notes_in(reply: JsonObject) -> list[str]:

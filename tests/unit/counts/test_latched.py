@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.support.bags import McapLayout, boolean, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
 from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
@@ -16,6 +16,10 @@ S = 10**9
 T0 = 1_790_000_000 * S
 DOCKED, BUMPER = "/docked", "/bumper"
 TOGGLES = ((0, False), (100, True), (400, False), (700, True))
+
+
+def at_log_time(message: Msg) -> int:
+    return message.log_time
 
 
 @pytest.fixture
@@ -75,3 +79,46 @@ def test_what_held_already_when_the_window_began_is_noted(bag_dir: Path, *, reca
     assert inside["sightings"] == []
     assert "/docked met this already when the window began" in " ".join(inside["notes"])
     assert "notes" not in matches(bag_dir, DOCKED, 450, 650, recalls=recalls)
+
+
+@each_way
+def test_a_latched_text_or_number_lasts_into_the_window(tmp_path: Path, *, recalls: bool) -> None:
+    messages = [odom(T0 + at * S, 0.0, 0.0) for at in range(0, 61, 2)]
+    messages += [text(T0, "auto", "/mode"), text(T0 + 45 * S, "manual", "/mode")]
+    layout = McapLayout(latched=frozenset({"/mode"}))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", sorted(messages, key=at_log_time), layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    given = {"topic": "/mode", "condition_type": "equals", "value": "auto", "by": "day"}
+    counted = asked(memory, tmp_path, "find_matches", start=T0 / S + 10, end=T0 / S + 50, **given)
+    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    assert (whole["seconds"], whole["count"]) == (35, 0)
+
+
+@each_way
+@pytest.mark.parametrize("by", [{}, {"by": "day"}])
+def test_it_is_said_that_a_latched_topic_in_a_scope_counts_by_its_messages(
+    bag_dir: Path, by: dict[str, str], *, recalls: bool
+) -> None:
+    bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
+    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **by, **{"while": bumped})
+    assert "ask about the other topic, with /docked in while" in " ".join(answer["notes"])
+    docked = {**bumped, "topic": DOCKED}
+    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **by, **{"while": docked})
+    assert not any("in while" in note for note in answer.get("notes", ()))
+
+
+@each_way
+@pytest.mark.parametrize("by", [{}, {"by": "day"}])
+def test_what_a_slow_topic_states_lasts_to_the_end_of_a_scope(
+    bag_dir: Path, by: dict[str, str], *, recalls: bool
+) -> None:
+    """Every 4 s it says no bump; docked from 100 to 400 s, and from 700 s on."""
+    docked = {"topic": DOCKED, "condition_type": "equals", "value": False}
+    given = {"topic": BUMPER, "condition_type": "equals", "value": False, "while": docked, **by}
+    memory = memory_of(bag_dir, recalls=recalls)
+    end = T0 / S + 402
+    answer = asked(memory, bag_dir, "find_matches", start=T0 / S, end=end, **given)
+    if by:
+        assert dict(zip(answer["columns"][1:], answer["all"], strict=True))["seconds"] == 102
+    else:
+        assert [each["duration_s"] for each in answer["sightings"]] == [2, 100]
