@@ -172,13 +172,13 @@ class _Kinds:
 
     def of(self, channel: Channel) -> _Kind:
         """Returns the kind of a channel."""
-        known = self._known.get(id(channel))
-        if known is None:
+        kind = self._known.get(id(channel))
+        if kind is None:
             definition = self.reader.definition(channel)
             plan, reason = self._plan(channel, definition)
-            known = _Kind(definition, plan, reason, self.hashed(channel))
-            self._known[id(channel)] = known
-        return known
+            kind = _Kind(definition, plan, reason, self.hashed(channel))
+            self._known[id(channel)] = kind
+        return kind
 
     def read(self, batch: Batch) -> _Kind:
         """Returns the kind of what was read: of large messages no more columns are made."""
@@ -233,8 +233,8 @@ class _Group:
             self._bytes += len(batch.buffer)
         channel = batch.channel
         parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
-        for some in _parts_of(batch):
-            self._add(parts, _table(kind, some, self.reader, skip=self.skip_undecodable))
+        for piece in _parts_of(batch):
+            self._add(parts, _table(kind, piece, self.reader, skip=self.skip_undecodable))
 
     def _add(self, parts: list[Table], table: Table) -> None:
         """Adds a table to those of its topic, of which all have columns or none has."""
@@ -249,11 +249,11 @@ class _Group:
     def tables(self) -> list[Table]:
         """Returns the tables, each of all its parts."""
         self._buffer = b""
-        found = []
+        tables = []
         while self._parts:
             _, parts = self._parts.popitem()
-            found.append(joined(parts))
-        return found[::-1]
+            tables.append(joined(parts))
+        return tables[::-1]
 
 
 def _parts_of(batch: Batch) -> Iterator[Batch]:

@@ -149,34 +149,43 @@ class DetectionColumns:
         values = Values(table)
         try:
             parts = [part for source in sources for part in found_in(values, source, places=True)]
-            own = _own_frame(definition)
-            found = joined_detections([_with_frames(values, part, own) for part in parts])
-            return Found(found, _stamps(values, definition))
+            header_frames = _own_frame(definition)
+            detections = joined_detections(
+                [_with_frames(values, part, header_frames) for part in parts]
+            )
+            return Found(detections, _stamps(values, definition))
         except UnknownShapeError:
             return None
 
-    def may_match(self, known: Table | PartZones) -> bool | Mask:
+    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a message may hold a detection, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        sources = self._sources.of(known)
-        found: bool | Mask = sources is None
+        sources = self._sources.of(table_or_parts)
+        may: bool | Mask = sources is None
         for source in sources or ():
-            found = found | (not isinstance(source, Json) or _may_be_json(known, source.leaf))
-        return found
+            may = may | (not isinstance(source, Json) or _may_be_json(table_or_parts, source.leaf))
+        return may
 
 
-def detections_by(found: Sequence[Sequence[Detection]]) -> Detections:
+def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
     """Returns the detections of messages that were read one by one."""
-    every = [(row, one) for row, some in enumerate(found) for one in some]
-    places = [(math.nan,) * 3 if one.place is None else one.place for _, one in every]
+    numbered = [
+        (row, detection) for row, detections in enumerate(by_message) for detection in detections
+    ]
+    places = [
+        (math.nan,) * 3 if detection.place is None else detection.place for _, detection in numbered
+    ]
     return Detections(
-        np.array([row for row, _ in every], np.int64),
-        Texts.of([one.label for _, one in every]),
-        np.array([math.nan if one.score is None else one.score for _, one in every], np.float64),
+        np.array([row for row, _ in numbered], np.int64),
+        Texts.of([detection.label for _, detection in numbered]),
+        np.array(
+            [math.nan if detection.score is None else detection.score for _, detection in numbered],
+            np.float64,
+        ),
         np.array(places, np.float64).reshape(-1, 3),
-        Texts.of([one.frame_id for _, one in every]),
+        Texts.of([detection.frame_id for _, detection in numbered]),
     )
 
 
@@ -257,7 +266,7 @@ def _frame(fields: dict[str, Node]) -> Iterator[Leaf]:
 
 def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
     """Returns where an object may have its place, first choice first; None: it depends."""
-    found: list[Point] = []
+    points: list[Point] = []
     for path in POSITIONS:
         node: Node | None = Group(fields)
         for name in path:
@@ -274,10 +283,10 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
         numbers = [leaf for leaf in leaves if isinstance(leaf, Leaf) and _is_number(leaf)]
         if len(leaves) == len(numbers) == 3:
             x, y, z = numbers
-            found.append((x, y, z))
+            points.append((x, y, z))
         elif any(not isinstance(leaf, Leaf) for leaf in leaves):
             return None
-    return tuple(found)
+    return tuple(points)
 
 
 def _is_number(leaf: Leaf) -> bool:
@@ -343,11 +352,15 @@ def texts_of(values: Values, leaf: Leaf) -> Texts:
     return texts
 
 
-def _found(values: Values, level: Level, name: Texts, among: Ints, scores: Floats) -> Detections:
+def _found(
+    values: Values, level: Level, name: Texts, positions: Ints, scores: Floats
+) -> Detections:
     """Returns detections at some places of a level, by their rows, without a place."""
-    _, rows = placed(values, level, among, (), surely=True)
-    labels = Texts(name.codes[among], name.words)
-    return Detections(rows, labels, scores[among], _nowhere(among.size), _no_frames(among.size))
+    _, rows = placed(values, level, positions, (), surely=True)
+    labels = Texts(name.codes[positions], name.words)
+    return Detections(
+        rows, labels, scores[positions], _nowhere(positions.size), _no_frames(positions.size)
+    )
 
 
 def _nowhere(count: int) -> Points:
@@ -358,9 +371,13 @@ def _no_frames(count: int) -> Texts:
     return Texts(np.zeros(count, np.uint32), ("",))
 
 
-def _may_be_json(known: Table | PartZones, leaf: Leaf) -> bool | Mask:
+def _may_be_json(table_or_parts: Table | PartZones, leaf: Leaf) -> bool | Mask:
     """Returns whether a text may be JSON, by its zone, or in which parts by their zones."""
-    zone = zone_of(leaf, known.zone) if isinstance(known, PartZones) else Values(known).zone(leaf)
+    zone = (
+        zone_of(leaf, table_or_parts.zone)
+        if isinstance(table_or_parts, PartZones)
+        else Values(table_or_parts).zone(leaf)
+    )
     return True if zone is None else zone.may_be_json
 
 
@@ -369,26 +386,29 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     if not _may_be_json(values.table, source.leaf):
         return
     texts = texts_of(values, source.leaf)
-    once = values.table.remember(
+    parsed = values.table.remember(
         f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
         lambda: detections_by([_parsed(word, source.depth) for word in texts.words]),
-        lambda found: 1000 + 100 * found.rows.size,
+        lambda detections: 1000 + 100 * detections.rows.size,
     )
-    if not once.rows.size:
+    if not parsed.rows.size:
         return
-    counts = np.bincount(once.rows, minlength=len(texts.words))
-    among = np.flatnonzero(counts[texts.codes])
-    first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
-    of = np.repeat(among, counts)
+    counts = np.bincount(parsed.rows, minlength=len(texts.words))
+    with_any = np.flatnonzero(counts[texts.codes])
+    first, counts = (
+        np.searchsorted(parsed.rows, texts.codes[with_any]),
+        counts[texts.codes[with_any]],
+    )
+    positions = np.repeat(with_any, counts)
     nth = np.repeat(first, counts) + within(counts)
-    _, rows = placed(values, source.leaf.level, of, (), surely=True)
-    around = _frames(values, source.leaf.level, of, source.frames)
+    _, rows = placed(values, source.leaf.level, positions, (), surely=True)
+    outer_frames = _frames(values, source.leaf.level, positions, source.frames)
     yield Detections(
         rows,
-        Texts(once.labels.codes[nth], once.labels.words),
-        once.scores[nth],
-        once.places[nth],
-        or_else(Texts(once.frames.codes[nth], once.frames.words), around),
+        Texts(parsed.labels.codes[nth], parsed.labels.words),
+        parsed.scores[nth],
+        parsed.places[nth],
+        or_else(Texts(parsed.frames.codes[nth], parsed.frames.words), outer_frames),
     )
 
 
@@ -411,57 +431,57 @@ def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     best: Ints = order[begins]
     if error:
         follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-        one, two = order[follows], order[follows + 1]
+        best_of, next_best = order[follows], order[follows + 1]
         with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = score[one] - score[two] <= 2 * error
-        if (is_close & (name.codes[one] != name.codes[two])).any():
+            is_close = score[best_of] - score[next_best] <= 2 * error
+        if (is_close & (name.codes[best_of] != name.codes[next_best])).any():
             raise UnknownShapeError("another hypothesis may be the best")
     return best
 
 
-def _places(values: Values, source: Labels, level: Level, among: Ints) -> Points:
+def _places(values: Values, source: Labels, level: Level, positions: Ints) -> Points:
     """Returns the first valid point of each detection (N x 3); NaN where it has none."""
     if source.points is None or source.best_points is None:
         raise UnknownShapeError("points are of another shape in each message")
-    found = _nowhere(among.size)
+    places = _nowhere(positions.size)
     for leaves in (*source.best_points, *source.points):
-        at = _owners(values, level, among, leaves[0].level)
+        at = _owners(values, level, positions, leaves[0].level)
         columns = [values.numbers(leaf) for leaf in leaves]
         numbers = [column.values[at] for column in columns if column is not None]
         if len(numbers) < len(leaves):
             raise UnknownShapeError("points are not held")
         point = np.stack(numbers, axis=1).astype(np.float64)
         # All zeros means that nobody filled it in.
-        is_one = np.isfinite(point).all(axis=1) & point.any(axis=1)
-        found = np.where((is_one & np.isnan(found[:, 0]))[:, None], point, found)
-    return found
+        is_given = np.isfinite(point).all(axis=1) & point.any(axis=1)
+        places = np.where((is_given & np.isnan(places[:, 0]))[:, None], point, places)
+    return places
 
 
-def _frames(values: Values, level: Level, among: Ints, leaves: Sequence[Leaf]) -> Texts:
+def _frames(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:
     """Returns the frame of each detection: what the innermost object around it names."""
-    found = _no_frames(among.size)
+    frames = _no_frames(positions.size)
     for leaf in leaves:
         texts = texts_of(values, leaf)
-        at = texts.codes[_owners(values, level, among, leaf.level)]
-        found = or_else(Texts(at, texts.words), found)
-    return found
+        codes = texts.codes[_owners(values, level, positions, leaf.level)]
+        frames = or_else(Texts(codes, texts.words), frames)
+    return frames
 
 
-def _owners(values: Values, level: Level, among: Ints, around: Level) -> Ints:
+def _owners(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
     """Returns, of some elements of a level, the elements or rows around them."""
-    while level != around:
+    while level != outer:
         elements = values.elements(level)
         if elements is None or level.parent is None:
             raise UnknownShapeError("elements are not held")
-        among, level = elements.owners[among], level.parent
-    return among
+        positions, level = elements.owners[positions], level.parent
+    return positions
 
 
 def _kind_at(definition: Definition, *path: str) -> str | Definition:
     """Returns what a field is; empty where there is no such field, or an array."""
-    found = fields_at(definition, path)
-    is_there = len(found) == len(path) and all(each.length is None for each in found)
-    return found[-1].kind if is_there else ""
+    fields = fields_at(definition, path)
+    is_there = len(fields) == len(path) and all(entry.length is None for entry in fields)
+    return fields[-1].kind if is_there else ""
 
 
 def _own_frame(definition: Definition) -> tuple[Leaf, ...]:
@@ -471,11 +491,15 @@ def _own_frame(definition: Definition) -> tuple[Leaf, ...]:
     return (Leaf(ROWS, ("header.frame_id",), Kind.TEXT),)
 
 
-def _with_frames(values: Values, found: Detections, own: tuple[Leaf, ...]) -> Detections:
+def _with_frames(
+    values: Values, detections: Detections, header_frames: tuple[Leaf, ...]
+) -> Detections:
     """Returns detections with the frame of their message where they name none."""
-    if not own or found.frames.words.count("") == 0:
-        return found
-    return found._replace(frames=or_else(found.frames, _frames(values, ROWS, found.rows, own)))
+    if not header_frames or detections.frames.words.count("") == 0:
+        return detections
+    return detections._replace(
+        frames=or_else(detections.frames, _frames(values, ROWS, detections.rows, header_frames))
+    )
 
 
 def _stamps(values: Values, definition: Definition) -> Ints | None:

@@ -71,8 +71,8 @@ def delete_catalogue(file: Path) -> None:
         return
     try:
         if file.is_file() and not file.is_symlink() and _is_catalogue(file):
-            for one in files_of(file):
-                one.unlink(missing_ok=True)
+            for path in files_of(file):
+                path.unlink(missing_ok=True)
         for leftover in leftovers(file):
             if _is_catalogue(leftover):
                 leftover.unlink(missing_ok=True)

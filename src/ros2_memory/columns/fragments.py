@@ -132,10 +132,10 @@ def _packed(array: Array) -> tuple[str, float | None, bytes]:
     if array.size >= _FEW:
         flat = array.reshape(-1, order="F")
         for step in (METRES, EXACT):
-            found = pack(flat, step)
-            again = unpack(found.codec, found.count, found.zone.least, found.data)
-            if cast("Array", again).tobytes() == flat.tobytes():
-                return found.codec, found.zone.least, found.data
+            column = pack(flat, step)
+            unpacked = unpack(column.codec, column.count, column.zone.least, column.data)
+            if cast("Array", unpacked).tobytes() == flat.tobytes():
+                return column.codec, column.zone.least, column.data
     return "", None, array.tobytes()
 
 
@@ -168,7 +168,7 @@ class Joined(NamedTuple, Generic[T]):
     @property
     def memory_bytes(self) -> int:
         """About how much memory they take."""
-        return 100 + sum(one.memory_bytes for one in self.found)
+        return 100 + sum(fragment.memory_bytes for fragment in self.found)
 
 
 def joining(kind: Kind[T]) -> Kind[Joined[T]]:
@@ -203,21 +203,21 @@ class Fragments(Generic[T]):
         asked for next.
         """
         # By name: each kind has one type.
-        found = cast("T | None", self._remembered.get((self._kind.name, key)))
-        if found is None and self._store is not None:
+        fragment = cast("T | None", self._remembered.get((self._kind.name, key)))
+        if fragment is None and self._store is not None:
             for other, data in self._store.fragments(self._name, key, also_before):
-                made = self._loaded(data)
-                if made is not None:
-                    self._remember(other, made)
-                    found = made if other == key else found
-        return found
+                loaded = self._loaded(data)
+                if loaded is not None:
+                    self._remember(other, loaded)
+                    fragment = loaded if other == key else fragment
+        return fragment
 
-    def put(self, key: FragmentKey, made: T) -> None:
+    def put(self, key: FragmentKey, fragment: T) -> None:
         """Remembers a fragment, which waits to be stored."""
-        self._remember(key, made)
+        self._remember(key, fragment)
         if self._store is not None:
             with self._lock:
-                self._waiting.append((key, made))
+                self._waiting.append((key, fragment))
 
     def write(self) -> None:
         """Stores what was made since; not what follows from parts that are deleted meanwhile."""
@@ -228,8 +228,8 @@ class Fragments(Generic[T]):
             made = [(key, to_bytes(made, self._kind.classes)) for key, made in waiting]
             self._store.put_fragments(self._name, made)
 
-    def _remember(self, key: FragmentKey, made: T) -> None:
-        self._remembered.put((self._kind.name, key), made, made.memory_bytes + _KEY_BYTES)
+    def _remember(self, key: FragmentKey, fragment: T) -> None:
+        self._remembered.put((self._kind.name, key), fragment, fragment.memory_bytes + _KEY_BYTES)
 
     def _loaded(self, data: bytes) -> T | None:
         try:

@@ -26,21 +26,21 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
-    drops = tuple(drop for part in found for drop in part.drops)
+def _joined_stands(parts: Sequence[Stands]) -> Sequence[Stands]:
+    drops = tuple(drop for part in parts for drop in part.drops)
     return [
-        Stands(stacked([part.blocks for part in found]), drops, max(part.last for part in found))
+        Stands(stacked([part.blocks for part in parts]), drops, max(part.last for part in parts))
     ]
 
 
-def _joined_events(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
-    whole = joined_events(found)
+def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
+    whole = joined_events(parts)
     return [] if whole is None else [whole]
 
 
-def _joined_tracks(found: Sequence[TrackPart]) -> Sequence[TrackPart]:
+def _joined_tracks(parts: Sequence[TrackPart]) -> Sequence[TrackPart]:
     by_recording: dict[str, list[TrackPart]] = {}
-    for part in found:
+    for part in parts:
         by_recording.setdefault(part.recording, []).append(part)
     return [*map(united_parts, by_recording.values())]
 

@@ -47,16 +47,18 @@ class Layout:
     def levels(self) -> dict[str, Level]:
         """The columns of the messages (""), and of the elements of each sequence by its path."""
         levels: dict[str, Level] = {"": Level({}, {})}
-        here = ""
+        sequence = ""
         for path in self.slots:
             if path.endswith("#"):
-                here = path[:-1]
-                around = max((each for each in levels if here.startswith(f"{each}.")), default="")
-                levels[around].sequences[here.removeprefix(f"{around}.")] = here
-                levels[here] = Level({}, {})
+                sequence = path[:-1]
+                parent = max(
+                    (outer for outer in levels if sequence.startswith(f"{outer}.")), default=""
+                )
+                levels[parent].sequences[sequence.removeprefix(f"{parent}.")] = sequence
+                levels[sequence] = Level({}, {})
             else:
-                name = path.removeprefix(here).removeprefix(".") if here else path
-                levels[here].columns[name] = path
+                name = path.removeprefix(sequence).removeprefix(".") if sequence else path
+                levels[sequence].columns[name] = path
         return levels
 
     def fits(self, table: Table) -> bool:

@@ -63,25 +63,27 @@ class Letters(NamedTuple):
     @classmethod
     def of(cls, texts: Texts) -> Letters | None:
         """Returns the letters of texts; None where they are too many."""
-        known: dict[frozenset[str], int] = {}
-        alike = [
-            known.setdefault(frozenset(text.casefold().translate(SPACES).split()), len(known))
+        number_of: dict[frozenset[str], int] = {}
+        spelling = [
+            number_of.setdefault(
+                frozenset(text.casefold().translate(SPACES).split()), len(number_of)
+            )
             for text in texts.words
         ]
-        words = sorted(frozenset().union(*known))
+        words = sorted(frozenset().union(*number_of))
         if len(words) > _MOST_LETTERS:
             return None
-        has = np.array([[word in some for some in known] for word in words], np.bool_)
-        rows = has.reshape(len(words), len(known))[:, np.array(alike, np.int64)[texts.codes]]
+        has = np.array([[word in spelled for spelled in number_of] for word in words], np.bool_)
+        rows = has.reshape(len(words), len(number_of))[:, np.array(spelling, np.int64)[texts.codes]]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
     def may_have(self, text: str) -> Mask:
         """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
-        found = np.full(self.has.shape[1], 0xFF, np.uint8)
+        bits = np.full(self.has.shape[1], 0xFF, np.uint8)
         for letters in letters_of(text):
-            here = [nth for nth, word in enumerate(self.words) if letters in word]
-            found &= np.bitwise_or.reduce(self.has[here], axis=0)
-        return np.unpackbits(found, count=self.size).view(np.bool_)
+            containing = [nth for nth, word in enumerate(self.words) if letters in word]
+            bits &= np.bitwise_or.reduce(self.has[containing], axis=0)
+        return np.unpackbits(bits, count=self.size).view(np.bool_)
 
 
 class Outline(NamedTuple):
@@ -104,12 +106,14 @@ class Outline(NamedTuple):
     @classmethod
     def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
         """Returns the outline of columns, by their paths."""
-        every = [*totals.values()]
+        ordered = [*totals.values()]
         return cls(
             [*totals],
-            np.array([one.size for one in every], np.int64),
-            np.array([one.total for one in every], np.float64),
-            np.array([(*one.least, *one.greatest) for one in every], np.int64).reshape(-1, 4),
+            np.array([column.size for column in ordered], np.int64),
+            np.array([column.total for column in ordered], np.float64),
+            np.array([(*column.least, *column.greatest) for column in ordered], np.int64).reshape(
+                -1, 4
+            ),
             letters,
         )
 
@@ -125,7 +129,9 @@ class Outline(NamedTuple):
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        texts = sum(one.has.nbytes + 100 * len(one.words) for one in self.letters.values())
+        texts = sum(
+            letters.has.nbytes + 100 * len(letters.words) for letters in self.letters.values()
+        )
         return texts + _BYTES + 120 * len(self.paths)
 
 
@@ -137,9 +143,9 @@ def outline_of(table: Table, times: IntArray) -> Outline:
         zone = table.zone(path)
         if zone is not None and (zone.words or "").startswith(IN_PART):
             texts = table.columns[path]
-            found = Letters.of(texts) if isinstance(texts, Texts) else None
-            if found is not None:
-                letters[path] = found
+            in_texts = Letters.of(texts) if isinstance(texts, Texts) else None
+            if in_texts is not None:
+                letters[path] = in_texts
         elif zone is not None and np.isfinite([zone.low, zone.high]).all():
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
@@ -159,7 +165,7 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
         return Totals(len(numbers), total, (ends[0],) * 2, (ends[1],) * 2)
     least = times[numbers - error <= (numbers + error).min()]
     most = times[numbers + error >= (numbers - error).max()]
-    spans = [(int(some[0]), int(some[-1])) for some in (least, most)]
+    spans = [(int(candidates[0]), int(candidates[-1])) for candidates in (least, most)]
     return Totals(len(numbers), total, *spans)
 
 

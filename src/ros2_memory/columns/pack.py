@@ -110,14 +110,14 @@ class Packed:
 def pack(column: Column, step: Step = EXACT) -> Packed:
     """Returns the column as bytes. `step` counts for floats alone; all others are exact."""
     if isinstance(column, Texts):
-        found = _pack_texts(column)
+        packed = _pack_texts(column)
     elif not len(column):
         return Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
     elif column.dtype.kind == "f":
-        found = _pack_floats(column, step)
+        packed = _pack_floats(column, step)
     else:
-        found = _pack_integers(column)
-    return _arranged(found) if isinstance(found, _Whole) else found
+        packed = _pack_integers(column)
+    return _arranged(packed) if isinstance(packed, _Whole) else packed
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
@@ -260,14 +260,14 @@ def _exactly(column: Numbers, zone: Zone) -> _Whole:
 
 
 def _zone_of(values: Floats) -> Zone:
-    there = values
+    numbers = values
     if math.isnan(values.min()):
-        there = values[~np.isnan(values)]
-        if not len(there):
+        numbers = values[~np.isnan(values)]
+        if not len(numbers):
             return Zone(nulls=len(values))
     # -0.0 becomes 0.0
-    least, greatest = float(there.min()) + 0.0, float(there.max()) + 0.0
-    return Zone(least, greatest, len(values) - len(there))
+    least, greatest = float(numbers.min()) + 0.0, float(numbers.max()) + 0.0
+    return Zone(least, greatest, len(values) - len(numbers))
 
 
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:

@@ -353,16 +353,16 @@ def first_align(kind: str | Definition) -> int:
 
 def fields_at(definition: Definition | None, path: Iterable[str]) -> list[Field]:
     """Returns the fields along a path, each inside the one before, as far as there are such."""
-    found: list[Field] = []
+    fields: list[Field] = []
     kind: str | Definition | None = definition
     for name in path:
         inside = kind.fields if isinstance(kind, Definition) else ()
-        own = next((each for each in inside if each.name == name), None)
-        if own is None:
+        member = next((entry for entry in inside if entry.name == name), None)
+        if member is None:
             break
-        found.append(own)
-        kind = own.kind
-    return found
+        fields.append(member)
+        kind = member.kind
+    return fields
 
 
 def _dtype(kind: str | Definition) -> np.dtype[np.generic[object]]:

@@ -124,8 +124,8 @@ class _Field(NamedTuple):
         """Returns the paths of its fields with these names; none unless all are numbers."""
         if self.length is not None or not isinstance(self.kind, Definition):
             return ()
-        found = [_field(self.kind, (name,)) for name in names]
-        paths = tuple(f"{self.path}.{part.path}" for part in found if part and part.is_number)
+        fields = [_field(self.kind, (name,)) for name in names]
+        paths = tuple(f"{self.path}.{part.path}" for part in fields if part and part.is_number)
         return paths if len(paths) == len(names) else ()
 
     def elements(self, count: int) -> tuple[str, ...]:
@@ -147,12 +147,12 @@ def _field(definition: Definition, path: Segments) -> _Field | None:
     Raises:
         UnknownShapeError: it leads through a list.
     """
-    found = fields_at(definition, path)
-    if any(each.length is not None for each in found[: len(path) - 1]):
+    fields = fields_at(definition, path)
+    if any(entry.length is not None for entry in fields[: len(path) - 1]):
         raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
-    if len(found) < len(path):
+    if len(fields) < len(path):
         return None
-    return _Field(".".join(path), found[-1].kind, found[-1].length)
+    return _Field(".".join(path), fields[-1].kind, fields[-1].length)
 
 
 def _columns_of(plan: Plan, definition: Definition) -> _Columns:
@@ -282,9 +282,9 @@ def _turns(rows: _Rows, columns: _Columns, count: int) -> Vectors:
     turns = np.full((count, 4), np.nan)
     if len(columns.turn) == 1:
         halves = rows.floats(columns.turn[0], RADIANS) / 2
-        known = np.isfinite(halves)
-        turns[known, :2] = 0.0
-        turns[known, 2], turns[known, 3] = np.sin(halves[known]), np.cos(halves[known])
+        is_known = np.isfinite(halves)
+        turns[is_known, :2] = 0.0
+        turns[is_known, 2], turns[is_known, 3] = np.sin(halves[is_known]), np.cos(halves[is_known])
     elif columns.turn:
         for part, path in enumerate(columns.turn):
             turns[:, part] = rows.floats(path, EXACT)

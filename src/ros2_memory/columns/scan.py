@@ -227,7 +227,7 @@ class Scan:
         Those of `STRETCH_NS` in which all rows are of whole parts, also those so long (ns) before
         and after, and what lies between them.
         """
-        found: list[Stretch] = []
+        stretches: list[Stretch] = []
         until = self._asked.window.stop
 
         def between(start: Ns) -> Iterator[Stretch]:
@@ -236,9 +236,9 @@ class Scan:
                 yield Stretch(TimeWindow(start, until), max([until - 1, *latest[-1:]]), None)
 
         for stretch in self._settled_stretches(beside) if self._sources else ():
-            found += [*between(stretch.window.stop), stretch]
+            stretches += [*between(stretch.window.stop), stretch]
             until = stretch.window.start
-        return [*found, *between(self._asked.window.start)]
+        return [*stretches, *between(self._asked.window.start)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the whole parts that all rows in a window are of; None where others are, too.
@@ -262,8 +262,8 @@ class Scan:
         end = int(np.searchsorted(self._firsts, window.stop))
         if self._others[end] > self._others[begin]:
             return None
-        here = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
-        return tuple(self._numbers[here].tolist())
+        reaching = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
+        return tuple(self._numbers[reaching].tolist())
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
@@ -274,7 +274,9 @@ class Scan:
 
     @cached_property
     def _numbers(self) -> IntArray:
-        return np.array([0 if one.part is None else one.part.number for one in self._sources])
+        return np.array(
+            [0 if source.part is None else source.part.number for source in self._sources]
+        )
 
     @cached_property
     def _heads(self) -> dict[int, PartHead]:
@@ -296,7 +298,7 @@ class Scan:
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
         """Returns the stretches of which all rows are of whole parts; see `stretches`."""
         window, firsts, latest = self._asked.window, self._firsts, self._latest
-        newest = max((each.latest for each in self._asked.timeline.segments), default=MIN_NS)
+        newest = max((segment.latest for segment in self._asked.timeline.segments), default=MIN_NS)
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
@@ -305,7 +307,7 @@ class Scan:
         is_apart = (before[begin] < after[begin]) & (before[end] < after[end])
         lasts = np.maximum(before[end], stops - 1)
         is_inside = (starts - beside >= window.start) & (lasts + beside < window.stop)
-        found = []
+        stretches = []
         for nth in np.flatnonzero(is_apart & is_inside & (stops <= newest)).tolist():
             start, stop, last = int(starts[nth]), int(stops[nth]), int(lasts[nth])
             around = TimeWindow(start - beside, last + beside + 1)
@@ -314,8 +316,8 @@ class Scan:
             has_copies = overlaps_any(self._shared, copied.start, copied.stop)
             parts = self.whole_parts(copied if has_copies else around)
             if parts is not None:
-                found.append(Stretch(TimeWindow(start, stop), last, parts))
-        return found
+                stretches.append(Stretch(TimeWindow(start, stop), last, parts))
+        return stretches
 
     def copies(self) -> Iterator[Rows]:
         """Yields the rows that do not count, as another recording has their messages, too.
@@ -343,18 +345,18 @@ class Scan:
                 break
             failures = store.failures
             self._coverage = self._scanner.coverage(self._asked.timeline)
-            found = [*self._found(reach)]
+            sources = [*self._found(reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
             if self._coverage is None:
-                return found
+                return sources
             before, now = self._coverage.state, store.state()
             if (failures, before.part, before.deletion) == (
                 store.failures,
                 now.part,
                 now.deletion,
             ):
-                return found
+                return sources
         self._coverage = None
         return [*self._found(reach)]
 
@@ -433,7 +435,7 @@ class Scan:
 
     def _holding_copies(self) -> list[tuple[Ns, Ns]]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        found: list[tuple[Ns, Ns]] = []
+        spans: list[tuple[Ns, Ns]] = []
         for start, stop in self._shared:
             published = sorted(
                 (-math.inf, math.inf)
@@ -442,8 +444,8 @@ class Scan:
                 for source in self._sources_in(TimeWindow(start, stop))
             )
             if any(before[1] >= after[0] for before, after in pairwise(published)):
-                found.append((start, stop))
-        return found
+                spans.append((start, stop))
+        return spans
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
@@ -456,10 +458,10 @@ class Scan:
                     self._compared.add(begin)
                     end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
-        found = self._copies.get(unit.key, [])
+        copies = self._copies.get(unit.key, [])
         if self._asked.relatches:
-            found = [*found, self._received_again(unit)]
-        return np.concatenate(found) if found else np.empty(0, np.int64)
+            copies = [*copies, self._received_again(unit)]
+        return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
     def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
         """Finds the copies in a part of a shared span."""
@@ -472,9 +474,9 @@ class Scan:
         copies = copies_among(messages)
         copies &= (messages.log_times >= part.start) & (messages.log_times < part.stop)
         begin = 0
-        for unit, some in zip(units, rows, strict=True):
-            of_unit = some[copies[begin : begin + some.size]]
-            begin += some.size
+        for unit, unit_rows in zip(units, rows, strict=True):
+            of_unit = unit_rows[copies[begin : begin + unit_rows.size]]
+            begin += unit_rows.size
             if of_unit.size:
                 self._copies[unit.key].append(of_unit)
 
@@ -501,13 +503,13 @@ class Scan:
         rows = [self._rows_in(unit, window) for unit in units]
         messages = self._messages(units, rows)
         latched = np.repeat(
-            [unit.table.channel.latched for unit in units], [some.size for some in rows]
+            [unit.table.channel.latched for unit in units], [unit_rows.size for unit_rows in rows]
         )
         again = relatched_among(messages) & latched
         begin = 0
-        for unit, some in zip(units, rows, strict=True):
-            self._relatched[unit.key] = some[again[begin : begin + some.size]]
-            begin += some.size
+        for unit, unit_rows in zip(units, rows, strict=True):
+            self._relatched[unit.key] = unit_rows[again[begin : begin + unit_rows.size]]
+            begin += unit_rows.size
 
     @cached_property
     def _delays(self) -> dict[int, tuple[float, float]]:
@@ -546,17 +548,19 @@ class Scan:
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
         numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
-        for unit, some in zip(units, rows, strict=True):
+        for unit, unit_rows in zip(units, rows, strict=True):
             recording = numbers[unit.first_bag.recording]
-            published, hashes = self._identities(unit, some)
+            published, hashes = self._identities(unit, unit_rows)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
             parts.append(
-                Identities(unit.times()[some], published, hashes, np.full(some.size, recording))
+                Identities(
+                    unit.times()[unit_rows], published, hashes, np.full(unit_rows.size, recording)
+                )
             )
         return joined_identities(parts)
 
-    def _identities(self, unit: Unit, some: IntArray) -> tuple[IntArray, IntArray]:
+    def _identities(self, unit: Unit, positions: IntArray) -> tuple[IntArray, IntArray]:
         """Returns publish times and hashes of some rows of a unit.
 
         Bags that were stored before another recording came beside them are read. Rows of one that
@@ -564,9 +568,9 @@ class Scan:
         """
         times = unit.times()
         published, hashes = unit.identities() or (times, np.full(times.size, UNHASHED))
-        unknown = some[hashes[some] == UNHASHED]
+        unknown = positions[hashes[positions] == UNHASHED]
         if not unknown.size:
-            return published[some], hashes[some]
+            return published[positions], hashes[positions]
         published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
         bags = unit.bags()
         for number in np.unique(numbers[unknown]).tolist():
@@ -580,18 +584,20 @@ class Scan:
                 if np.array_equal(table.log_times[same], times[rows]):
                     published[rows] = table.publish_times[same]
                     hashes[rows] = table.payload_hashes[same]
-        return published[some], hashes[some]
+        return published[positions], hashes[positions]
 
 
 def _bounded(tables: Iterable[Table]) -> list[Table]:
     """Returns the tables of a bag; without their columns where these take too much together."""
-    found: list[Table] = []
+    held: list[Table] = []
     size = 0
     for table in tables:
         size += table.memory_bytes
-        found.append(table)
+        held.append(table)
         if size > _MOST_BYTES:
             left_out = {"": _TOO_LARGE}
-            found = [replace(each, columns={}, elements={}, left_out=left_out) for each in found]
+            held = [
+                replace(earlier, columns={}, elements={}, left_out=left_out) for earlier in held
+            ]
         del table
-    return found
+    return held

@@ -77,13 +77,13 @@ class Scored:
         return name, score, error
 
 
-def or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
+def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
     """Returns each of some texts, or another where it is empty (or `blank`)."""
-    is_none = [not (word.strip() if blank else word) for word in one.words]
+    is_none = [not (word.strip() if blank else word) for word in texts.words]
     if not any(is_none):
-        return one
-    codes = np.where(np.array(is_none)[one.codes], other.codes + len(one.words), one.codes)
-    return Texts(codes.astype(np.uint32), (*one.words, *other.words))
+        return texts
+    codes = np.where(np.array(is_none)[texts.codes], fallback.codes + len(texts.words), texts.codes)
+    return Texts(codes.astype(np.uint32), (*texts.words, *fallback.words))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,16 +233,16 @@ def scored(fields: Mapping[str, Node]) -> Scored | None:
 def _leaves(
     fields: Mapping[str, Node], names: tuple[str, ...], takes: Callable[[Leaf], bool]
 ) -> tuple[Leaf, ...]:
-    found = [fields[name] for name in names if name in fields]
-    return tuple(node for node in found if isinstance(node, Leaf) and takes(node))
+    nodes = [fields[name] for name in names if name in fields]
+    return tuple(node for node in nodes if isinstance(node, Leaf) and takes(node))
 
 
 def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
     """Returns the texts in an object that may be JSON, and whether there are detections in it."""
     texts: list[Leaf] = []
     for node in fields.values():
-        found = without_low(node, 0.0, depth - 1)
-        for _, leaf, limits in leaves_below(Spot(found)):
+        child = without_low(node, 0.0, depth - 1)
+        for _, leaf, limits in leaves_below(Spot(child)):
             if any(isinstance(limit, _Detections) for limit in limits):
                 return (), True
             if leaf.json_depth:

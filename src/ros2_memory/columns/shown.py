@@ -81,7 +81,7 @@ class Limit(Protocol):
     def level(self) -> Level:
         """The level that it is about."""
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> Kept:
         """Returns where it stands, for some rows or elements of the level."""
 
 
@@ -92,11 +92,11 @@ class Pick:
     level: Level
     place: int
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> Kept:
         """Returns where the elements stand at the place."""
-        places = values.places(self.level, among, from_end=self.place < 0)
+        places = values.places(self.level, positions, from_end=self.place < 0)
         if places is None:
-            return unknown(len(among))
+            return unknown(len(positions))
         kept = places == self.place
         return Kept(kept, kept)
 
@@ -110,12 +110,12 @@ class LongerThan:
     count: int
     is_longer: bool
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> Kept:
         """Returns where the sequence is that long."""
         lengths = values.numeric(self.level, f"{self.sequence}.length")
         if lengths is None:
-            return unknown(len(among))
-        kept = (lengths[among] > self.count) == self.is_longer
+            return unknown(len(positions))
+        kept = (lengths[positions] > self.count) == self.is_longer
         return Kept(kept, kept)
 
 
@@ -224,27 +224,27 @@ class Spot(NamedTuple):
 
 
 def placed(
-    values: Values, level: Level, among: Ints, limits: Limits, *, surely: bool
+    values: Values, level: Level, positions: Ints, limits: Limits, *, surely: bool
 ) -> tuple[Ints, Ints]:
     """Returns which of some rows or elements stand in the value, and the row of each.
 
     Args:
         values: of the table.
         level: of the rows or elements.
-        among: their positions.
+        positions: their positions.
         limits: on what stands there.
         surely: whether those that may or may not stand there are left out.
     """
-    here, kept, owners = level, among, among
+    current, kept, owners = level, positions, positions
     while True:
         for limit in limits:
-            if limit.level == here and len(kept):
+            if limit.level == current and len(kept):
                 mask = limit.kept(values, owners)[0 if surely else 1]
                 kept, owners = kept[mask], owners[mask]
-        found = values.elements(here)
-        if here.parent is None or found is None:
+        elements = values.elements(current)
+        if current.parent is None or elements is None:
             return kept, owners
-        owners, here = found.owners[owners], here.parent
+        owners, current = elements.owners[owners], current.parent
 
 
 class Shape:
@@ -273,13 +273,13 @@ class Shape:
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        found = {name: self._at(path) for name, path in self._fields.items()}
-        if all(node is None for node in found.values()):
+        nodes = {name: self._at(path) for name, path in self._fields.items()}
+        if all(node is None for node in nodes.values()):
             return self._message()
         return Group(
             {
                 name: NOTHING if node is None else self._converted(name, node)
-                for name, node in found.items()
+                for name, node in nodes.items()
             }
         )
 
@@ -291,15 +291,15 @@ class Shape:
         """
         segments = tuple(path.split("."))
         mapped = self._fields.get(segments[0])
-        found: Node | None = None
+        node: Node | None = None
         if mapped is not None:
             whole = self._at(mapped)
             if whole is not None:
-                found = descend(self._converted(segments[0], whole), segments[1:])
+                node = descend(self._converted(segments[0], whole), segments[1:])
         elif not self._fields:
-            found = descend(self._message(), segments)
-        if found is not None:
-            return found
+            node = descend(self._message(), segments)
+        if node is not None:
+            return node
         plain = self._at(segments)
         return None if plain is None else _changed(plain, _as_numbers)
 
@@ -353,9 +353,9 @@ class Shape:
             raise UnknownShapeError(f"{place.path} is no sequence of bytes")
 
         def leaf(kind: Kind, *path: str) -> Leaf:
-            found = descend(message, path)
-            if isinstance(found, Leaf) and found.kind is kind:
-                return found
+            child = descend(message, path)
+            if isinstance(child, Leaf) and child.kind is kind:
+                return child
             raise UnknownShapeError(f"{'.'.join(path)} is not as in the standard definition")
 
         count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
@@ -370,9 +370,9 @@ class Shape:
         return self.shown(Place(ROWS, "", self.definition, None, 0))
 
     def _at(self, path: Sequence[str]) -> Node | None:
-        found = descend(self._message(), path)
-        if found is not None:
-            return found
+        node = descend(self._message(), path)
+        if node is not None:
+            return node
         plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
         return None if plain is None else _changed(plain, self._as_shown)
 
@@ -432,11 +432,11 @@ class Shape:
         return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
 
 
-def shape_of(known: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
+def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
     """Returns the shape of a table's type, or of some parts'; None where the messages decide."""
-    if known.definition is None or "" in known.left_out:
+    if table_or_parts.definition is None or "" in table_or_parts.left_out:
         return None
-    return Shape(known.definition, known.channel.type, extractor)
+    return Shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
 
 
 class ByType(Generic[T]):
@@ -452,9 +452,9 @@ class ByType(Generic[T]):
         self._make = make
         self._known: dict[tuple[Definition, str], T | None] = {}
 
-    def of(self, known: Table | PartZones) -> T | None:
+    def of(self, table_or_parts: Table | PartZones) -> T | None:
         """Returns that of a table's type, or of some parts'; None where the messages decide."""
-        shape = shape_of(known, self._extractor)
+        shape = shape_of(table_or_parts, self._extractor)
         if shape is None:
             return None
         key = (shape.definition, shape.type)
@@ -485,10 +485,10 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
             inner = descend(node.element, path[nth:])
             return None if inner is None else Listing(node.level, inner)
         elif isinstance(node, Message | Group):
-            found = node.child(segment)
-            if found is None:
+            child = node.child(segment)
+            if child is None:
                 return None
-            node = found
+            node = child
         else:
             return None
     return node
@@ -593,15 +593,15 @@ def _real(level: Level, source: str) -> Leaf:
 
 
 def _vector(level: Level, sources: Sequence[str]) -> Group:
-    return Group({axis: _real(level, each) for axis, each in zip("xyz", sources, strict=True)})
+    return Group({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
 
 
 def _turned(level: Level, sources: Sequence[str], message: Message | None) -> Group:
     angles = (Made.ROLL, Made.PITCH, Made.YAW)
     return Group(
         {
-            name: Leaf(level, tuple(sources), Kind.REAL, made)
-            for name, made in zip(ANGLES, angles, strict=True)
+            name: Leaf(level, tuple(sources), Kind.REAL, angle)
+            for name, angle in zip(ANGLES, angles, strict=True)
         },
         message,
     )

@@ -151,13 +151,15 @@ class _Plan(NamedTuple):
         if self.entry:
             facts = _entries(values, self.entry, self.type)
             return FromColumns(Stated(table.log_times, facts), nothing)
-        labels = joined_facts([facts for each in self.labels for facts in _labels(values, each)])
+        labels = joined_facts(
+            [facts for source in self.labels for facts in _labels(values, source)]
+        )
         if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
             raise UnknownShapeError("more labels than are tracked")
         numbers, to_read = NOTHING, nothing
         if self.numbers:
-            of = _charges if self.type == BATTERY else _commands
-            numbers, to_read = of(values, self.numbers)
+            facts_of = _charges if self.type == BATTERY else _commands
+            numbers, to_read = facts_of(values, self.numbers)
         flags = [_booleans(values, path, leaf) for path, leaf in self.flags]
         return FromColumns(
             Stated(table.log_times, joined_facts([labels, *flags, numbers])), to_read
@@ -185,8 +187,8 @@ def _entry(value: Node, type_name: str) -> tuple[Leaf, ...]:
         listed = _child(value, "status")
         node = listed.element if isinstance(listed, Listing) else None
     text = "message" if type_name == DIAGNOSTICS else "msg"
-    found = [] if node is None else [_child(node, name) for name in ("level", "name", text)]
-    leaves = tuple(leaf for leaf in found if isinstance(leaf, Leaf))
+    nodes = [] if node is None else [_child(node, name) for name in ("level", "name", text)]
+    leaves = tuple(leaf for leaf in nodes if isinstance(leaf, Leaf))
     kinds = [leaf.kind for leaf in leaves]
     if kinds != [Kind.INTEGER, Kind.TEXT, Kind.TEXT]:
         raise UnknownShapeError("the definition is not the standard one")
@@ -229,9 +231,11 @@ def _of_goals(value: Node) -> Iterator[Leaf]:
 
 def _labels(values: Values, source: Source) -> Iterator[Facts]:
     """Yields the labels at one place of the messages, with their scores."""
-    for found in found_in(values, source, places=False):
-        words = [Word(LABEL, label) for label in found.labels.words]
-        yield Facts(found.rows, found.labels.codes.astype(np.int64), found.scores, words)
+    for detections in found_in(values, source, places=False):
+        words = [Word(LABEL, label) for label in detections.labels.words]
+        yield Facts(
+            detections.rows, detections.labels.codes.astype(np.int64), detections.scores, words
+        )
 
 
 def _booleans(values: Values, path: str, leaf: Leaf) -> Facts:
@@ -239,10 +243,10 @@ def _booleans(values: Values, path: str, leaf: Leaf) -> Facts:
     if zone is not None and zone.least is not None and zone.least == zone.greatest:
         flags = np.full(rows.size, float(zone.least))
     else:
-        found = values.numbers(leaf)
-        if found is None:
+        numbers = values.numbers(leaf)
+        if numbers is None:
             raise UnknownShapeError(f"{path} is not held")
-        flags = found.values.astype(np.float64)
+        flags = numbers.values.astype(np.float64)
     return Facts(rows, np.zeros(rows.size, np.int64), flags, [Word(FLAG, path)])
 
 
@@ -255,12 +259,12 @@ def _entries(values: Values, entry: tuple[Leaf, ...], type_name: str) -> Facts:
     if level is None:
         raise UnknownShapeError("levels are not held")
     numbers = level.values.astype(np.int64)
-    telling = [each for each in np.unique(numbers).tolist() if _of_entry(each, type_name)]
-    among = np.flatnonzero(np.isin(numbers, telling))
-    _, rows = placed(values, entry[0].level, among, (), surely=True)
+    telling = [value for value in np.unique(numbers).tolist() if _of_entry(value, type_name)]
+    positions = np.flatnonzero(np.isin(numbers, telling))
+    _, rows = placed(values, entry[0].level, positions, (), surely=True)
     if rows.size and np.bincount(rows).max() > MOST[STATUS]:
         raise UnknownShapeError("more levels than are tracked")
-    keys = np.stack([numbers[among], name.codes[among], text.codes[among]])
+    keys = np.stack([numbers[positions], name.codes[positions], text.codes[positions]])
     alike, codes = np.unique(keys, axis=1, return_inverse=True)
     once = Facts.of(
         [
@@ -287,13 +291,15 @@ def _of_entry(level: int, type_name: str, name: str = "", text: str = "") -> tup
 
 def _charges(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
-    found = values.numbers(leaves[0])
-    if found is None or not isinstance(found.error, float):
+    numbers = values.numbers(leaves[0])
+    if numbers is None or not isinstance(numbers.error, float):
         raise UnknownShapeError("the charge is not held")
-    charges = found.values.astype(np.float64)
-    low, levels, high = (charge_levels(charges + off) for off in (-found.error, 0, found.error))
-    known = np.flatnonzero((levels >= 0) & (low == high))
-    charge = Facts(known, np.zeros(known.size, np.int64), levels[known].astype(np.float64), _CHARGE)
+    charges = numbers.values.astype(np.float64)
+    low, levels, high = (charge_levels(charges + off) for off in (-numbers.error, 0, numbers.error))
+    settled = np.flatnonzero((levels >= 0) & (low == high))
+    charge = Facts(
+        settled, np.zeros(settled.size, np.int64), levels[settled].astype(np.float64), _CHARGE
+    )
     return charge, np.flatnonzero(low != high)
 
 
@@ -301,15 +307,15 @@ def _commands(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
     surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:
-        found = values.numbers(leaf)
-        if found is None or not isinstance(found.error, float):
+        column = values.numbers(leaf)
+        if column is None or not isinstance(column.error, float):
             raise UnknownShapeError("the command is not held")
-        numbers = found.values.astype(np.float64)
-        surely &= is_still(numbers, found.error)
-        perhaps &= is_still(numbers, -found.error)
-    known = np.flatnonzero(surely == perhaps)
-    moves = (~surely[known]).astype(np.float64)
-    return Facts(known, np.zeros(known.size, np.int64), moves, _COMMAND), np.flatnonzero(
+        numbers = column.values.astype(np.float64)
+        surely &= is_still(numbers, column.error)
+        perhaps &= is_still(numbers, -column.error)
+    settled = np.flatnonzero(surely == perhaps)
+    moves = (~surely[settled]).astype(np.float64)
+    return Facts(settled, np.zeros(settled.size, np.int64), moves, _COMMAND), np.flatnonzero(
         surely != perhaps
     )
 
@@ -321,9 +327,9 @@ def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
     the place of another without a trace.
     """
     columns = [values.numbers(leaf) for leaf in leaves]
-    found = [column.values for column in columns if column is not None]
+    numbers = [column.values for column in columns if column is not None]
     elements = values.elements(leaves[0].level) if leaves else None
-    if len(found) < len(columns) or elements is None:
+    if len(numbers) < len(columns) or elements is None:
         raise UnknownShapeError("goals are not held")
     first = np.searchsorted(elements.owners, np.arange(values.rows + 1))
     counts = np.diff(first)
@@ -333,7 +339,7 @@ def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
     before = np.maximum(first[np.maximum(elements.owners - 1, 0)] + nth, 0)
     before = np.minimum(before, max(elements.owners.size - 1, 0))
     differs = np.zeros(elements.owners.size, np.bool_)
-    for column in found:
+    for column in numbers:
         differs |= column != column[before]
     is_new[elements.owners[differs]] = True
     return np.cumsum(is_new)

@@ -226,11 +226,11 @@ class ColumnStore(Database):
 
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
-        among = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
+        condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
         rows = self._rows(
             list[tuple[str, int, Ns, Ns, int, int]](),
             "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
-            f" WHERE definitions IN ('', ?) {among}",
+            f" WHERE definitions IN ('', ?) {condition}",
             self._definitions,
             *(() if paths is None else (json.dumps(paths),)),
         )
@@ -270,19 +270,23 @@ class ColumnStore(Database):
         """Returns all topics that were ever stored, by their numbers."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
-            known = {each: topic for each, topic in self._topics.items() if self.is_current(each)}
+            topics = {
+                topic_number: topic
+                for topic_number, topic in self._topics.items()
+                if self.is_current(topic_number)
+            }
             rows = connection.execute(
                 "SELECT topic.id, name, topic.encoding, latched, layout, type,"
                 " definition.encoding, text"
                 " FROM topic JOIN definition ON definition.id = definition WHERE topic.id > ?",
-                (max(known, default=self.offset) - self.offset,),
+                (max(topics, default=self.offset) - self.offset,),
             )
             for number, name, encoding, latched, layout, *schema in rows:
                 channel = Channel(name, encoding, Schema(*schema), bool(latched))
                 topic = Topic(channel, Layout.from_json(layout), self._definition_of)
-                known[self.offset + number] = topic
-            self._topics = known
-            return known
+                topics[self.offset + number] = topic
+            self._topics = topics
+            return topics
 
         return self.read(ask, {})
 
@@ -308,8 +312,8 @@ class ColumnStore(Database):
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
             bags = [json.loads(row[4]) for row in rows]
-            every = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
-            own = np.split(every, np.cumsum([*map(len, bags)])[:-1]) if rows else []
+            all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
+            bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [
                 PartHead(
                     self.offset + number,
@@ -322,7 +326,7 @@ class ColumnStore(Database):
                     bool(whole),
                 )
                 for (number, of_topic, first, last, _, messages, dropped, whole), numbers in zip(
-                    rows, own, strict=True
+                    rows, bags_of_parts, strict=True
                 )
             ]
 
@@ -372,14 +376,14 @@ class ColumnStore(Database):
                 " WHERE coalesce(own.data, other.data) IS NOT NULL",
                 (self._ids(parts), path),
             )
-            found: dict[int, bytes] = {}
+            by_part: dict[int, bytes] = {}
             size = 0
             for part, data in rows:
-                found[part + self.offset] = data
+                by_part[part + self.offset] = data
                 size += len(data)
                 if size > most_bytes:
                     break
-            return found
+            return by_part
 
         return self.read(ask, {})
 
@@ -390,7 +394,7 @@ class ColumnStore(Database):
 
         They are of the same settings, the newest first.
         """
-        own, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
+        key_parts, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
         query = (
             "SELECT start_ns, parts, data FROM fragment"
             " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC"
@@ -399,7 +403,7 @@ class ColumnStore(Database):
         return [
             (key._replace(start=start, parts=self._parts(parts)), data)
             for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
-            if start < key.start or parts == own
+            if start < key.start or parts == key_parts
         ]
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
@@ -433,7 +437,7 @@ class ColumnStore(Database):
 
     # Writing
 
-    def put_fragments(self, kind: str, made: Sequence[tuple[FragmentKey, bytes]]) -> bool:
+    def put_fragments(self, kind: str, fragments: Sequence[tuple[FragmentKey, bytes]]) -> bool:
         """Stores fragments in place of those of the same time, settings and some of the parts.
 
         Not those of a part that is not stored any more. What was stored of the same parts may be
@@ -441,7 +445,7 @@ class ColumnStore(Database):
         """
 
         def write(connection: sqlite3.Connection) -> None:
-            for key, data in made:
+            for key, data in fragments:
                 if not all(map(self.is_current, key.parts)):
                     continue
                 parts = self._ids(key.parts)

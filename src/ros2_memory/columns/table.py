@@ -141,9 +141,9 @@ class Texts:
     @classmethod
     def of(cls, values: Sequence[str]) -> Texts:
         """Returns the column of these strings."""
-        known: dict[str, int] = {}
-        codes = [known.setdefault(value, len(known)) for value in values]
-        return cls(np.array(codes, np.uint32), tuple(known))
+        code_of: dict[str, int] = {}
+        codes = [code_of.setdefault(value, len(code_of)) for value in values]
+        return cls(np.array(codes, np.uint32), tuple(code_of))
 
     def __len__(self) -> int:
         """Returns the number of rows."""
@@ -168,12 +168,12 @@ class Texts:
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:
     """Returns columns of texts one after the other."""
-    known: dict[str, int] = {}
+    code_of: dict[str, int] = {}
     codes = [np.empty(0, np.uint32)]
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(known))
+        recoded = [code_of.setdefault(word, len(code_of)) for word in part.words]
+        codes.append(np.array(recoded, np.uint32)[part.codes])
+    return Texts(np.concatenate(codes), tuple(code_of))
 
 
 Column: TypeAlias = "Numbers | Texts"
@@ -203,11 +203,11 @@ class Elements:
         first = np.searchsorted(self.owners, positions, "left")
         counts = np.searchsorted(self.owners, positions, "right") - first
         before = np.cumsum(counts) - counts
-        own = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
+        taken = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
         return Elements(
             np.repeat(np.arange(positions.size), counts),
-            {path: _rows(column, own) for path, column in self.columns.items()},
-            {path: inner.rows(own) for path, inner in self.elements.items()},
+            {path: _rows(column, taken) for path, column in self.columns.items()},
+            {path: inner.rows(taken) for path, inner in self.elements.items()},
         )
 
 
@@ -349,7 +349,7 @@ def _joined_levels(
 
     def elements(path: str) -> Elements:
         inner = [part.elements[path] for part in parts]
-        owners = [each.owners + rows for each, rows in zip(inner, before, strict=False)]
+        owners = [sequence.owners + rows for sequence, rows in zip(inner, before, strict=False)]
         return Elements(np.concatenate(owners), *_joined_levels(inner))
 
     columns = {

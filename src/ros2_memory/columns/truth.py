@@ -98,17 +98,17 @@ class ColumnCondition:
         whole = _any_of(plan.whole, values)
         return Kept(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
 
-    def may_match(self, known: Table | PartZones) -> bool | Mask:
+    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a row may meet the condition, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        plan = self._plans.of(known)
+        plan = self._plans.of(table_or_parts)
         if plan is None:
             return True
-        if isinstance(known, PartZones):
-            return plan.may_match(lambda leaf: zone_of(leaf, known.zone))
-        return plan.may_match(Values(known).zone)
+        if isinstance(table_or_parts, PartZones):
+            return plan.may_match(lambda leaf: zone_of(leaf, table_or_parts.zone))
+        return plan.may_match(Values(table_or_parts).zone)
 
 
 class _Plan(NamedTuple):
@@ -130,12 +130,12 @@ class _Plan(NamedTuple):
         return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
 
     def may_match(self, zone_of: ZoneOf) -> bool | Mask:
-        found: bool | Mask = False
+        may: bool | Mask = False
         for test in self.whole:
-            found = found | test.may_match(zone_of)
-            if found is True:
+            may = may | test.may_match(zone_of)
+            if may is True:
                 break
-        return found
+        return may
 
 
 def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
@@ -144,12 +144,12 @@ def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
     for test in tests:
         if not test.may_match(values.zone):
             continue
-        for level, found, limits in test.found(values):
-            if found is None:
+        for level, passing, limits in test.found(values):
+            if passing is None:
                 return Kept(surely, np.ones(values.rows, np.bool_))
-            certain = np.flatnonzero(found.surely)
+            certain = np.flatnonzero(passing.surely)
             surely[placed(values, level, certain, limits, surely=True)[1]] = True
-            possible = np.flatnonzero(found.perhaps)
+            possible = np.flatnonzero(passing.perhaps)
             perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
         if surely.all():
             break
@@ -167,15 +167,15 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
             # A missing z is NaN, which is near only what is infinitely far away.
             if test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
         ]
-    found: list[_LeafTest | _PlaceTest] = []
+    tests: list[_LeafTest | _PlaceTest] = []
     for spot in spots:
         for path, leaf, limits in leaves_below(spot):
             # Elements of lists have no name of their own.
             is_element = field is not None and not path
-            made = _LeafTest(test, leaf, limits, is_element, condition.least_score)
-            if made.is_needed:
-                found.append(made)
-    return found
+            leaf_test = _LeafTest(test, leaf, limits, is_element, condition.least_score)
+            if leaf_test.is_needed:
+                tests.append(leaf_test)
+    return tests
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,10 +235,10 @@ class _LeafTest:
         numbers: Sequence[float] = self.numbers
         if self.leaf.kind is Kind.BOOLEAN:
             numbers = [value for value in (False, True) if self.passes(value=value)]
-        found: bool | Mask = False
+        may: bool | Mask = False
         for number in numbers:
-            found = found | zone.spans(number)
-        return found
+            may = may | zone.spans(number)
+        return may
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
@@ -293,8 +293,8 @@ class _LeafTest:
                 near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
             return Kept(passed & ~near, passed | near)
-        among = np.flatnonzero(near)
-        passed[among] = self._passed(exactly(among))
+        unsettled = np.flatnonzero(near)
+        passed[unsettled] = self._passed(exactly(unsettled))
         return Kept(passed, passed)
 
     @property
@@ -322,8 +322,8 @@ class _LeafTest:
             if not is_part:
                 yield level, None, self.limits
             return
-        here = lengths > (MAX_NUMBERS if is_part else 0)
-        if not here.any():
+        is_long = lengths > (MAX_NUMBERS if is_part else 0)
+        if not is_long.any():
             return
         least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
         kept = unknown(len(lengths))
@@ -333,8 +333,8 @@ class _LeafTest:
             kept = self._between(least, greatest, error)
         limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
         # Of one that is picked from an array, what is known of all says only what it may be.
-        surely = here & kept.surely & (len(limits) == len(self.limits))
-        yield level, Kept(surely, here & kept.perhaps), limits
+        surely = is_long & kept.surely & (len(limits) == len(self.limits))
+        yield level, Kept(surely, is_long & kept.perhaps), limits
 
     def _between(self, least: Numeric, greatest: Numeric, error: float) -> Kept:
         """Returns in which arrays a number passes, by their least and greatest finite ones.
@@ -375,10 +375,10 @@ def _without_low(word: str, least: float, depth: int) -> str:
     value: JsonValue = word
     for _ in range(around):
         value = {"": value}
-    found = without_low_scores(value, least)
-    while isinstance(found, dict):
-        found = found[""]
-    return str(found)
+    kept = without_low_scores(value, least)
+    while isinstance(kept, dict):
+        kept = kept[""]
+    return str(kept)
 
 
 def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
@@ -396,15 +396,15 @@ def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
 
 def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
     """Returns which numbers equal one of these, compared as Python does: exactly."""
-    found = np.zeros(len(column), np.bool_)
+    is_equal = np.zeros(len(column), np.bool_)
     for number in numbers:
         nearest = as_float(number)
         if column.dtype.kind in "iu":
             if math.isfinite(nearest) and number == math.floor(number):
-                found |= column == int(number)
+                is_equal |= column == int(number)
         elif nearest == number:
-            found |= column == np.float64(nearest)
-    return found
+            is_equal |= column == np.float64(nearest)
+    return is_equal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -418,22 +418,22 @@ class _PlaceTest:
     def may_match(self, zone_of: ZoneOf) -> bool | Mask:
         """Returns whether some position may be near, as far as known without reading any."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
-        found: bool | Mask = True
+        may: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
             zone = zone_of(leaf)
-            found = found if zone is None else found & zone.may_be_near(center, reach)
-        return found
+            may = may if zone is None else may & zone.may_be_near(center, reach)
+        return may
 
     def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level are near; None where the table cannot say."""
         leaves = self.leaves[: len(self._center)]
         columns = [values.numbers(leaf) for leaf in leaves]
-        known = [column for column in columns if column is not None]
+        held = [column for column in columns if column is not None]
         level = self.leaves[0].level
-        if len(known) < len(columns):
+        if len(held) < len(columns):
             yield level, None, self.limits
         else:
-            yield level, self._near(known), self.limits
+            yield level, self._near(held), self.limits
 
     @property
     def _center(self) -> tuple[float, ...]:
@@ -465,8 +465,8 @@ class _PlaceTest:
 def _positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
     """Yields the positions in a value, as `analysis.conditions.positions` finds them."""
     for whole in opened(spot):
-        own = [*_own_positions(whole)]
-        yield from own or _positions_below(whole)
+        direct = [*_own_positions(whole)]
+        yield from direct or _positions_below(whole)
 
 
 def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
@@ -496,13 +496,13 @@ def _own_positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
                 yield from _own_positions(inner)
     elif isinstance(node, Message | Group):
         fields = dict(children(node))
-        found = [fields.get(axis) for axis in "xyz"]
+        axes = [fields.get(axis) for axis in "xyz"]
         is_position = all(
             isinstance(axis, Nothing) or (isinstance(axis, Leaf) and axis.kind is not Kind.TEXT)
-            for axis in found[:2]
+            for axis in axes[:2]
         )
         if is_position:
             numeric = {Kind.INTEGER, Kind.REAL}
-            leaves = [axis for axis in found if isinstance(axis, Leaf) and axis.kind in numeric]
-            if all(axis in leaves for axis in found[:2]):
+            leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.kind in numeric]
+            if all(axis in leaves for axis in axes[:2]):
                 yield tuple(leaves), limits

@@ -81,10 +81,10 @@ class Level:
 
     def full(self, path: str) -> str:
         """Returns the dot-path, from the message on, of a column of this level."""
-        here = self
-        while here.parent is not None:
-            path = f"{here.name}.{path}" if path else here.name
-            here = here.parent
+        level = self
+        while level.parent is not None:
+            path = f"{level.name}.{path}" if path else level.name
+            level = level.parent
         return path
 
 
@@ -162,17 +162,17 @@ class Values:
         """Returns how many rows or elements a level has; None where that is not held."""
         if level.parent is None:
             return self.rows
-        found = self.elements(level)
-        return None if found is None else len(found.owners)
+        elements = self.elements(level)
+        return None if elements is None else len(elements.owners)
 
-    def places(self, level: Level, among: Ints, *, from_end: bool) -> Ints | None:
+    def places(self, level: Level, positions: Ints, *, from_end: bool) -> Ints | None:
         """Returns the places of some elements in their lists: 0, 1, ... or -1, -2, ..."""
-        found = self.elements(level)
-        if found is None:
+        elements = self.elements(level)
+        if elements is None:
             return None
-        owners = found.owners
-        edge = np.searchsorted(owners, owners[among], side="right" if from_end else "left")
-        return among - edge
+        owners = elements.owners
+        edge = np.searchsorted(owners, owners[positions], side="right" if from_end else "left")
+        return positions - edge
 
     def column(self, level: Level, path: str) -> Column | None:
         """Returns a column of a level; None where the table does not hold it."""
@@ -181,8 +181,8 @@ class Values:
 
     def texts(self, leaf: Leaf) -> Texts | None:
         """Returns the texts of a leaf; None where the table does not hold them."""
-        found = self.column(leaf.level, leaf.sources[0])
-        return found if isinstance(found, Texts) else None
+        column = self.column(leaf.level, leaf.sources[0])
+        return column if isinstance(column, Texts) else None
 
     def letters(self, leaf: Leaf, text: str) -> Mask | None:
         """Returns which texts of a leaf may have a casefolded text; None where that is not known.
@@ -197,8 +197,8 @@ class Values:
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
         """Returns a column of numbers or booleans; None where the table does not hold it."""
-        found = self.column(level, path)
-        return None if found is None or isinstance(found, Texts) else cast("Numeric", found)
+        column = self.column(level, path)
+        return None if column is None or isinstance(column, Texts) else cast("Numeric", column)
 
     def numbers(self, leaf: Leaf) -> Numbers | None:
         """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
@@ -206,8 +206,8 @@ class Values:
             size = self.size(leaf.level)
             return None if size is None else Numbers(np.full(size, float(leaf.constant)))
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
-        found = [column for column in columns if column is not None]
-        return self._made(leaf, found) if len(found) == len(columns) else None
+        held = [column for column in columns if column is not None]
+        return self._made(leaf, held) if len(held) == len(columns) else None
 
     def _made(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
         if leaf.made in _ANGLES:
@@ -244,16 +244,16 @@ class Values:
         if error:
             return Numbers(angles[which], _angle_error(error, length, cosine, angles[which]))
 
-        def exactly(among: Ints) -> Floats:
-            known: dict[tuple[float, float, float, float], float] = {}
-            found = np.empty(len(among))
-            rows = zip(*(part[among].tolist() for part in (x, y, z, w)), strict=True)
+        def exactly(positions: Ints) -> Floats:
+            angle_of: dict[tuple[float, float, float, float], float] = {}
+            exact = np.empty(len(positions))
+            rows = zip(*(part[positions].tolist() for part in (x, y, z, w)), strict=True)
             for nth, numbers in enumerate(rows):
-                if numbers not in known:
-                    angles_of = euler_of(numbers)
-                    known[numbers] = math.nan if angles_of is None else angles_of[ANGLES[which]]
-                found[nth] = known[numbers]
-            return found
+                if numbers not in angle_of:
+                    euler = euler_of(numbers)
+                    angle_of[numbers] = math.nan if euler is None else euler[ANGLES[which]]
+                exact[nth] = angle_of[numbers]
+            return exact
 
         # Zero is zero everywhere, and a robot in the plane has nothing else.
         off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
@@ -272,13 +272,13 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
     if leaf.made in _ANGLES:
         most = 90.0 if leaf.made is Made.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
-    found = zone(leaf.level.full(leaf.sources[0]))
-    if found is not None and leaf.is_of_array and leaf.level.parent is not None:
+    source_zone = zone(leaf.level.full(leaf.sources[0]))
+    if source_zone is not None and leaf.is_of_array and leaf.level.parent is not None:
         lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
-        return None if lengths is None else _with_long_arrays(found, lengths)
-    if found is None or leaf.made is not Made.SECONDS:
-        return found
-    return found.divided(NS_PER_S)
+        return None if lengths is None else _with_long_arrays(source_zone, lengths)
+    if source_zone is None or leaf.made is not Made.SECONDS:
+        return source_zone
+    return source_zone.divided(NS_PER_S)
 
 
 def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:

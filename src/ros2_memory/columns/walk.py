@@ -173,9 +173,9 @@ class _Walk:
                 return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
         buffer, ends = self.buffer, (places + sizes).tolist()
         words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
-        known: dict[bytes, int] = {}
-        codes = [known.setdefault(word, len(known)) for word in words]
-        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
+        code_of: dict[bytes, int] = {}
+        codes = [code_of.setdefault(word, len(code_of)) for word in words]
+        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in code_of]))
 
     def _read_numbers(
         self, step: NumberSequence, rows: _Rows, at: IntArray, level: Level | None
@@ -244,9 +244,9 @@ class _Walk:
         begins = np.zeros(total, np.int64)
         for nth in range(most):
             left = np.flatnonzero(counts > nth)
-            here = _aligned(end[left], plan.align)
-            begins[first[left] + nth] = here
-            end[left] = self.read(plan, rows.of(left), here, None)
+            starts = _aligned(end[left], plan.align)
+            begins[first[left] + nth] = starts
+            end[left] = self.read(plan, rows.of(left), starts, None)
         return begins, end
 
 
@@ -326,9 +326,9 @@ def add_ranges(
     begins = (np.cumsum(counts) - counts)[filled]
     finite = np.isfinite(values)
     for end, ufunc, none in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
-        found = np.full(counts.size, np.nan)
+        extremes = np.full(counts.size, np.nan)
         if values.size:
-            some = values if finite.all() else np.where(finite, values, none)
-            found[filled] = ufunc.reduceat(some, begins)
-            found[np.isinf(found)] = np.nan
-        columns[f"{path}.{end}"] = found
+            comparable = values if finite.all() else np.where(finite, values, none)
+            extremes[filled] = ufunc.reduceat(comparable, begins)
+            extremes[np.isinf(extremes)] = np.nan
+        columns[f"{path}.{end}"] = extremes

@@ -36,14 +36,16 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
         return None
     values = Values(table)
     if node.kind is Kind.TEXT:
-        found = values.texts(node)
+        texts = values.texts(node)
     elif node.kind in {Kind.BOOLEAN, Kind.INTEGER} and (column := values.numbers(node)) is not None:
-        known, codes = np.unique(column.values, return_inverse=True)
-        whole = [json.dumps(each if name is None else {name: each}) for each in known.tolist()]
+        distinct, codes = np.unique(column.values, return_inverse=True)
+        whole = [
+            json.dumps(value if name is None else {name: value}) for value in distinct.tolist()
+        ]
         return Texts(codes.astype(np.uint32), tuple(whole))
     else:
-        found = None
-    if found is None:
+        texts = None
+    if texts is None:
         return None
-    words = tuple(json.dumps(each if name is None else {name: each}) for each in found.words)
-    return Texts(found.codes, words)
+    words = tuple(json.dumps(value if name is None else {name: value}) for value in texts.words)
+    return Texts(texts.codes, words)

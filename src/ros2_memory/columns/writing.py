@@ -173,7 +173,7 @@ def thin_parts(
         (json.dumps(parts),),
     ):
         sizes[topic][part] = size
-    left = max(sum(sum(some.values()) for some in sizes.values()) + spare, at_least)
+    left = max(sum(sum(by_part.values()) for by_part in sizes.values()) + spare, at_least)
     dropped = 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
         left -= sum(sizes[topic].values())
@@ -260,7 +260,9 @@ def insert_bags(
     for table, bag in decoded.tables:
         topic, layout_of[topic] = topic_of(connection, table, layouts)
         tables[topic].append((table, np.full(len(table), numbers[bag])))
-    packed = {topic: [packed_part(layout_of[topic], some)] for topic, some in tables.items()}
+    packed = {
+        topic: [packed_part(layout_of[topic], of_topic)] for topic, of_topic in tables.items()
+    }
     return insert_parts(connection, packed, whole=whole)
 
 
@@ -268,8 +270,8 @@ def insert_parts(
     connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
 ) -> list[int]:
     """Inserts parts, by the numbers of their topics; returns their ids."""
-    every = [(topic, part) for topic, some in parts.items() for part in some]
-    return [_insert_part(connection, topic, part, whole=whole) for topic, part in every]
+    numbered = [(topic, part) for topic, of_topic in parts.items() for part in of_topic]
+    return [_insert_part(connection, topic, part, whole=whole) for topic, part in numbered]
 
 
 def _insert_part(

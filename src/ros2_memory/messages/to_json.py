@@ -164,7 +164,7 @@ def _shape_of(cls: type) -> _Shape | None:
 
 def _shape(kind: ValueKind, table: FieldTable) -> _Shape:
     summaries = summaries_of(table)
-    rows = ((name, each, summaries.get(name)) for name, each in table.attributes.items())
+    rows = ((name, attribute, summaries.get(name)) for name, attribute in table.attributes.items())
     return _Shape(kind, tuple(rows))
 
 
@@ -218,7 +218,7 @@ class ExactJson:
 
     def _composed(self, node: object, path: str, depth: int) -> JsonValue:
         if isinstance(node, list | tuple):
-            return [self.value(one, path, depth) for one in self._elements(node, path)]
+            return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
             entries = self._entries(node, path)
             return {name: self.value(node, _join(path, name), depth) for name, node in entries}
@@ -241,10 +241,10 @@ class ExactJson:
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
         fields: dict[str, JsonValue] = {}
         for name, attribute, summarize in shape.fields:
-            found: object = getattr(node, attribute, ABSENT)
+            inner: object = getattr(node, attribute, ABSENT)
             if summarize is not None:
-                found = summarize(node, found)
-            fields[name] = self.value(found, f"{path}.{name}" if path else name, depth)
+                inner = summarize(node, inner)
+            fields[name] = self.value(inner, f"{path}.{name}" if path else name, depth)
         return fields
 
     def _rotation(self, node: object, path: str) -> JsonValue:
@@ -270,8 +270,8 @@ class ExactJson:
         if isinstance(scalar, np.floating):
             return self.write.real(float(scalar))
         plain = scalar.item()
-        known = isinstance(plain, bool | int | bytes)
-        return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
+        is_plain = isinstance(plain, bool | int | bytes)
+        return self.value(plain if is_plain else str(plain), path, MAX_DEPTH - 1)
 
     # What a reply shortens, and notes.
 
@@ -356,8 +356,8 @@ class ReplyJson(ExactJson):
 
     def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
         """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
-        known = self._notes.get((kind, path))
-        if known is None or known[0] < weight:
+        noted = self._notes.get((kind, path))
+        if noted is None or noted[0] < weight:
             self._notes[kind, path] = (weight, note)
 
 

@@ -160,26 +160,26 @@ class SqliteBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
-            found: list[tuple[int, int, int, int, int, int]]
-            found = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
+            stored: list[tuple[int, int, int, int, int, int]]
+            stored = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
             right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
-        if any(wrong for *_, wrong, _ in found):
+        if any(wrong for *_, wrong, _ in stored):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
-        rows = [row for row in found if not row[5]]
+        rows = [row for row in stored if not row[5]]
         totals = [
             ChannelTotal(topics.channels[number], count, first, last)
             for number, count, first, last, *_ in rows
             if number in topics.channels
         ]
-        orphans = sum(row[1] for row in rows) - sum(each.messages for each in totals)
+        orphans = sum(row[1] for row in rows) - sum(total.messages for total in totals)
         notes = [] if right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
-        if impossible := sum(row[1] for row in found if row[5]):
+        if impossible := sum(row[1] for row in stored if row[5]):
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
         return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
@@ -203,9 +203,9 @@ class SqliteBags:
         """
         if window.empty:
             return
-        with self._opened(path) as (base, known):
-            wanted = known.named(topics)
-            right = self._is_indexed_right(base, known)
+        with self._opened(path) as (base, declared):
+            wanted = declared.named(topics)
+            right = self._is_indexed_right(base, declared)
             if not right:
                 yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
             for time, row, number in _ordered_rows(
@@ -241,18 +241,18 @@ class SqliteBags:
         payload = uncompressed_payload(channel, found[0], self._limit)
         return Record(channel, time, time, payload)
 
-    def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
+    def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:
         """Returns whether the indexes of a file agree with its table; compares them once."""
-        right = self._proven.get(known.key)
+        right = self._proven.get(topics.key)
         if right is None:
-            every = partial(_ordered_rows, base, known.channels, TimeWindow.everything())
+            ordered = partial(_ordered_rows, base, topics.channels, TimeWindow.everything())
             try:
-                both = zip_longest(every(indexed=True), every(indexed=False))
+                both = zip_longest(ordered(indexed=True), ordered(indexed=False))
                 right = all(starmap(eq, both))
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
                 right = False
-            self._proven.put(known.key, right, _PROOF_BYTES)
+            self._proven.put(topics.key, right, _PROOF_BYTES)
         return right
 
     @contextmanager
@@ -301,9 +301,7 @@ class SqliteBags:
                     str(value.get("serialization_format") or "cdr"),
                     schema,
                     offered_as_latched(str(value.get("offered_qos_profiles") or "")),
-                    tuple(
-                        (known, str(value[name])) for name, known in _METADATA if value.get(name)
-                    ),
+                    tuple((key, str(value[name])) for name, key in _METADATA if value.get(name)),
                 )
             )
         if len(channels) > MAX_CHANNELS:

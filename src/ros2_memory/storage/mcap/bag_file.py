@@ -304,8 +304,8 @@ class McapBags:
         try:
             pairs = _pairs(file, chunk, wanted, data)
             if before is not None:
-                known = _pairs(file, before, wanted, data)
-                pairs = pairs.taken(~np.isin(pairs.offsets, known.offsets))
+                earlier = _pairs(file, before, wanted, data)
+                pairs = pairs.taken(~np.isin(pairs.offsets, earlier.offsets))
             content = ReadChunks([chunk], data, [len(data)])
             batches = batches_of(content, pairs, wanted, window, self._uncompressed)
         except (UnreadableError, ValueError, IndexError) as error:
@@ -350,7 +350,7 @@ class McapBags:
                 at = lost.last if newest_first else lost.first
                 return Rows([at], [0], lambda _place, _time: lost)
             columns = self._chunk_columns(file, chunk, wanted, data)
-            column = joined([each.between(window.start, window.stop) for each in columns])
+            column = joined([indexed.between(window.start, window.stop) for indexed in columns])
             if not column.times.size:
                 return None
             fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
@@ -404,7 +404,7 @@ class McapBags:
         except UnreadableError:
             first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
             return LostError(reason, first, last)
-        times = joined([each.between(window.start, window.stop) for each in columns]).times
+        times = joined([column.between(window.start, window.stop) for column in columns]).times
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
 
     def _chunk_columns(
@@ -435,12 +435,12 @@ class McapBags:
         else:
             try:
                 read = chunk_columns(file, chunk, missing)
-                for channel, found in read.items():
-                    require_indexed(data, channel, found)
+                for channel, fresh in read.items():
+                    require_indexed(data, channel, fresh)
             except (UnreadableError, ValueError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
-        for channel, found in read.items():
-            self._indexes.put((file.key, chunk.offset, channel), found, found.memory_bytes)
+        for channel, fresh in read.items():
+            self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
         return [*columns, *(read[channel] for channel in missing)]
 
     def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
@@ -554,7 +554,9 @@ def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Col
     """
     try:
         with as_unreadable():
-            agrees = all(declared.agrees(*each) for each in declarations_of(data, columns))
+            agrees = all(
+                declared.agrees(*declaration) for declaration in declarations_of(data, columns)
+            )
     except UnreadableError as error:
         raise _ContradictedError(reason_of(error)) from error
     if not agrees:
@@ -621,11 +623,11 @@ def _overlooked(
     believed: McapIndex, index: McapIndex, wanted: Collection[int], passed: TimeWindow
 ) -> tuple[Ns, Ns] | None:
     """Returns between which log times messages were missed, in a part read by wrong indexes."""
-    known = {chunk.offset: chunk for chunk in believed.chunks}
+    believed_at = {chunk.offset: chunk for chunk in believed.chunks}
     chunks = [
         chunk
         for chunk in _with_any(index, wanted, passed)
-        if not _describes(known.get(chunk.offset), chunk)
+        if not _describes(believed_at.get(chunk.offset), chunk)
     ]
     if not chunks:
         return None

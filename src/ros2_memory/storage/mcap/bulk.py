@@ -203,20 +203,20 @@ def batches_of(
     if (in_file[1:] == in_file[:-1]).any():
         raise UnreadableError(_TWICE)
     order = _in_window(pairs, window)
-    at, of = at[order], pairs.channels[order]
+    at, numbers = at[order], pairs.channels[order]
     steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]
     published = _published(heads["publish_time"][order], pairs.times[order])
     times, places = pairs.times[order], pairs.offsets[order] + steps
     starts = at + MESSAGE.size
     lengths = stops[order] - starts
     has_frames = bool(_are_frames(buffer, starts, lengths).any())
-    bounds = np.flatnonzero(of[1:] != of[:-1]) + 1
-    edges = [0, *bounds.tolist(), of.size] if of.size else []
-    found: list[Batch] = []
+    bounds = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    edges = [0, *bounds.tolist(), numbers.size] if numbers.size else []
+    batches: list[Batch] = []
     for first, last in pairwise(edges):
         rows = slice(first, last)
         batch = Batch(
-            channels[int(of[first])],
+            channels[int(numbers[first])],
             times[rows],
             published[rows],
             places[rows],
@@ -224,10 +224,10 @@ def batches_of(
             starts[rows],
             lengths[rows],
         )
-        found.append(batch)
+        batches.append(batch)
     if not has_frames:
-        return iter(found)
-    return chain.from_iterable(_decompressed(each, uncompressed) for each in found)
+        return iter(batches)
+    return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
 
 
 def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
@@ -264,12 +264,12 @@ def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
 
 def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
     """Returns which payloads begin as zstd does."""
-    long = sizes >= len(FRAME_MAGIC)
-    if not long.all():
-        starts = starts[long]
-    found = np.zeros(long.size, np.bool_)
-    found[long] = gathered(buffer, _UINT32, starts) == _MAGIC
-    return found
+    is_long = sizes >= len(FRAME_MAGIC)
+    if not is_long.all():
+        starts = starts[is_long]
+    are_frames = np.zeros(is_long.size, np.bool_)
+    are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
+    return are_frames
 
 
 def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:
@@ -289,9 +289,13 @@ def bare_batches(
         pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
         steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
-        of, times, places = pairs.channels[order], pairs.times[order], pairs.offsets[order] + steps
-        for number in np.unique(of).tolist():
-            rows = of == number
+        numbers, times, places = (
+            pairs.channels[order],
+            pairs.times[order],
+            pairs.offsets[order] + steps,
+        )
+        for number in np.unique(numbers).tolist():
+            rows = numbers == number
             none = np.zeros(int(rows.sum()), np.int64)
             logged = times[rows]
             yield Batch(channels[number], logged, logged, places[rows], b"", none, none)

@@ -159,12 +159,12 @@ class Pairs(NamedTuple):
         """Returns messages in file order, without (unsigned) log times that no clock shows."""
         unsigned = np.array(times, np.uint64)
         kept = unsigned < MAX_NS
-        places, channels = (np.array(each, np.int64)[kept] for each in (offsets, numbers))
+        places, channels = (np.array(column, np.int64)[kept] for column in (offsets, numbers))
         return cls(channels, unsigned[kept].astype(np.int64), places, np.zeros_like(places))
 
     def taken(self, rows: Mask) -> Pairs:
         """Returns some of the messages."""
-        return Pairs(*(each[rows] for each in self))
+        return Pairs(*(column[rows] for column in self))
 
     def columns(self, wanted: Collection[int]) -> dict[int, Column]:
         """Returns the messages of the wanted channels, which are of one chunk."""
@@ -255,7 +255,10 @@ def index_groups(
         size += chunk.index_length
         if size > LARGE_BYTES or nth == len(chunks) - 1:
             group = chunks[begin : nth + 1]
-            yield group, [file.read(each.offset + each.length, each.index_length) for each in group]
+            yield (
+                group,
+                [file.read(member.offset + member.length, member.index_length) for member in group],
+            )
             begin, size = nth + 1, 0
 
 
@@ -322,16 +325,16 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     ends = np.append(places, size)
     if bool((begins > ends).any()):
         raise UnreadableError(NOT_THERE)
-    found: list[tuple[int, bytes]] = []
+    declarations: list[tuple[int, bytes]] = []
     between = begins < ends
     for begin, end in zip(begins[between].tolist(), ends[between].tolist(), strict=True):
         walked = walk_chunk(data[begin:end])
         if walked.messages:
             raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
-        found += walked.declarations
-        if len(found) > MAX_CHUNK_DECLARATIONS:
+        declarations += walked.declarations
+        if len(declarations) > MAX_CHUNK_DECLARATIONS:
             raise UnreadableError(_MANY_DECLARED)
-    return found
+    return declarations
 
 
 @dataclass(slots=True)

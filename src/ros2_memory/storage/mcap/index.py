@@ -296,9 +296,9 @@ class Contents:
             strict=True,
         )
         for number, count, first, last in rows:
-            known = self.totals.get(number)
-            if known is not None:
-                self.back = max(self.back, known.last - first)
+            total = self.totals.get(number)
+            if total is not None:
+                self.back = max(self.back, total.last - first)
             self._add(number, Extent(count, first, last))
         return starts, ends
 
@@ -377,20 +377,20 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
     if not index.chunks:
         return index
-    found = Contents()
+    contents = Contents()
     with as_unreadable():
         for group, regions in index_groups(file, index.chunks):
-            firsts, lasts = found.add(pairs_in(group, regions))
+            firsts, lasts = contents.add(pairs_in(group, regions))
             stated_times = [(chunk.start, chunk.end) for chunk in group]
             if [*zip(firsts.tolist(), lasts.tolist(), strict=True)] != stated_times:
                 raise UnreadableError(OUTSIDE)
-    if found.totals.keys() != stated.channel_message_counts.keys():
+    if contents.totals.keys() != stated.channel_message_counts.keys():
         raise DoubtError
     return index._replace(
-        totals=found.totals,
-        notes=disagreements(stated, found.totals),
-        set_back=beyond_disorder(found.back),
-        pauses=found.pauses,
+        totals=contents.totals,
+        notes=disagreements(stated, contents.totals),
+        set_back=beyond_disorder(contents.back),
+        pauses=contents.pauses,
         seams=_seams(index.chunks),
     )
 
@@ -406,8 +406,8 @@ def _index_from_summary(file: OpenFile) -> tuple[McapIndex, Statistics]:
     filled = [chunk for chunk in chunks if chunk.channels]
     if counts and len(filled) < len(chunks):  # some have no message indexes
         raise DoubtError
-    known = frozenset(channels)
-    if not all(map(known.issuperset, {chunk.channels for chunk in filled})):
+    declared_channels = frozenset(channels)
+    if not all(map(declared_channels.issuperset, {chunk.channels for chunk in filled})):
         raise DoubtError("its chunk indexes name channels that it does not declare")
     if chunks:
         _require_chunks_as_indexed(file, start, chunks)
@@ -477,11 +477,11 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
 
 def disagreements(stated: Statistics, totals: Mapping[int, Extent]) -> tuple[str, ...]:
     """Returns a note if the messages contradict the statistics; else nothing."""
-    every = totals.values()
+    extents = totals.values()
     counts = {channel: total.count for channel, total in totals.items()}
-    count = sum([total.count for total in every])
-    first = min([total.first for total in every], default=stated.message_start_time)
-    last = max([total.last for total in every], default=stated.message_end_time)
+    count = sum([total.count for total in extents])
+    first = min([total.first for total in extents], default=stated.message_start_time)
+    last = max([total.last for total in extents], default=stated.message_end_time)
     claimed = (stated.message_count, stated.message_start_time, stated.message_end_time)
     if stated.channel_message_counts == counts and claimed == (count, first, last):
         return ()

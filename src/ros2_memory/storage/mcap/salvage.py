@@ -153,9 +153,9 @@ class ContentDigest:
         if isinstance(record, mcap_records.Message):
             return self._message(record)
         if isinstance(record, mcap_records.Schema):
-            known = record.id == 0 or record.id in self._schemas
+            is_known = record.id == 0 or record.id in self._schemas
             self._schemas.setdefault(record.id, record)
-            return not known
+            return not is_known
         if isinstance(record, mcap_records.Channel):
             return self._channel(record)
         if not isinstance(record, mcap_records.Header):
@@ -245,11 +245,11 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
 
 
 def _custom_data_in(text: str) -> dict[str, str] | None:
-    found = _CUSTOM_DATA.search(text)
-    if found is None or not _NEXT_KEY.match(text, found.end()):
+    match = _CUSTOM_DATA.search(text)
+    if match is None or not _NEXT_KEY.match(text, match.end()):
         return None
     try:
-        content: object = yaml.safe_load(found[0])
+        content: object = yaml.safe_load(match[0])
     except (yaml.YAMLError, RecursionError, ValueError):
         return None
     if not isinstance(content, dict):

@@ -96,8 +96,8 @@ class _Scan:
             elif record.opcode == Opcode.CHUNK:
                 self._add_chunk(record)
             elif record.opcode in _DECLARED:
-                known = self.repeated if self.data_ended else self.declared
-                self._declare(record.opcode, record.body(self.file), known)
+                declarations = self.repeated if self.data_ended else self.declared
+                self._declare(record.opcode, record.body(self.file), declarations)
         except UnreadableError as error:
             self.damaged.append(str(error))
         self.read_to = record.end
@@ -106,17 +106,17 @@ class _Scan:
         if record.end - record.offset > self.max_bytes:
             raise UnreadableError(too_large("a message", self.max_bytes))
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
-        for known, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
-            known.append(value)
+        for column, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
+            column.append(value)
         self.messages += 1
 
-    def _declare(self, opcode: int, body: bytes, known: Declarations) -> None:
+    def _declare(self, opcode: int, body: bytes, declarations: Declarations) -> None:
         with as_unreadable():
             if opcode == Opcode.STATISTICS:
                 self.stated = statistics(body)
                 return
-            self.redeclared = self.redeclared or not known.agrees(opcode, body)
-            known.add(opcode, body)
+            self.redeclared = self.redeclared or not declarations.agrees(opcode, body)
+            declarations.add(opcode, body)
 
     def _add_chunk(self, record: FileRecord) -> None:
         opened = self.opener.open(record)
@@ -151,7 +151,7 @@ class _Scan:
         self.messages += content.messages
         pairs = content.pairs
         if pairs.times.size:
-            [first], [last] = (each.tolist() for each in self.found.add(pairs))
+            [first], [last] = (bounds.tolist() for bounds in self.found.add(pairs))
             numbers = frozenset(pairs.channels.tolist())
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 

@@ -118,7 +118,7 @@ class McapWriter(BagWriter):
                         copy.put(record)
                     elif isinstance(record, mcap_records.Message):
                         raise UnreadableError("damaged: a message without a channel or a time")
-                was = sum(each.count for each in self._bags().summarize(source).topics)
+                was = sum(topic.count for topic in self._bags().summarize(source).topics)
                 if salvage.lost_bytes or was != digest.messages + taken.total():
                     raise UnreadableError("damaged: not all of its messages can be read")
             copy.finish()
