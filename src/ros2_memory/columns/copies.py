@@ -60,16 +60,12 @@ def copies_among(messages: Identities) -> NDArray[np.bool_]:
     """
     copies = np.zeros(messages.log_times.size, np.bool_)
     suspects = _shared_by_recordings(messages)
-    some = messages.rows(suspects)
-    order = suspects[np.lexsort((some.recordings, some.log_times))]
+    suspected = messages.rows(suspects)
+    order = suspects[np.lexsort((suspected.recordings, suspected.log_times))]
     counts: dict[tuple[int, int], dict[int, int]] = {}
     recent: deque[tuple[Ns, tuple[int, int]]] = deque()
-    some = messages.rows(order)
-    rows = zip(
-        order.tolist(),
-        *(column.tolist() for column in some),
-        strict=True,
-    )
+    columns = (column.tolist() for column in messages.rows(order))
+    rows = zip(order.tolist(), *columns, strict=True)
     for row, time, published, payload, recording in rows:
         while recent and recent[0][0] < time - COPY_HORIZON_NS:
             counts.pop(recent.popleft()[1], None)

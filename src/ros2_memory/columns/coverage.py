@@ -135,34 +135,34 @@ class Covering:
         self.store = store
         self._bag_dir = bag_dir
         self._lock = Lock()
-        self._known: dict[int, CoveredSegment] = {}
-        self._of: tuple[Timeline, Coverage] | None = None
+        self._by_id: dict[int, CoveredSegment] = {}
+        self._latest: tuple[Timeline, Coverage] | None = None
 
     def of(self, timeline: Timeline) -> Coverage:
         """Returns the coverage of a timeline, as the store is now."""
         failures, state = self.store.failures, self.store.state()
         with self._lock:
-            if self._of is not None:
-                covered_timeline, coverage = self._of
+            if self._latest is not None:
+                covered_timeline, coverage = self._latest
                 if covered_timeline is timeline and coverage.state == state:
                     return coverage
                 if coverage.state.deletion != state.deletion:
-                    self._known = {}
-            segments = self._covered(timeline, state)
+                    self._by_id = {}
+            segments = self._covered_segments(timeline, state)
             coverage = Coverage(state, segments)
             if self.store.failures != failures:
                 return coverage
             # By identity: a segment is immutable, and lives as long as its entry here.
-            self._known = {id(covered.segment): covered for covered in segments}
-            self._of = timeline, coverage
+            self._by_id = {id(covered.segment): covered for covered in segments}
+            self._latest = timeline, coverage
             return coverage
 
-    def _covered(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        has_changed = self._of is None or self._of[1].state != state
+    def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
+        has_changed = self._latest is None or self._latest[1].state != state
         remembered = {
             nth: covered
             for nth, segment in enumerate(timeline.segments)
-            if (covered := self._known.get(id(segment))) is not None
+            if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
             and not (has_changed and covered.missing)
         }
@@ -175,11 +175,11 @@ class Covering:
             bags = chain.from_iterable(timeline.segments[nth].bags for nth in to_look_up)
             stored = self.store.bags([relative(bag.file, root) for bag in bags])
         return [
-            remembered[nth] if nth in remembered else self._segment(segment, stored)
+            remembered[nth] if nth in remembered else self._covered_segment(segment, stored)
             for nth, segment in enumerate(timeline.segments)
         ]
 
-    def _segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
+    def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
         root, offset = str(self._bag_dir), self.store.offset
         numbers, hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
@@ -187,7 +187,9 @@ class Covering:
             stored_bag = stored.get(relative(bag.file, root))
             if (
                 stored_bag is not None
-                and stored_bag[1:4] == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+                and stored_bag.size == bag.size
+                and stored_bag.mtime_ns == bag.mtime_ns
+                and stored_bag.sidecar_ns == bag.sidecar_ns
                 and bag.state is BagState.CLOSED
             ):
                 numbers[nth], hashed[nth] = offset + stored_bag.row, stored_bag.hashed

@@ -149,7 +149,7 @@ class DetectionColumns:
         values = Values(table)
         try:
             parts = [part for source in sources for part in found_in(values, source, places=True)]
-            header_frames = _own_frame(definition)
+            header_frames = _header_frames(definition)
             detections = joined_detections(
                 [_with_frames(values, part, header_frames) for part in parts]
             )
@@ -306,38 +306,48 @@ def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detect
     """
     if isinstance(source, Json):
         yield from _in_json(values, source)
-        return
-    if isinstance(source, Words):
-        texts = texts_of(values, source.leaf)
-        has = np.array([bool(word) for word in texts.words], np.bool_)
-        among = np.flatnonzero(has[texts.codes]) if texts.words else np.empty(0, np.int64)
-        yield _found(values, source.leaf.level, texts, among, np.full(len(texts), math.nan))
-        return
+    elif isinstance(source, Words):
+        yield _in_labels(values, source.leaf)
+    else:
+        yield _in_objects(values, source, places=places)
+
+
+def _in_labels(values: Values, leaf: Leaf) -> Detections:
+    """Returns the labels of lists that are not empty, without a score."""
+    texts = texts_of(values, leaf)
+    is_label = np.array([bool(word) for word in texts.words], np.bool_)
+    positions = np.flatnonzero(is_label[texts.codes]) if texts.words else np.empty(0, np.int64)
+    return _detections_at(values, leaf.level, texts, positions, np.full(len(texts), math.nan))
+
+
+def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
+    """Returns the objects that have a name, with their scores; raises as `found_in`."""
     objects = source.scored
     named = objects.read(values)
     if named is None:
         raise UnknownShapeError("names or scores are not held")
     name, score, error = named
-    among, size = np.arange(len(name)), len(name)
+    positions, size = np.arange(len(name)), len(name)
     if source.is_best:
         elements, parent = values.elements(objects.level), objects.level.parent
         if elements is None or parent is None:
             raise UnknownShapeError("hypotheses are not held")
-        among, size = _best(name, score, error, elements.owners), values.size(parent) or 0
+        positions, size = _best(name, score, error, elements.owners), values.size(parent) or 0
     is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
-    among = among[is_named[name.codes[among]]] if name.words else among[:0]
-    if among.size < size and any(
-        found.rows.size
+    positions = positions[is_named[name.codes[positions]]] if name.words else positions[:0]
+    if positions.size < size and any(
+        detections.rows.size
         for inner in source.otherwise
-        for found in found_in(values, inner, places=False)
+        for detections in found_in(values, inner, places=False)
     ):
         raise UnknownShapeError("some objects are detections, and some have such in them")
-    found = _found(values, objects.level, name, among, score)
-    if places:
-        where = _places(values, source, objects.level, among)
-        frames = _frames(values, objects.level, among, source.frames)
-        found = found._replace(places=where, frames=frames)
-    yield found
+    detections = _detections_at(values, objects.level, name, positions, score)
+    if not places:
+        return detections
+    return detections._replace(
+        places=_places(values, source, objects.level, positions),
+        frames=_frames(values, objects.level, positions, source.frames),
+    )
 
 
 def texts_of(values: Values, leaf: Leaf) -> Texts:
@@ -352,7 +362,7 @@ def texts_of(values: Values, leaf: Leaf) -> Texts:
     return texts
 
 
-def _found(
+def _detections_at(
     values: Values, level: Level, name: Texts, positions: Ints, scores: Floats
 ) -> Detections:
     """Returns detections at some places of a level, by their rows, without a place."""
@@ -484,7 +494,7 @@ def _kind_at(definition: Definition, *path: str) -> str | Definition:
     return fields[-1].kind if is_there else ""
 
 
-def _own_frame(definition: Definition) -> tuple[Leaf, ...]:
+def _header_frames(definition: Definition) -> tuple[Leaf, ...]:
     """Returns the frame in a message's own header, if it has one."""
     if _kind_at(definition, "header", "frame_id") not in {"string", "wstring"}:
         return ()

@@ -239,8 +239,10 @@ class Filling:
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.give_back()
 
-    def _is_renewed(self, bag: BagFile) -> bool:
+    def _renew(self, bag: BagFile) -> bool:
         """Keeps what is stored of a bag if a new `handover.json` beside it changes nothing in it.
+
+        Returns whether it is kept.
 
         Each rotation writes that of a recording with many bags again, and it concerns one or two of
         these. All messages of the bag count now; if it was stored with as many, all did then.
@@ -256,7 +258,7 @@ class Filling:
         if not self._is_settled(bag):
             return False
         try:
-            if self._is_renewed(bag):
+            if self._renew(bag):
                 return True
             to_store = ReadBag(self._key(bag), bag, hashed, partial(self._is_settled, bag))
             # A latched message may come again later, in another recording.

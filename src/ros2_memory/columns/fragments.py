@@ -67,33 +67,37 @@ class Kind(NamedTuple, Generic[T]):
 
     name: str
     classes: tuple[type, ...]
-    join: Callable[[Sequence[T]], Sequence[T]] = lambda found: found
+    join: Callable[[Sequence[T]], Sequence[T]] = lambda fragments: fragments
 
 
-def to_bytes(made: object, classes: Sequence[type]) -> bytes:
+def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """Returns a fragment as it is stored: a line of JSON, and the bytes of arrays one by one.
 
     Each list in it begins with what it is: the number of a class, or a number below 0.
     """
-    numbers = {one: nth for nth, one in enumerate(classes)}
+    numbers = {cls: number for number, cls in enumerate(classes)}
     data: list[bytes] = []
 
-    def plain(one: object) -> object:
-        if isinstance(one, bytes):
-            data.append(one)
-            return [_BYTES, len(one)]
-        if isinstance(one, np.ndarray):
-            codec, least, packed = _packed(one)
+    def plain(value: object) -> object:
+        if isinstance(value, bytes):
+            data.append(value)
+            return [_BYTES, len(value)]
+        if isinstance(value, np.ndarray):
+            codec, least, packed = _packed(value)
             data.append(packed)
-            return [_ARRAY, len(packed), codec, least, one.dtype.str, *one.shape]
-        if type(one) in numbers:
-            values = [getattr(one, each.name) for each in fields(one)] if is_dataclass(one) else one
-            return [numbers[type(one)], *map(plain, cast("Iterable[object]", values))]
-        if isinstance(one, tuple | list):
-            return [_TUPLE, *map(plain, one)]
-        return {key: plain(each) for key, each in one.items()} if isinstance(one, dict) else one
+            return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
+        if type(value) in numbers:
+            parts: object = value
+            if is_dataclass(value):
+                parts = [getattr(value, field.name) for field in fields(value)]
+            return [numbers[type(value)], *map(plain, cast("Iterable[object]", parts))]
+        if isinstance(value, tuple | list):
+            return [_TUPLE, *map(plain, value)]
+        if isinstance(value, dict):
+            return {key: plain(entry) for key, entry in value.items()}
+        return value
 
-    head = json.dumps(plain(made))
+    head = json.dumps(plain(fragment))
     return compressed(b"".join((head.encode(), b"\n", *data)))
 
 
@@ -103,28 +107,29 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
     Raises:
         ValueError, TypeError, LookupError, struct.error: the bytes are none.
     """
-    head, values = decompressed(data).split(b"\n", 1)
+    head, tail = decompressed(data).split(b"\n", 1)
     words: dict[str, str] = {}
-    at = 0
+    begin = 0
 
-    def made(one: object) -> object:
-        nonlocal at
-        if isinstance(one, str):
-            return words.setdefault(one, one)  # equal ones are one object: there are thousands
-        if isinstance(one, dict):
-            return {key: made(each) for key, each in one.items()}
-        if not isinstance(one, list):
-            return one
-        what, *rest = one
-        if what >= 0:
-            return classes[what](*map(made, rest))
-        if what == _TUPLE:
-            return tuple(map(made, rest))
-        own = values[at : at + rest[0]]
-        at += rest[0]
-        return own if what == _BYTES else _unpacked(own, *rest[1:])
+    def restored(value: object) -> object:
+        nonlocal begin
+        if isinstance(value, str):
+            return words.setdefault(value, value)  # equal ones are one object: there are thousands
+        if isinstance(value, dict):
+            return {key: restored(entry) for key, entry in value.items()}
+        if not isinstance(value, list):
+            return value
+        number, *rest = value
+        if number >= 0:
+            return classes[number](*map(restored, rest))
+        if number == _TUPLE:
+            return tuple(map(restored, rest))
+        size, *array = rest
+        packed = tail[begin : begin + size]
+        begin += size
+        return packed if number == _BYTES else _unpacked(packed, *array)
 
-    return made(json.loads(head))
+    return restored(json.loads(head))
 
 
 def _packed(array: Array) -> tuple[str, float | None, bytes]:
@@ -163,12 +168,12 @@ class FragmentKey(NamedTuple):
 class Joined(NamedTuple, Generic[T]):
     """The fragments of a stretch of the clock, joined."""
 
-    found: Sequence[T]
+    fragments: Sequence[T]
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory they take."""
-        return 100 + sum(fragment.memory_bytes for fragment in self.found)
+        return 100 + sum(fragment.memory_bytes for fragment in self.fragments)
 
 
 def joining(kind: Kind[T]) -> Kind[Joined[T]]:
@@ -225,8 +230,9 @@ class Fragments(Generic[T]):
             waiting = [*self._waiting]
             self._waiting.clear()
         if self._store is not None and waiting:
-            made = [(key, to_bytes(made, self._kind.classes)) for key, made in waiting]
-            self._store.put_fragments(self._name, made)
+            classes = self._kind.classes
+            packed = [(key, to_bytes(fragment, classes)) for key, fragment in waiting]
+            self._store.put_fragments(self._name, packed)
 
     def _remember(self, key: FragmentKey, fragment: T) -> None:
         self._remembered.put((self._kind.name, key), fragment, fragment.memory_bytes + _KEY_BYTES)

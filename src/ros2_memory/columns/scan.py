@@ -179,14 +179,10 @@ class Scan:
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window, may_match = self._asked.window, self._asked.may_match
+        window = self._asked.window
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
         sources = [s for s in sources if window.overlaps(s.first, s.last)]
-        ruled_out: set[int] = set()
-        if may_match is not None:
-            heads = [source.part for source in sources if source.part is not None]
-            wanted = self._scanner.matching(heads, may_match)
-            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+        ruled_out = self._ruled_out(sources)
         if not self._asked.may_not_match:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
         if (within := self._asked.within) is not None:
@@ -198,28 +194,28 @@ class Scan:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                parts = sources[nth:ahead]
-                self._together = [each.part for each in parts if each.part is not None]
+                self._together = [s.part for s in sources[nth:ahead] if s.part is not None]
             self._asked.check(source.last if newest_first else source.first)
-            may = source.part is None or source.part.number not in ruled_out
+            may_match = source.part is None or source.part.number not in ruled_out
             waiting += [
-                Rows(unit, partial(self._counting, unit), may_match=may)
+                Rows(unit, partial(self._counting, unit), may_match=may_match)
                 for unit in self._units(source)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
             waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
             after = sources[nth + 1] if nth + 1 < len(sources) else None
-            while waiting and (
-                after is None
-                or (
-                    waiting[0].last >= after.last
-                    if newest_first
-                    else waiting[0].first <= after.first
-                )
-            ):
+            while waiting and _is_next(waiting[0], after, newest_first=newest_first):
                 rows = waiting.pop(0)
                 if self._asked.may_be_empty or len(rows):
                     yield rows
+
+    def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
+        """Returns the numbers of the parts that have no wanted row, by their zones."""
+        if self._asked.may_match is None:
+            return set()
+        heads = [source.part for source in sources if source.part is not None]
+        wanted = self._scanner.matching(heads, self._asked.may_match)
+        return {head.number for head, may in zip(heads, wanted, strict=True) if not may}
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
         """Returns the stretches of the clock that the window consists of, the newest first.
@@ -345,7 +341,7 @@ class Scan:
                 break
             failures = store.failures
             self._coverage = self._scanner.coverage(self._asked.timeline)
-            sources = [*self._found(reach)]
+            sources = [*self._sources_of(reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
             if self._coverage is None:
@@ -358,9 +354,9 @@ class Scan:
             ):
                 return sources
         self._coverage = None
-        return [*self._found(reach)]
+        return [*self._sources_of(reach)]
 
-    def _found(self, reach: TimeWindow) -> Iterator[_Source]:
+    def _sources_of(self, reach: TimeWindow) -> Iterator[_Source]:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
@@ -375,17 +371,17 @@ class Scan:
                 if reach.overlaps(first, last):
                     yield _Source(first, last, None, bag)
 
-    def _ordered(self, found: Iterable[_Source]) -> list[_Source]:
+    def _ordered(self, sources: Iterable[_Source]) -> list[_Source]:
         """Returns sources in order of time; of those of the same times as their bags are."""
-        sources = sorted(found, key=lambda source: (source.first, source.last))
-        if len({(source.first, source.last) for source in sources}) == len(sources):
-            return sources
+        by_time = sorted(sources, key=lambda source: (source.first, source.last))
+        if len({(source.first, source.last) for source in by_time}) == len(by_time):
+            return by_time
 
         def order(source: _Source) -> tuple[Ns, Ns, tuple[Ns, Ns, str] | tuple[()]]:
             bag = source.bag if source.part is None else self._first_bag(source.part)
             return source.first, source.last, () if bag is None else in_time(bag)
 
-        return sorted(sources, key=order)
+        return sorted(by_time, key=order)
 
     def _first_bag(self, part: PartHead) -> BagFile | None:
         """Returns the first bag of a part of which rows count, if any."""
@@ -400,19 +396,21 @@ class Scan:
             unit = self._scanner.part(source.part, self._coverage, self._together)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
-        known = self._decoded.get(source.bag.file)
-        if known is None:
+        return self._units_of_bag(source.bag)
+
+    def _units_of_bag(self, bag: BagFile) -> list[Unit]:
+        """Returns the tables of a bag, which is decoded unless it was one of the last."""
+        units = self._decoded.get(bag.file)
+        if units is None:
             hashed = bool(self._shared) or self._asked.relatches
-            tables = _bounded(self._asked.decode(source.bag, self._asked.topic, hashed))
-            known = [
-                BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
-            ]
-            self._decoded[source.bag.file] = known
+            tables = _bounded(self._asked.decode(bag, self._asked.topic, hashed))
+            units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
+            self._decoded[bag.file] = units
             while len(self._decoded) > _MOST_DECODED or (
                 len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
             ):
                 self._decoded.popitem(last=False)
-        return known
+        return units
 
     def _decoded_bytes(self) -> int:
         return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
@@ -585,6 +583,13 @@ class Scan:
                     published[rows] = table.publish_times[same]
                     hashes[rows] = table.payload_hashes[same]
         return published[positions], hashes[positions]
+
+
+def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
+    """Returns whether no row of the sources from `after` on comes before a table."""
+    if after is None:
+        return True
+    return rows.last >= after.last if newest_first else rows.first <= after.first
 
 
 def _bounded(tables: Iterable[Table]) -> list[Table]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeGuard
 
 import numpy as np
 
@@ -41,6 +41,14 @@ if TYPE_CHECKING:
 Object: TypeAlias = Message | Group
 
 
+class NamedScores(NamedTuple):
+    """The name (blank: none) and the score (NaN: none) of each object, and the error of scores."""
+
+    name: Texts
+    score: Floats
+    error: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scored:
     """An object that may be a detection: what names it, in order, and what its score is.
@@ -55,26 +63,22 @@ class Scored:
     labels: tuple[Leaf, ...]
     scores: tuple[Leaf, ...]
 
-    def read(self, values: Values) -> tuple[Texts, Floats, float] | None:
-        """Returns the name (blank: none) and score (NaN: none) of each, and the error of scores.
-
-        None where these are not held.
-        """
-        names = [values.texts(leaf) for leaf in self.labels]
-        name = names[0]
-        for other in names[1:]:
-            name = None if name is None or other is None else or_else(name, other, blank=True)
+    def read(self, values: Values) -> NamedScores | None:
+        """Returns the names and scores of all; None where the table does not hold them."""
+        name, *fallbacks = (values.texts(leaf) for leaf in self.labels)
+        for fallback in fallbacks:
+            name = None if name is None or fallback is None else or_else(name, fallback, blank=True)
         if name is None:
             return None
         score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
-            found = values.numbers(leaf)
-            if found is None or not isinstance(found.error, float):
+            numbers = values.numbers(leaf)
+            if numbers is None or not isinstance(numbers.error, float):
                 return None
-            number = found.values.astype(np.float64, copy=False)
-            score = np.where(np.isnan(score), number, score)
-            error = max(error, found.error)
-        return name, score, error
+            column = numbers.values.astype(np.float64, copy=False)
+            score = np.where(np.isnan(score), column, score)
+            error = max(error, numbers.error)
+        return NamedScores(name, score, error)
 
 
 def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
@@ -96,26 +100,26 @@ class _Detections(ABC):
     texts: tuple[Leaf, ...]
     has_inner: bool
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> Kept:
         """Returns where the detection stays."""
         if self not in values.kept:
-            values.kept[self] = self._kept(values)
+            values.kept[self] = self._all_kept(values)
         surely, perhaps = values.kept[self]
-        return Kept(surely[among], perhaps[among])
+        return Kept(surely[positions], perhaps[positions])
 
     @abstractmethod
-    def _kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> Kept:
         """Returns where the detections of a table stay."""
 
 
 class _Scores(_Detections):
     """Which detections score enough."""
 
-    def _kept(self, values: Values) -> Kept:
-        found = self.scored.read(values)
-        if found is None:
+    def _all_kept(self, values: Values) -> Kept:
+        named = self.scored.read(values)
+        if named is None:
             return unknown(values.size(self.level) or 0)
-        name, score, error = found
+        name, score, error = named
         labelled = _has_label(name)
         surely = ~(labelled & (score < self.least + error))
         perhaps = ~(labelled & (score < self.least - error))
@@ -127,22 +131,21 @@ class _Scores(_Detections):
 class _BestScores(_Detections):
     """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
 
-    def _kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> Kept:
         size = values.size(self.level) or 0
-        found, results = self.scored.read(values), values.elements(self.scored.level)
-        if found is None or results is None or found[2]:
+        named, results = self.scored.read(values), values.elements(self.scored.level)
+        if named is None or results is None or named.error:
             return unknown(size)  # also with rounded scores, of which another may be the best
-        name, score, _ = found
-        labelled = _has_label(name)
-        order, begins = ranked(score, results.owners)
+        labelled = _has_label(named.name)
+        order, begins = ranked(named.score, results.owners)
         best = order[begins]
-        of = results.owners[best]
+        detections = results.owners[best]
         surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
         if self.has_inner or may_be_json(values, self.texts):
             surely[:] = False
-        is_low = score[best] < self.least
-        surely[of] = labelled[best] & ~is_low
-        perhaps[of] = ~(labelled[best] & is_low)
+        is_low = named.score[best] < self.least
+        surely[detections] = labelled[best] & ~is_low
+        perhaps[detections] = ~(labelled[best] & is_low)
         return Kept(surely, perhaps)
 
 
@@ -157,15 +160,15 @@ class _Hypotheses:
         """The level of the hypotheses."""
         return self.best.scored.level
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> Kept:
         """Returns where the hypothesis stays."""
-        found, results = self.best.scored.read(values), values.elements(self.level)
-        if found is None or found[2] or results is None:
-            return unknown(len(among))
+        named, results = self.best.scored.read(values), values.elements(self.level)
+        if named is None or named.error or results is None:
+            return unknown(len(positions))
         # Where it is not sure that the detection is one, neither is what stays of it.
-        is_one = self.best.kept(values, results.owners[among]).surely
-        is_low = found[1][among] < self.best.least
-        return Kept(~is_low & is_one, ~is_low | ~is_one)
+        is_detection = self.best.kept(values, results.owners[positions]).surely
+        is_low = named.score[positions] < self.best.least
+        return Kept(~is_low & is_detection, ~is_low | ~is_detection)
 
 
 def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
@@ -197,14 +200,14 @@ def is_object(node: Node) -> TypeGuard[Object]:
 
 def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
-    found = scored(fields)
-    if found is not None:
-        return Narrowed(_Scores(found.level, found, least, *_inside(fields, depth)), node)
-    results, named = fields.get("results"), hypotheses(fields)
-    if isinstance(results, Listing) and named is not None:
+    single = scored(fields)
+    if single is not None:
+        return Narrowed(_Scores(single.level, single, least, *_inside(fields, depth)), node)
+    results, several = fields.get("results"), hypotheses(fields)
+    if isinstance(results, Listing) and several is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
         texts, has_inner = _inside(others, depth)
-        best = _BestScores(named.level.parent or named.level, named, least, texts, has_inner)
+        best = _BestScores(several.level.parent or several.level, several, least, texts, has_inner)
         kept = Narrowed(_Hypotheses(best), results.element)
         return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
     return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})

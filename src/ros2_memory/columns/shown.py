@@ -301,7 +301,7 @@ class Shape:
         if node is not None:
             return node
         plain = self._at(segments)
-        return None if plain is None else _changed(plain, _as_numbers)
+        return None if plain is None else _with_changed_leaves(plain, _quaternion_as_xyzw)
 
     def shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
@@ -324,7 +324,7 @@ class Shape:
         if kind is ValueKind.VECTOR and are_numbers:
             return _vector(level, sources)
         if kind is ValueKind.QUATERNION:
-            return _turned(level, sources, message) if are_numbers else NOTHING
+            return _angles_of(level, sources, message) if are_numbers else NOTHING
         return message
 
     def plain(self, place: Place) -> Node:
@@ -374,7 +374,7 @@ class Shape:
         if node is not None:
             return node
         plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
-        return None if plain is None else _changed(plain, self._as_shown)
+        return None if plain is None else _with_changed_leaves(plain, self._as_shown)
 
     def _as_shown(self, node: Node) -> Node:
         """Returns the end of a walk through definitions as the value shows it."""
@@ -429,7 +429,7 @@ class Shape:
         if len(leaves) != 4:
             return node
         # PX4 writes w first.
-        return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
+        return _angles_of(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
 
 
 def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
@@ -569,23 +569,22 @@ def _picked(node: Listing | Items, index: int) -> Node:
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
 
 
-def _changed(node: Node, change: Callable[[Node], Node]) -> Node:
+def _with_changed_leaves(node: Node, change: Callable[[Node], Node]) -> Node:
     """Returns a node with what it stands for changed: of a list its elements."""
     if isinstance(node, Listing):
-        return Listing(node.level, _changed(node.element, change))
+        return Listing(node.level, _with_changed_leaves(node.element, change))
     if isinstance(node, Narrowed):
-        return Narrowed(node.limit, _changed(node.node, change))
+        return Narrowed(node.limit, _with_changed_leaves(node.node, change))
     return change(node)
 
 
-def _as_numbers(node: Node) -> Node:
-    """Returns what was found by its full path: a quaternion then stays x, y, z, w."""
+def _quaternion_as_xyzw(node: Node) -> Node:
+    """Returns a rotation as the x, y, z, w of its message, and not as angles; others unchanged."""
     if not isinstance(node, Group) or node.turned is None:
         return node
     message = node.turned
-    return Group(
-        {name: _real(message.level, f"{message.path}.{name}".lstrip(".")) for name in "xyzw"}
-    )
+    path = f"{message.path}." if message.path else ""
+    return Group({name: _real(message.level, f"{path}{name}") for name in "xyzw"})
 
 
 def _real(level: Level, source: str) -> Leaf:
@@ -596,7 +595,7 @@ def _vector(level: Level, sources: Sequence[str]) -> Group:
     return Group({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
 
 
-def _turned(level: Level, sources: Sequence[str], message: Message | None) -> Group:
+def _angles_of(level: Level, sources: Sequence[str], message: Message | None) -> Group:
     angles = (Made.ROLL, Made.PITCH, Made.YAW)
     return Group(
         {

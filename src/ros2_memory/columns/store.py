@@ -311,7 +311,7 @@ class ColumnStore(Database):
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(row[4]) for row in rows]
+            bags = [json.loads(numbers) for _, _, _, _, numbers, *_ in rows]
             all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
             bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [

@@ -144,7 +144,7 @@ def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
     for test in tests:
         if not test.may_match(values.zone):
             continue
-        for level, passing, limits in test.found(values):
+        for level, passing, limits in test.passing(values):
             if passing is None:
                 return Kept(surely, np.ones(values.rows, np.bool_))
             certain = np.flatnonzero(passing.surely)
@@ -240,15 +240,15 @@ class _LeafTest:
             may = may | zone.spans(number)
         return may
 
-    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
         leaf = self.leaf
         if leaf.kind is Kind.TEXT:
-            yield leaf.level, self._among_texts(values), self.limits
+            yield leaf.level, self._passing_texts(values), self.limits
             return
         numbers = values.numbers(leaf)
         if numbers is not None:
-            yield leaf.level, self._among_numbers(numbers), self.limits
+            yield leaf.level, self._passing_numbers(numbers), self.limits
         if leaf.is_of_array and leaf.level.parent is not None:
             yield from self._in_long_arrays(values, leaf.level.parent, is_part=numbers is not None)
         elif numbers is None:
@@ -258,7 +258,7 @@ class _LeafTest:
     def _folded(self) -> str | None:
         return None if isinstance(self.test, Beyond) else self.test.folded
 
-    def _among_texts(self, values: Values) -> Kept | None:
+    def _passing_texts(self, values: Values) -> Kept | None:
         """Returns which texts pass; None where the table cannot say."""
         may = values.letters(self.leaf, self._folded or "")
         is_word = isinstance(self.test, Contains) and self.test.is_one_word
@@ -278,7 +278,7 @@ class _LeafTest:
         passed = np.array(flags, np.bool_)[texts.codes] if flags else np.zeros(0, np.bool_)
         return Kept(passed, passed)
 
-    def _among_numbers(self, numbers: Numbers) -> Kept:
+    def _passing_numbers(self, numbers: Numbers) -> Kept:
         column, error, exactly = numbers
         if column.dtype.kind == "b":
             if_false, if_true = self.passes(value=False), self.passes(value=True)
@@ -424,7 +424,7 @@ class _PlaceTest:
             may = may if zone is None else may & zone.may_be_near(center, reach)
         return may
 
-    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
         """Yields which rows or elements of a level are near; None where the table cannot say."""
         leaves = self.leaves[: len(self._center)]
         columns = [values.numbers(leaf) for leaf in leaves]

@@ -207,11 +207,11 @@ class Values:
             return None if size is None else Numbers(np.full(size, float(leaf.constant)))
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
         held = [column for column in columns if column is not None]
-        return self._made(leaf, held) if len(held) == len(columns) else None
+        return self._numbers_of(leaf, held) if len(held) == len(columns) else None
 
-    def _made(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
+    def _numbers_of(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
         if leaf.made in _ANGLES:
-            return self._turned(leaf, columns)
+            return self._angle(leaf, columns)
         first, error = columns[0], self.error(leaf)
         if leaf.made is Made.SECONDS:
             return Numbers(seconds(first), error / NS_PER_S)
@@ -232,7 +232,7 @@ class Values:
         """Returns what is known of a leaf without reading it."""
         return zone_of(leaf, self.table.zone)
 
-    def _turned(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
+    def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
         """Returns one of the angles (degrees) of quaternions."""
         key = (leaf.level, leaf.sources)
         x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)

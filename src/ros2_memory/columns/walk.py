@@ -74,7 +74,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
         if (gathered(batch.buffer, _UINT16, batch.starts) != _LITTLE_ENDIAN).any():
             raise NotWalkedError
         level = Level(left_out=dict(plan.left_out))
-        rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
+        rows = _Bodies(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
     except (IndexError, UnicodeDecodeError) as error:
         raise NotWalkedError from error
@@ -85,8 +85,8 @@ def walked(plan: Plan, batch: Batch) -> Level:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """What is walked: where each message's body begins in the buffer, and its bytes.
+class _Bodies:
+    """The bodies that are walked: where each message's begins in the buffer, and its bytes.
 
     Positions count from there, since alignment does.
     """
@@ -94,8 +94,8 @@ class _Rows:
     origins: IntArray
     sizes: IntArray
 
-    def of(self, rows: IntArray) -> _Rows:
-        return _Rows(self.origins[rows], self.sizes[rows])
+    def of(self, rows: IntArray) -> _Bodies:
+        return _Bodies(self.origins[rows], self.sizes[rows])
 
 
 def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
@@ -108,7 +108,7 @@ def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
 class _Walk:
     buffer: bytes
 
-    def read(self, plan: Plan, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+    def read(self, plan: Plan, rows: _Bodies, at: IntArray, level: Level | None) -> IntArray:
         """Goes through messages that begin at these positions; returns where they end.
 
         Args:
@@ -145,10 +145,10 @@ class _Walk:
                 number = block[str(nth)]
                 columns[entry.path] = number != 0 if entry.is_bool else np.ascontiguousarray(number)
 
-    def _length(self, rows: _Rows, at: IntArray) -> IntArray:
+    def _length(self, rows: _Bodies, at: IntArray) -> IntArray:
         return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64)
 
-    def _read_text(self, text: Text, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+    def _read_text(self, text: Text, rows: _Bodies, at: IntArray, level: Level | None) -> IntArray:
         at = _aligned(at, text.align, text.skip)
         sizes = self._length(rows, at)
         at = at + 4
@@ -178,7 +178,7 @@ class _Walk:
         return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in code_of]))
 
     def _read_numbers(
-        self, step: NumberSequence, rows: _Rows, at: IntArray, level: Level | None
+        self, step: NumberSequence, rows: _Bodies, at: IntArray, level: Level | None
     ) -> IntArray:
         at = _aligned(at, step.align, step.skip)
         counts = self._length(rows, at)
@@ -209,7 +209,7 @@ class _Walk:
         )
 
     def _read_sequence(
-        self, step: Sequence, rows: _Rows, at: IntArray, level: Level | None
+        self, step: Sequence, rows: _Bodies, at: IntArray, level: Level | None
     ) -> IntArray:
         if step.length == SEQUENCE:
             at = _aligned(at, step.align, step.skip)
@@ -234,7 +234,7 @@ class _Walk:
         return end
 
     def _stepped(
-        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
+        self, plan: Plan, rows: _Bodies, at: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
         """Returns where elements of various sizes begin, and where their sequences end."""
         most, total = int(counts.max(initial=0)), int(counts.sum())

@@ -195,17 +195,17 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool
     paths = [path for (path,) in rows if path not in ALWAYS]
     if not paths:
         return False
-    among = (topic, part, json.dumps(paths))
+    listed = json.dumps(paths)
     connection.execute(
         f"UPDATE zone SET codec = '{DROPPED}' WHERE topic = ? AND part = ?"
         " AND path IN (SELECT value FROM json_each(?))",
-        among,
+        (topic, part, listed),
     )
     connection.execute(
         "DELETE FROM part_column WHERE part = ? AND path IN (SELECT value FROM json_each(?))",
-        among[1:],
+        (part, listed),
     )
-    connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (json.dumps(paths), part))
+    connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (listed, part))
     # Who knows the part looks again.
     connection.execute("INSERT INTO deletion DEFAULT VALUES")
     return True
@@ -336,13 +336,14 @@ class Layouts:
     def of(self, table: Table) -> tuple[Layout, str]:
         """Returns the layout of a table, and its JSON."""
         key = (table.channel.schema, tuple(sorted(table.left_out.items())))
-        known = self._known.get(key)
-        if known is None or not known[0].fits(table):
+        layout, text = self._known.get(key, (None, ""))
+        if layout is None or not layout.fits(table):
             layout = Layout.of(table, table.definition)
-            known = self._known[key] = (layout, layout.to_json())
+            text = layout.to_json()
+            self._known[key] = (layout, text)
             if len(self._known) > _MOST_LAYOUTS:
                 del self._known[next(iter(self._known))]
-        return known
+        return layout, text
 
 
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:

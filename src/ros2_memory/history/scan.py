@@ -142,7 +142,7 @@ def joined_back(
             joined = Joined(kind.join([one for _, one in made[::-1]]) if made else [])
             if before == (trouble(), view.notes.added):
                 known.put(key, joined)
-        for one in reversed(joined.found):
+        for one in reversed(joined.fragments):
             yield stretch.window.start, one
 
 

@@ -271,14 +271,20 @@ def number(node: object) -> float | None:
 
 def triple(node: object) -> Vector3 | None:
     """Returns three numbers in an array or tuple; None for anything else."""
-    found = _numbers(node, 3)
-    return (found[0], found[1], found[2]) if found else None
+    numbers = _numbers(node, 3)
+    if not numbers:
+        return None
+    x, y, z = numbers
+    return x, y, z
 
 
 def quadruple(node: object) -> Quaternion | None:
     """Returns four numbers in an array or tuple; None for anything else."""
-    found = _numbers(node, 4)
-    return (found[0], found[1], found[2], found[3]) if found else None
+    numbers = _numbers(node, 4)
+    if not numbers:
+        return None
+    first, second, third, fourth = numbers
+    return first, second, third, fourth
 
 
 def _numbers(node: object, count: int) -> list[float]:

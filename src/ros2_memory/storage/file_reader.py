@@ -215,13 +215,13 @@ class FileReader(BagReader):
     ) -> Iterator[Record]:
         """Yields the undecoded messages of `topics` inside the window, by log time."""
 
-        def found() -> Iterator[Record | LostError]:
+        def read() -> Iterator[Record | LostError]:
             with reading(path), self._open(path) as opened:
                 records = opened.bags.records
                 yield from records(opened.path, topics, window, newest_first=newest_first)
 
         # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-        return map(partial(raise_if_lost, path), found())
+        return map(partial(raise_if_lost, path), read())
 
     def batches(
         self,
@@ -233,11 +233,11 @@ class FileReader(BagReader):
     ) -> Iterator[Batch]:
         """Yields the messages of `topics` inside the window, many at once."""
 
-        def found() -> Iterator[Batch | LostError]:
+        def read() -> Iterator[Batch | LostError]:
             with reading(path), self._open(path) as opened:
                 yield from opened.bags.batches(opened.path, topics, window, bare)
 
-        return map(partial(raise_if_lost, path), found())
+        return map(partial(raise_if_lost, path), read())
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file."""
@@ -288,14 +288,14 @@ class FileReader(BagReader):
         return None if isinstance(message_type, str) else message_type.fields
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
-        known = self._known.get(id(channel))
-        if known is not None:
-            return known[1]
+        _, cached = self._known.get(id(channel), (channel, None))
+        if cached is not None:
+            return cached
         decoder: Callable[[bytes], object] | str = _json
         if channel.encoding == "cdr":
-            found = self._type_of(channel)
-            found = found if isinstance(found, str) else found.compiled()
-            decoder = found if isinstance(found, str) else partial(_deserialized, found)
+            usable = self._type_of(channel)
+            usable = usable if isinstance(usable, str) else usable.compiled()
+            decoder = usable if isinstance(usable, str) else partial(_deserialized, usable)
         elif channel.encoding != "json":
             decoder = f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         if len(self._known) >= _MAX_KNOWN:

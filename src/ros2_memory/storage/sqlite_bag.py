@@ -165,21 +165,22 @@ class SqliteBags:
             right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
-        if any(wrong for *_, wrong, _ in stored):
+        if any(undecodable for *_, undecodable, _ in stored):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
-        rows = [row for row in stored if not row[5]]
         totals = [
             ChannelTotal(topics.channels[number], count, first, last)
-            for number, count, first, last, *_ in rows
-            if number in topics.channels
+            for number, count, first, last, _, is_impossible in stored
+            if number in topics.channels and not is_impossible
         ]
-        orphans = sum(row[1] for row in rows) - sum(total.messages for total in totals)
+        impossible = sum(count for _, count, _, _, _, is_impossible in stored if is_impossible)
+        counts = sum(count for _, count, *_ in stored)
+        orphans = counts - impossible - sum(total.messages for total in totals)
         notes = [] if right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
-        if impossible := sum(row[1] for row in stored if row[5]):
+        if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
         return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
@@ -230,15 +231,15 @@ class SqliteBags:
         row: int,
         number: int,
     ) -> Record:
-        found = base.execute(_PAYLOAD, (row,)).fetchone()
-        if found is None or not isinstance(found[0], bytes):
+        stored, *indexed = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
+        if not isinstance(stored, bytes):
             raise UnreadableError("damaged: a message without a binary payload")
-        if found[1:] != (time, number):
+        if indexed != [time, number]:
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
-        if len(found[0]) > LARGE_BYTES:
+        if len(stored) > LARGE_BYTES:
             self._large.acquire()
-        payload = uncompressed_payload(channel, found[0], self._limit)
+        payload = uncompressed_payload(channel, stored, self._limit)
         return Record(channel, time, time, payload)
 
     def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:

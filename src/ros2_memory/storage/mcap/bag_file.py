@@ -72,7 +72,7 @@ from ros2_memory.storage.mcap.index import (
     chunk_data,
     index_from_summary,
 )
-from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
+from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
@@ -337,7 +337,7 @@ class McapBags:
         def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
             return _fetch_from_chunk(last_used(chunk), wanted, self._uncompressed)(place, time)
 
-        def rows_of(chunk: Chunk) -> Rows[Record | LostError] | None:
+        def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
             # Of a chunk that cannot be read, only what is wanted by its index is lost.
             try:
@@ -348,7 +348,7 @@ class McapBags:
                 if lost is None:
                     return None
                 at = lost.last if newest_first else lost.first
-                return Rows([at], [0], lambda _place, _time: lost)
+                return RunRows([at], [0], lambda _place, _time: lost)
             columns = self._chunk_columns(file, chunk, wanted, data)
             column = joined([indexed.between(window.start, window.stop) for indexed in columns])
             if not column.times.size:
@@ -484,9 +484,10 @@ class McapBags:
 
         A bag is chosen for a question by these times: a wrong one would hide its messages.
         """
-        ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
-        ordered = index.chunks
-        looked_at = {each.offset for each in (*ordered[:1], *ordered[-1:], *_out_of_order(ordered))}
+        totals = index.totals.values()
+        ends = sorted({end for total in totals for end in (total.first, total.last)})
+        odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
+        looked_at = {chunk.offset for chunk in odd}
         left = _VERIFIED_BYTES
         try:
             for chunk in index.chunks:
@@ -595,16 +596,16 @@ def _beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
     """
     chunks, start, last = index.chunks, window.start, window.stop - 1
     inside = [n for n, chunk in enumerate(chunks) if chunk.start <= last and chunk.end >= start]
-    found = {one + 1 for one, other in pairwise(inside) if other - one == _NEXT_BUT_ONE}
+    beside = {n + 1 for n, following in pairwise(inside) if following - n == _NEXT_BUT_ONE}
     for seam in index.seams:
         if seam.first <= last and seam.last >= start:
-            found.update((seam.nth, seam.nth + 1))
+            beside.update((seam.nth, seam.nth + 1))
     for at in (start, last):
         if not any(chunks[n].start <= at <= chunks[n].end for n in inside):
             before = [(chunk.end, n) for n, chunk in enumerate(chunks) if chunk.end < at]
             nth = max(before)[1] if before else -1
-            found.update((nth, nth + 1))
-    return [chunks[n] for n in sorted(found) if 0 <= n < len(chunks)]
+            beside.update((nth, nth + 1))
+    return [chunks[n] for n in sorted(beside) if 0 <= n < len(chunks)]
 
 
 def _split_window(
@@ -652,11 +653,11 @@ def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
 
 def _rows(
     column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
-) -> Rows[Record | LostError]:
+) -> RunRows[Record | LostError]:
     times, places = column
     if newest_first:
         times, places = times[::-1], places[::-1]
-    return Rows(times.tolist(), places.tolist(), fetch)
+    return RunRows(times.tolist(), places.tolist(), fetch)
 
 
 def _fetch_from_chunk(

@@ -168,12 +168,12 @@ class Pairs(NamedTuple):
 
     def columns(self, wanted: Collection[int]) -> dict[int, Column]:
         """Returns the messages of the wanted channels, which are of one chunk."""
-        return {
-            number: Column.of(self.times[here], self.offsets[here])
-            for number in wanted
-            for here in [self.channels == number]
-            if here.any()
-        }
+        columns: dict[int, Column] = {}
+        for number in wanted:
+            is_wanted = self.channels == number
+            if is_wanted.any():
+                columns[number] = Column.of(self.times[is_wanted], self.offsets[is_wanted])
+        return columns
 
 
 def pairs_in(

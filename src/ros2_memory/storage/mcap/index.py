@@ -160,7 +160,7 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
 @lru_cache(1024)
 def _numbers(low: bytes, high: bytes) -> frozenset[int]:
     """Returns the channel numbers with these low and high bytes: one set for all equal ones."""
-    return frozenset(one | other << 8 for one, other in zip(low, high, strict=True))
+    return frozenset(first | second << 8 for first, second in zip(low, high, strict=True))
 
 
 @lru_cache(32)
@@ -332,14 +332,14 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     many of them was written in another order, and they say nothing.
     """
     # Plain lists: for some thirty chunks arrays take twice as long.
-    apart = [abs(other[2] - one[3]) for one, other in pairwise(chunks)]
+    apart = [abs(following.start - chunk.end) for chunk, following in pairwise(chunks)]
     usual = _SEAM_TIMES * sorted(apart)[len(apart) // 2] if apart else 0
     seams: list[Seam] = []
     for nth in [nth for nth, gap in enumerate(apart) if gap > usual]:
-        one, other = chunks[nth], chunks[nth + 1]
-        if apart[nth] * _SEAM_SHARE > one.end - one.start + other.end - other.start:
+        before, after = chunks[nth], chunks[nth + 1]
+        if apart[nth] * _SEAM_SHARE > before.end - before.start + after.end - after.start:
             near = chunks[max(nth + 1 - _SEAM_CHUNKS, 0) : nth + 1 + _SEAM_CHUNKS]
-            first, last = min([each.start for each in near]), max([each.end for each in near])
+            first, last = min([chunk.start for chunk in near]), max([chunk.end for chunk in near])
             seams.append(Seam(nth, first, last))
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
 
