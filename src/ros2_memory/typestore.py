@@ -399,8 +399,8 @@ def _unrolled(field: FieldDesc) -> int:
     if field[0] != Nodetype.ARRAY:
         return 0
     element, count = field[1]
-    primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
-    return 0 if primitive else count
+    is_primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
+    return 0 if is_primitive else count
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:

@@ -107,6 +107,6 @@ def _shared_by_recordings(messages: Identities) -> IntArray:
     is_same = (np.diff(ordered.publish_times) == 0) & (np.diff(ordered.hashes) == 0)
     group = np.concatenate(([0], np.cumsum(~is_same))) if order.size else order
     is_elsewhere = is_same & (np.diff(ordered.recordings) != 0)
-    shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
-    shared[group[1:][is_elsewhere]] = True
-    return order[shared[group]] if order.size else order
+    is_shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
+    is_shared[group[1:][is_elsewhere]] = True
+    return order[is_shared[group]] if order.size else order

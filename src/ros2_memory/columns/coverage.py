@@ -181,7 +181,7 @@ class Covering:
 
     def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
         root, offset = str(self._bag_dir), self.store.offset
-        numbers, hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
+        numbers, is_hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
         for nth, bag in enumerate(segment.bags):
             stored_bag = stored.get(relative(bag.file, root))
@@ -192,7 +192,7 @@ class Covering:
                 and stored_bag.sidecar_ns == bag.sidecar_ns
                 and bag.state is BagState.CLOSED
             ):
-                numbers[nth], hashed[nth] = offset + stored_bag.row, stored_bag.hashed
+                numbers[nth], is_hashed[nth] = offset + stored_bag.row, stored_bag.hashed
             else:
                 missing.append(bag)
-        return CoveredSegment(segment, numbers, hashed, tuple(missing))
+        return CoveredSegment(segment, numbers, is_hashed, tuple(missing))

@@ -473,9 +473,9 @@ def is_transient(error: Exception) -> bool:
     Operational errors are those of the machine or of the moment, such as a full disk. Only a table
     that is missing (`SQLITE_ERROR`) and text that is not UTF-8 (no code) are faults of the content.
     """
-    operational = isinstance(error, sqlite3.OperationalError)
-    of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
-    return isinstance(error, MemoryError) or (operational and not of_content)
+    is_operational = isinstance(error, sqlite3.OperationalError)
+    is_of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
+    return isinstance(error, MemoryError) or (is_operational and not is_of_content)
 
 
 def is_busy(error: Exception) -> bool:

@@ -67,19 +67,19 @@ class Detections(NamedTuple):
 
     def at(self, rows: Ints) -> Detections:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
-        place = np.searchsorted(rows, self.rows)
-        kept = place < rows.size
-        kept[kept] = rows[place[kept]] == self.rows[kept]
+        message = np.searchsorted(rows, self.rows)
+        is_among = message < rows.size
+        is_among[is_among] = rows[message[is_among]] == self.rows[is_among]
         return Detections(
-            place[kept],
-            Texts(self.labels.codes[kept], self.labels.words),
-            self.scores[kept],
-            self.places[kept],
-            Texts(self.frames.codes[kept], self.frames.words),
+            message[is_among],
+            Texts(self.labels.codes[is_among], self.labels.words),
+            self.scores[is_among],
+            self.places[is_among],
+            Texts(self.frames.codes[is_among], self.frames.words),
         )
 
 
-class Found(NamedTuple):
+class StampedDetections(NamedTuple):
     """The detections of some messages.
 
     Attributes:
@@ -141,7 +141,7 @@ class DetectionColumns:
     def __init__(self, extractor: SchemaExtractor) -> None:
         self._sources = ByType(extractor, lambda shape: tuple(sources_in(shape.value)))
 
-    def of(self, table: Table) -> Found | None:
+    def of(self, table: Table) -> StampedDetections | None:
         """Returns the detections of a table's messages; None where they have to be read."""
         definition, sources = table.definition, self._sources.of(table)
         if definition is None or sources is None:
@@ -153,7 +153,7 @@ class DetectionColumns:
             detections = joined_detections(
                 [_with_frames(values, part, header_frames) for part in parts]
             )
-            return Found(detections, _stamps(values, definition))
+            return StampedDetections(detections, _stamps(values, definition))
         except UnknownShapeError:
             return None
 
@@ -163,10 +163,12 @@ class DetectionColumns:
         Of several parts for each of them, or for all.
         """
         sources = self._sources.of(table_or_parts)
-        may: bool | Mask = sources is None
+        possible: bool | Mask = sources is None
         for source in sources or ():
-            may = may | (not isinstance(source, Json) or _may_be_json(table_or_parts, source.leaf))
-        return may
+            possible = possible | (
+                not isinstance(source, Json) or _may_be_json(table_or_parts, source.leaf)
+            )
+        return possible
 
 
 def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
@@ -229,13 +231,15 @@ def sources_in(
             if is_object(element) or isinstance(element, Narrowed):
                 yield from sources_in(element, depth - 1, frames)
     elif is_object(node):
-        yield from _in_object(dict(children(node)), depth, frames)
+        yield from _sources_in_object(dict(children(node)), depth, frames)
 
 
-def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+def _sources_in_object(
+    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+) -> Iterator[Source]:
     named, several = scored(fields), hypotheses(fields)
-    frames = (*frames, *_frame(fields))
-    inner = tuple(_in_fields(fields, depth, frames))
+    frames = (*frames, *_frame_leaves(fields))
+    inner = tuple(_sources_in_fields(fields, depth, frames))
     if named is not None:
         yield Labels(named, inner, frames, (), _points(fields))
     elif several is not None:
@@ -247,7 +251,9 @@ def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) ->
         yield from inner
 
 
-def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+def _sources_in_fields(
+    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+) -> Iterator[Source]:
     for name, node in fields.items():
         element = node.element if isinstance(node, Listing) else None
         if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
@@ -255,7 +261,7 @@ def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) ->
         yield from sources_in(node, depth - 1, frames)
 
 
-def _frame(fields: dict[str, Node]) -> Iterator[Leaf]:
+def _frame_leaves(fields: dict[str, Node]) -> Iterator[Leaf]:
     header = fields.get("header")
     if isinstance(header, Message | Group):
         fields = dict(children(header))
@@ -332,7 +338,10 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
         elements, parent = values.elements(objects.level), objects.level.parent
         if elements is None or parent is None:
             raise UnknownShapeError("hypotheses are not held")
-        positions, size = _best(name, score, error, elements.owners), values.size(parent) or 0
+        positions, size = (
+            _best_hypotheses(name, score, error, elements.owners),
+            values.size(parent) or 0,
+        )
     is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
     positions = positions[is_named[name.codes[positions]]] if name.words else positions[:0]
     if positions.size < size and any(
@@ -345,8 +354,8 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     if not places:
         return detections
     return detections._replace(
-        places=_places(values, source, objects.level, positions),
-        frames=_frames(values, objects.level, positions, source.frames),
+        places=_places_at(values, source, objects.level, positions),
+        frames=_frames_at(values, objects.level, positions, source.frames),
     )
 
 
@@ -412,7 +421,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     positions = np.repeat(with_any, counts)
     nth = np.repeat(first, counts) + within(counts)
     _, rows = placed(values, source.leaf.level, positions, (), surely=True)
-    outer_frames = _frames(values, source.leaf.level, positions, source.frames)
+    outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
     yield Detections(
         rows,
         Texts(parsed.labels.codes[nth], parsed.labels.words),
@@ -431,7 +440,7 @@ def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
     return detections_of(value)
 
 
-def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
+def _best_hypotheses(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     """Returns the first of the hypotheses of the highest score, for each detection.
 
     Raises:
@@ -449,13 +458,13 @@ def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     return best
 
 
-def _places(values: Values, source: Labels, level: Level, positions: Ints) -> Points:
+def _places_at(values: Values, source: Labels, level: Level, positions: Ints) -> Points:
     """Returns the first valid point of each detection (N x 3); NaN where it has none."""
     if source.points is None or source.best_points is None:
         raise UnknownShapeError("points are of another shape in each message")
     places = _nowhere(positions.size)
     for leaves in (*source.best_points, *source.points):
-        at = _owners(values, level, positions, leaves[0].level)
+        at = _owners_at(values, level, positions, leaves[0].level)
         columns = [values.numbers(leaf) for leaf in leaves]
         numbers = [column.values[at] for column in columns if column is not None]
         if len(numbers) < len(leaves):
@@ -467,17 +476,17 @@ def _places(values: Values, source: Labels, level: Level, positions: Ints) -> Po
     return places
 
 
-def _frames(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:
+def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:
     """Returns the frame of each detection: what the innermost object around it names."""
     frames = _no_frames(positions.size)
     for leaf in leaves:
         texts = texts_of(values, leaf)
-        codes = texts.codes[_owners(values, level, positions, leaf.level)]
+        codes = texts.codes[_owners_at(values, level, positions, leaf.level)]
         frames = or_else(Texts(codes, texts.words), frames)
     return frames
 
 
-def _owners(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
+def _owners_at(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
     """Returns, of some elements of a level, the elements or rows around them."""
     while level != outer:
         elements = values.elements(level)
@@ -508,7 +517,7 @@ def _with_frames(
     if not header_frames or detections.frames.words.count("") == 0:
         return detections
     return detections._replace(
-        frames=or_else(detections.frames, _frames(values, ROWS, detections.rows, header_frames))
+        frames=or_else(detections.frames, _frames_at(values, ROWS, detections.rows, header_frames))
     )
 
 

@@ -255,12 +255,12 @@ class Filling:
 
     def _read(self, bag: BagFile, pending: DecodedBags, *, hashed: bool) -> bool:
         """Adds a bag to what was found; stores a long one, and returns whether it is stored."""
-        if not self._is_settled(bag):
+        if not self._may_be_stored(bag):
             return False
         try:
             if self._renew(bag):
                 return True
-            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._is_settled, bag))
+            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._may_be_stored, bag))
             # A latched message may come again later, in another recording.
             groups = decoded(
                 self._reader, bag.path, hashed=lambda channel: hashed or channel.latched
@@ -329,16 +329,17 @@ class Filling:
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
 
-    def _is_settled(self, bag: BagFile) -> bool:
+    def _may_be_stored(self, bag: BagFile) -> bool:
         return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())
 
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
-        if self._shared is None or self._shared[0] is not timeline:
+        shared_in, files = self._shared or (None, frozenset[str]())
+        if shared_in is not timeline:
             spans = [TimeWindow(*span) for span in timeline.shared_times]
-            files = (bag.file for span in spans for bag in timeline.overlapping(span))
-            self._shared = timeline, frozenset(files)
-        return bag.file in self._shared[1]
+            files = frozenset(bag.file for span in spans for bag in timeline.overlapping(span))
+            self._shared = timeline, files
+        return bag.file in files
 
     def _is_over(self, begin: Ns, timeline: Timeline) -> bool:
         """Returns whether no bag that belongs to ten minutes is to be expected."""

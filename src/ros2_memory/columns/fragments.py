@@ -54,7 +54,7 @@ class Sized(Protocol):
 T = TypeVar("T", bound=Sized)
 
 
-class Kind(NamedTuple, Generic[T]):
+class FragmentKind(NamedTuple, Generic[T]):
     """A kind of fragments: what tells it apart from others in the file, and what it consists of.
 
     Attributes:
@@ -176,9 +176,9 @@ class Joined(NamedTuple, Generic[T]):
         return 100 + sum(fragment.memory_bytes for fragment in self.fragments)
 
 
-def joining(kind: Kind[T]) -> Kind[Joined[T]]:
+def joining(kind: FragmentKind[T]) -> FragmentKind[Joined[T]]:
     """Returns the kind of the joined fragments of a kind."""
-    return Kind(f"{kind.name}-joined", (*kind.classes, Joined))
+    return FragmentKind(f"{kind.name}-joined", (*kind.classes, Joined))
 
 
 class Fragments(Generic[T]):
@@ -192,7 +192,11 @@ class Fragments(Generic[T]):
     """
 
     def __init__(
-        self, store: ColumnStore | None, kind: Kind[T], settings: str, remembered: ByteLru[object]
+        self,
+        store: ColumnStore | None,
+        kind: FragmentKind[T],
+        settings: str,
+        remembered: ByteLru[object],
     ) -> None:
         self._store = store
         self._kind = kind

@@ -19,7 +19,7 @@ from ros2_memory.analysis.topic_events import (
     TopicEvents,
     joined_events,
 )
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.core.arrays import stacked
 
 if TYPE_CHECKING:
@@ -46,13 +46,13 @@ def _joined_tracks(parts: Sequence[TrackPart]) -> Sequence[TrackPart]:
 
 
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
-PATHS: Final[Kind[PathSlice]] = Kind("path", (*_MOTION, Poses, Frames))
+PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, Frames))
 """The path of the poses of a topic in a slice of the clock."""
-STANDS: Final = Kind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
+STANDS: Final = FragmentKind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
 """Where the robot may have stood in a slice of the clock, by the poses of a topic."""
-EVENTS: Final = Kind(
+EVENTS: Final = FragmentKind(
     "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
 )
 """What came into view, changed or failed on a topic in a part."""
-TRACKS: Final = Kind("track", (TrackPart,), _joined_tracks)
+TRACKS: Final = FragmentKind("track", (TrackPart,), _joined_tracks)
 """Where the poses of a part have the robot in a frame; joined, those of a recording."""

@@ -18,7 +18,7 @@ from ros2_memory.columns.shown import (
     placed,
     shape_of,
 )
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -92,7 +92,7 @@ def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | Non
     if len(leaves) != 1 or leaves[0][0].level is not ROWS or leaves[0][1]:
         return None
     leaf, _ = leaves[0]
-    return leaf.sources[0] if leaf.made in {Made.STORED, Made.REAL} else None
+    return leaf.sources[0] if leaf.conversion in {Conversion.STORED, Conversion.REAL} else None
 
 
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:

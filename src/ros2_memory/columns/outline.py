@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.table import IN_PART, SPACES, Numbers, Table, Texts, letters_of
 
 if TYPE_CHECKING:
@@ -73,8 +73,12 @@ class Letters(NamedTuple):
         words = sorted(frozenset().union(*number_of))
         if len(words) > _MOST_LETTERS:
             return None
-        has = np.array([[word in spelled for spelled in number_of] for word in words], np.bool_)
-        rows = has.reshape(len(words), len(number_of))[:, np.array(spelling, np.int64)[texts.codes]]
+        has_word = np.array(
+            [[word in spelled for spelled in number_of] for word in words], np.bool_
+        )
+        rows = has_word.reshape(len(words), len(number_of))[
+            :, np.array(spelling, np.int64)[texts.codes]
+        ]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
     def may_have(self, text: str) -> Mask:
@@ -149,11 +153,11 @@ def outline_of(table: Table, times: IntArray) -> Outline:
         elif zone is not None and np.isfinite([zone.low, zone.high]).all():
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
-                totals[path] = _totals(column, table.error(path), times)
+                totals[path] = _totals_of(column, table.error(path), times)
     return Outline.of(totals, letters)
 
 
-def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
+def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
     is_finite = np.isfinite(column)
     if not is_finite.all():
         column, times = column[is_finite], times[is_finite]
@@ -161,12 +165,12 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
     with np.errstate(over="ignore", invalid="ignore"):  # not finite where no float holds it
         total = float(numbers.sum(dtype=np.float64))
     if error == 0.0:
-        ends = [int(times[nth]) for nth in (numbers.argmin(), numbers.argmax())]
-        return Totals(len(numbers), total, (ends[0],) * 2, (ends[1],) * 2)
-    least = times[numbers - error <= (numbers + error).min()]
-    most = times[numbers + error >= (numbers - error).max()]
-    spans = [(int(candidates[0]), int(candidates[-1])) for candidates in (least, most)]
+        least, greatest = int(times[numbers.argmin()]), int(times[numbers.argmax()])
+        return Totals(len(numbers), total, (least, least), (greatest, greatest))
+    may_be_least = times[numbers - error <= (numbers + error).min()]
+    may_be_greatest = times[numbers + error >= (numbers - error).max()]
+    spans = [(int(ends[0]), int(ends[-1])) for ends in (may_be_least, may_be_greatest)]
     return Totals(len(numbers), total, *spans)
 
 
-OUTLINE: Final[Kind[Outline]] = Kind("outline", (Outline, Letters))
+OUTLINE: Final[FragmentKind[Outline]] = FragmentKind("outline", (Outline, Letters))

@@ -150,10 +150,10 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
             dtype, copy=False
         )
     stored = np.dtype(np.float32) if form == "float32" else dtype
-    rounded = form == "rounded"
-    lowest = int(_ordered(np.array([least], stored), rounded=rounded)[0])
+    is_rounded = form == "rounded"
+    lowest = int(_ordered(np.array([least], stored), rounded=is_rounded)[0])
     whole = _whole_numbers(arrangement, count, lowest, data)
-    return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
+    return _from_ordered(whole, stored, rounded=is_rounded).astype(dtype, copy=False)
 
 
 def compressed(data: bytes) -> bytes:
@@ -273,11 +273,11 @@ def _zone_of(values: Floats) -> Zone:
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     """The bits of floats as integers that are ordered as the floats are; NaN is the greatest."""
     integer, magnitude, dropped = _BITS[values.itemsize]
-    same = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
-    missing = np.isnan(same)
-    if missing.any():
-        same[missing] = np.nan
-    bits = same.view(integer).astype(np.int64)
+    zeroed = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
+    is_nan = np.isnan(zeroed)
+    if is_nan.any():
+        zeroed[is_nan] = np.nan
+    bits = zeroed.view(integer).astype(np.int64)
     if rounded:
         bits = (bits + (1 << (dropped - 1))) >> dropped
         magnitude >>= dropped
@@ -391,8 +391,8 @@ def _in_use(column: Texts) -> Texts:
 
     Words of deleted rows must not stay in the file.
     """
-    used = np.bincount(column.codes, minlength=len(column.words)) > 0
-    return column if used.all() else column.rows(np.arange(len(column)))
+    is_used = np.bincount(column.codes, minlength=len(column.words)) > 0
+    return column if is_used.all() else column.rows(np.arange(len(column)))
 
 
 def folded(words: Collection[str]) -> str | None:

@@ -201,9 +201,9 @@ class _Planner:
         layout = self.layout or ()
         unit = max((align for align, _ in layout), default=1)
         ends = () if self.layout is None else tuple(self._end(start) for start in range(unit))
-        objects = any(isinstance(step, Text | Sequence) for step in self.steps)
+        has_objects = any(isinstance(step, Text | Sequence) for step in self.steps)
         steps, left_out = tuple(self.steps), self.left_out
-        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, objects)
+        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, has_objects)
 
     def _end(self, at: int) -> int:
         for align, size in self.layout or ():
@@ -264,10 +264,10 @@ class _Planner:
                 number = Number(at, attribute, dtype, kind == "bool", nth)
                 self._fixed(number, dtype.str, size, size)
             return
-        ranged = length * size <= MAX_RANGED_BYTES
-        array = Array(path, attribute, length, kind == "bool", ranged)
+        is_ranged = length * size <= MAX_RANGED_BYTES
+        array = Array(path, attribute, length, kind == "bool", is_ranged)
         self.left_out[path] = f"an array of {length} numbers"
-        if ranged:
+        if is_ranged:
             self._fixed(array, f"({length},){dtype.str}", size, length * size)
             return
         self._fixed(array, "", size, length * size)
@@ -312,7 +312,7 @@ class _Planner:
     def _flush(self) -> None:
         """Ends the run."""
         if self.size:
-            shown = [(str(nth), *entry[1:]) for nth, entry in enumerate(self.read) if entry[1]]
+            shown = [(str(nth), kind, at) for nth, (_, kind, at) in enumerate(self.read) if kind]
             dtype = np.dtype(
                 {
                     "names": [name for name, _, _ in shown],

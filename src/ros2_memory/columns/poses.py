@@ -131,7 +131,7 @@ class _Field(NamedTuple):
         """Returns the paths of its fields with these names; none unless all are numbers."""
         if self.length is not None or not isinstance(self.kind, Definition):
             return ()
-        fields = [_field(self.kind, (name,)) for name in names]
+        fields = [_field_at(self.kind, (name,)) for name in names]
         paths = tuple(f"{self.path}.{part.path}" for part in fields if part and part.is_number)
         return paths if len(paths) == len(names) else ()
 
@@ -148,7 +148,7 @@ class _Field(NamedTuple):
         return tuple(f"{self.path}.{nth}" for nth in range(count))
 
 
-def _field(definition: Definition, path: Segments) -> _Field | None:
+def _field_at(definition: Definition, path: Segments) -> _Field | None:
     """Returns the field at a path; None where there is none.
 
     Raises:
@@ -167,9 +167,9 @@ def _columns_of(plan: Plan, definition: Definition) -> _Columns:
     paths = _pose(plan, definition)
     if paths is None:
         return _Columns((), (), "", "", ())
-    frame = _field(definition, FRAME.segments)
+    frame = _field_at(definition, FRAME.segments)
     is_named = frame is not None and frame.length is None and frame.kind in _TEXTS
-    numbered = plan.pose_frame and _field(definition, plan.pose_frame.segments)
+    numbered = plan.pose_frame and _field_at(definition, plan.pose_frame.segments)
     return _Columns(
         *paths,
         frame.path if frame is not None and is_named else "",
@@ -197,8 +197,8 @@ def _pose(plan: Plan, definition: Definition) -> _Paths | None:
 
 
 def _point(route: PointPose, definition: Definition) -> _Paths | None:
-    position = _field(definition, route.position.segments)
-    orientation = _field(definition, route.orientation.segments)
+    position = _field_at(definition, route.position.segments)
+    orientation = _field_at(definition, route.orientation.segments)
     axes = position.parts("xyz") if position else ()
     turn = orientation.parts("xyzw") if orientation else ()
     if route.arrays:
@@ -211,7 +211,7 @@ def _point(route: PointPose, definition: Definition) -> _Paths | None:
 
 def _planar(route: PlanarPose, definition: Definition) -> _Paths | None:
     routes = (route.x, route.y, route.z, route.heading)
-    fields = (_field(definition, axis.segments) for axis in routes)
+    fields = (_field_at(definition, axis.segments) for axis in routes)
     x, y, z, heading = (entry.path if entry and entry.is_number else "" for entry in fields)
     if not x or not y:
         return None
@@ -221,8 +221,8 @@ def _planar(route: PlanarPose, definition: Definition) -> _Paths | None:
 def _velocity(plan: Plan, definition: Definition) -> tuple[str, ...]:
     """Returns the paths of the first linear velocity that an angular one stands beside."""
     for linear_route, angular_route in plan.twists:
-        linear = _field(definition, linear_route.segments)
-        angular = _field(definition, angular_route.segments)
+        linear = _field_at(definition, linear_route.segments)
+        angular = _field_at(definition, angular_route.segments)
         if linear is None or angular is None:
             continue
         velocity, turning = linear.parts("xyz"), angular.parts("xyz")

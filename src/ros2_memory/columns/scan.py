@@ -57,7 +57,7 @@ _TOO_LARGE: Final = "its messages are too large to hold their columns"
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ScanRequest:
     """What a scan is of.
 
     Attributes:
@@ -126,15 +126,15 @@ class Scan:
 
     Args:
         scanner: has what is stored.
-        asked: what it is of.
+        request: what it is of.
     """
 
-    def __init__(self, scanner: Scanner, asked: Asked) -> None:
+    def __init__(self, scanner: Scanner, request: ScanRequest) -> None:
         self._scanner = scanner
-        self._asked = asked
+        self._request = request
         self._coverage: Coverage | None = None
         self._shared = [
-            span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
+            span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
         ]
         self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
@@ -142,8 +142,8 @@ class Scan:
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
         self._together: list[PartHead] = []
-        reach = asked.window
-        if asked.relatches:
+        reach = request.window
+        if request.relatches:
             reach = TimeWindow.everything()
         elif self._shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
@@ -163,7 +163,7 @@ class Scan:
     @property
     def window(self) -> TimeWindow:
         """The window that it is of."""
-        return self._asked.window
+        return self._request.window
 
     def rows(
         self, *, newest_first: bool = False, among: TimeWindow | None = None
@@ -179,13 +179,13 @@ class Scan:
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window = self._asked.window
+        window = self._request.window
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
         sources = [s for s in sources if window.overlaps(s.first, s.last)]
         ruled_out = self._ruled_out(sources)
-        if not self._asked.may_not_match:
+        if not self._request.may_not_match:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
-        if (within := self._asked.within) is not None:
+        if (within := self._request.within) is not None:
             sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
         ahead = together = 1
         waiting: list[Rows] = []
@@ -195,7 +195,7 @@ class Scan:
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
                 self._together = [s.part for s in sources[nth:ahead] if s.part is not None]
-            self._asked.check(source.last if newest_first else source.first)
+            self._request.check(source.last if newest_first else source.first)
             may_match = source.part is None or source.part.number not in ruled_out
             waiting += [
                 Rows(unit, partial(self._counting, unit), may_match=may_match)
@@ -206,15 +206,15 @@ class Scan:
             after = sources[nth + 1] if nth + 1 < len(sources) else None
             while waiting and _is_next(waiting[0], after, newest_first=newest_first):
                 rows = waiting.pop(0)
-                if self._asked.may_be_empty or len(rows):
+                if self._request.may_be_empty or len(rows):
                     yield rows
 
     def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
         """Returns the numbers of the parts that have no wanted row, by their zones."""
-        if self._asked.may_match is None:
+        if self._request.may_match is None:
             return set()
         heads = [source.part for source in sources if source.part is not None]
-        wanted = self._scanner.matching(heads, self._asked.may_match)
+        wanted = self._scanner.matching(heads, self._request.may_match)
         return {head.number for head, may in zip(heads, wanted, strict=True) if not may}
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
@@ -224,7 +224,7 @@ class Scan:
         and after, and what lies between them.
         """
         stretches: list[Stretch] = []
-        until = self._asked.window.stop
+        until = self._request.window.stop
 
         def between(start: Ns) -> Iterator[Stretch]:
             if start < until:
@@ -234,24 +234,24 @@ class Scan:
         for stretch in self._settled_stretches(beside) if self._sources else ():
             stretches += [*between(stretch.window.stop), stretch]
             until = stretch.window.start
-        return [*stretches, *between(self._asked.window.start)]
+        return [*stretches, *between(self._request.window.start)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the whole parts that all rows in a window are of; None where others are, too.
 
         With them those that latched messages in the window may have been received in before.
         """
-        parts = self._whole_parts(window)
-        late = [part for part in parts or () if self._asked.relatches and self._may_be_late(part)]
+        parts = self._parts_reaching_into(window)
+        late = [part for part in parts or () if self._request.relatches and self._may_be_late(part)]
         if not late:
             return parts
         published = min(self._published[part][0] for part in late)
         if published < window.start - STRETCH_NS:
             return None
         since = min(int(published) - COPY_HORIZON_NS, window.start)
-        return self._whole_parts(TimeWindow(since, window.stop))
+        return self._parts_reaching_into(TimeWindow(since, window.stop))
 
-    def _whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
+    def _parts_reaching_into(self, window: TimeWindow) -> tuple[int, ...] | None:
         if self._coverage is None:
             return None
         begin = int(np.searchsorted(self._latest, window.start))
@@ -286,15 +286,17 @@ class Scan:
         heads = [part for part in parts if part is not None]
         if self._coverage is not None and heads:
             counting = self._coverage.counts([head.bags for head in heads])
-            of_all = counting == [head.bags.size for head in heads]
-            is_whole[[part is not None for part in parts]] &= of_all
+            all_count = counting == [head.bags.size for head in heads]
+            is_whole[[part is not None for part in parts]] &= all_count
         is_whole &= self._lasts - self._firsts < STRETCH_NS
         return np.concatenate([[0], np.cumsum(~is_whole)])
 
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
         """Returns the stretches of which all rows are of whole parts; see `stretches`."""
-        window, firsts, latest = self._asked.window, self._firsts, self._latest
-        newest = max((segment.latest for segment in self._asked.timeline.segments), default=MIN_NS)
+        window, firsts, latest = self._request.window, self._firsts, self._latest
+        newest = max(
+            (segment.latest for segment in self._request.timeline.segments), default=MIN_NS
+        )
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
@@ -325,9 +327,11 @@ class Scan:
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         for source in self._sources:
             part = None if source.part is None else source.part.number
-            if id(source) not in shared and not (self._asked.relatches and self._may_be_late(part)):
+            if id(source) not in shared and not (
+                self._request.relatches and self._may_be_late(part)
+            ):
                 continue
-            self._asked.check(source.first)
+            self._request.check(source.first)
             for unit in self._units(source):
                 repeated = self._repeated(unit)
                 if repeated.size:
@@ -340,7 +344,7 @@ class Scan:
             if store is None:
                 break
             failures = store.failures
-            self._coverage = self._scanner.coverage(self._asked.timeline)
+            self._coverage = self._scanner.coverage(self._request.timeline)
             sources = [*self._sources_of(reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
@@ -358,7 +362,7 @@ class Scan:
 
     def _sources_of(self, reach: TimeWindow) -> Iterator[_Source]:
         """Yields the sources that may have rows in a window."""
-        topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
+        topic, timeline, coverage = self._request.topic, self._request.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
             plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
             yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
@@ -390,7 +394,7 @@ class Scan:
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
     def _units(self, source: _Source) -> Iterable[Unit]:
-        if source.part is None and self._asked.stored:
+        if source.part is None and self._request.stored:
             return ()
         if source.part is not None and self._coverage is not None:
             unit = self._scanner.part(source.part, self._coverage, self._together)
@@ -402,8 +406,10 @@ class Scan:
         """Returns the tables of a bag, which is decoded unless it was one of the last."""
         units = self._decoded.get(bag.file)
         if units is None:
-            hashed = bool(self._shared) or self._asked.relatches
-            tables = _bounded(self._asked.decode(bag, self._asked.topic, hashed))
+            hashed = bool(self._shared) or self._request.relatches
+            tables = _without_columns_if_large(
+                self._request.decode(bag, self._request.topic, hashed)
+            )
             units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
             self._decoded[bag.file] = units
             while len(self._decoded) > _MOST_DECODED or (
@@ -417,17 +423,17 @@ class Scan:
 
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""
-        window = self._asked.window
-        counting = unit.counting()
+        window = self._request.window
+        is_counted = unit.counting()
         if not window.covers(unit.first, unit.last):
             times = unit.times()
-            inside = (times >= window.start) & (times < window.stop)
-            counting = inside if counting is None else counting & inside
+            is_inside = (times >= window.start) & (times < window.stop)
+            is_counted = is_inside if is_counted is None else is_counted & is_inside
         repeated = self._repeated(unit)
         if repeated.size:
-            counting = np.ones(len(unit.table), np.bool_) if counting is None else counting
-            counting[repeated] = False
-        return None if counting is None or counting.all() else np.flatnonzero(counting)
+            is_counted = np.ones(len(unit.table), np.bool_) if is_counted is None else is_counted
+            is_counted[repeated] = False
+        return None if is_counted is None or is_counted.all() else np.flatnonzero(is_counted)
 
     # Copies
 
@@ -441,7 +447,7 @@ class Scan:
                 else self._published[source.part.number]
                 for source in self._sources_in(TimeWindow(start, stop))
             )
-            if any(before[1] >= after[0] for before, after in pairwise(published)):
+            if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
                 spans.append((start, stop))
         return spans
 
@@ -457,7 +463,7 @@ class Scan:
                     end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
         copies = self._copies.get(unit.key, [])
-        if self._asked.relatches:
+        if self._request.relatches:
             copies = [*copies, self._received_again(unit)]
         return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
@@ -485,11 +491,11 @@ class Scan:
         identities = unit.identities() if may_be_late else None
         if identities is None:
             return none
-        published = identities[0]
-        late = unit.times() - published > RELATCHED_NS
-        if not late.any():
+        published, _ = identities
+        is_late = unit.times() - published > RELATCHED_NS
+        if not is_late.any():
             return none
-        since = max(int(published[late].min()) - COPY_HORIZON_NS, MIN_NS)
+        since = max(int(published[is_late].min()) - COPY_HORIZON_NS, MIN_NS)
         if since < self._relatched_since:
             # As much again before it: late messages come many at once, of about the same age.
             self._relatched_since = max(since - (unit.last - since), MIN_NS)
@@ -536,9 +542,9 @@ class Scan:
             yield from self._units(source)
 
     def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
-        times, counting = unit.times(), unit.counting()
-        inside = (times >= window.start) & (times < window.stop)
-        return np.flatnonzero(inside if counting is None else inside & counting)
+        times, is_counted = unit.times(), unit.counting()
+        is_inside = (times >= window.start) & (times < window.stop)
+        return np.flatnonzero(is_inside if is_counted is None else is_inside & is_counted)
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
@@ -573,7 +579,7 @@ class Scan:
         bags = unit.bags()
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._asked.decode(bags[number], self._asked.topic, True):
+            for table in self._request.decode(bags[number], self._request.topic, True):
                 if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
                     continue
                 # A part has ten minutes of a long bag.
@@ -592,7 +598,7 @@ def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
     return rows.last >= after.last if newest_first else rows.first <= after.first
 
 
-def _bounded(tables: Iterable[Table]) -> list[Table]:
+def _without_columns_if_large(tables: Iterable[Table]) -> list[Table]:
     """Returns the tables of a bag; without their columns where these take too much together."""
     held: list[Table] = []
     size = 0

@@ -14,7 +14,7 @@ import numpy as np
 
 from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
-from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, Sized
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME
@@ -175,7 +175,7 @@ class Scanner:
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments[OUTLINE.name] = self._outlines
 
-    def fragments(self, kind: Kind[T]) -> Fragments[T]:
+    def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
             fragments = Fragments(self.store, kind, self._settings, self.caches.read)
@@ -244,7 +244,7 @@ class Scanner:
         self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]
     ) -> Mask:
         """Returns which of some parts may have rows that are wanted, by their zones."""
-        may = np.ones(len(heads), np.bool_)
+        possible = np.ones(len(heads), np.bool_)
         topics = np.array([head.topic for head in heads], np.int64)
         numbers = np.array([head.number for head in heads], np.int64)
         for number in np.unique(topics).tolist():
@@ -252,8 +252,8 @@ class Scanner:
             if topic is not None:
                 is_of_topic = topics == number
                 zones = partial(self._zones, number, numbers[is_of_topic])
-                may[is_of_topic] = may_match(PartZones(topic, zones))
-        return may
+                possible[is_of_topic] = may_match(PartZones(topic, zones))
+        return possible
 
     def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
         """Returns the least and greatest value of a column by part; infinite if not stored."""

@@ -17,12 +17,12 @@ import numpy as np
 from ros2_memory.columns.shown import (
     Choice,
     Group,
-    Kept,
     Listing,
     Message,
     Narrowed,
     Node,
     Spot,
+    TruthValues,
     children,
     leaves_below,
     opened,
@@ -91,7 +91,7 @@ def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Detections(ABC):
+class _ScoreLimit(ABC):
     """Which detections of a level stay; that is found once for each table."""
 
     level: Level
@@ -100,43 +100,43 @@ class _Detections(ABC):
     texts: tuple[Leaf, ...]
     has_inner: bool
 
-    def kept(self, values: Values, positions: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the detection stays."""
         if self not in values.kept:
             values.kept[self] = self._all_kept(values)
         surely, perhaps = values.kept[self]
-        return Kept(surely[positions], perhaps[positions])
+        return TruthValues(surely[positions], perhaps[positions])
 
     @abstractmethod
-    def _all_kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> TruthValues:
         """Returns where the detections of a table stay."""
 
 
-class _Scores(_Detections):
+class _OwnScoreLimit(_ScoreLimit):
     """Which detections score enough."""
 
-    def _all_kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> TruthValues:
         named = self.scored.read(values)
         if named is None:
             return unknown(values.size(self.level) or 0)
         name, score, error = named
-        labelled = _has_label(name)
-        surely = ~(labelled & (score < self.least + error))
-        perhaps = ~(labelled & (score < self.least - error))
+        is_labelled = _has_label(name)
+        surely = ~(is_labelled & (score < self.least + error))
+        perhaps = ~(is_labelled & (score < self.least - error))
         if self.has_inner or may_be_json(values, self.texts):
-            surely &= labelled
-        return Kept(surely, perhaps)
+            surely &= is_labelled
+        return TruthValues(surely, perhaps)
 
 
-class _BestScores(_Detections):
+class _BestScoreLimit(_ScoreLimit):
     """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
 
-    def _all_kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> TruthValues:
         size = values.size(self.level) or 0
         named, results = self.scored.read(values), values.elements(self.scored.level)
         if named is None or results is None or named.error:
             return unknown(size)  # also with rounded scores, of which another may be the best
-        labelled = _has_label(named.name)
+        is_labelled = _has_label(named.name)
         order, begins = ranked(named.score, results.owners)
         best = order[begins]
         detections = results.owners[best]
@@ -144,23 +144,23 @@ class _BestScores(_Detections):
         if self.has_inner or may_be_json(values, self.texts):
             surely[:] = False
         is_low = named.score[best] < self.least
-        surely[detections] = labelled[best] & ~is_low
-        perhaps[detections] = ~(labelled[best] & is_low)
-        return Kept(surely, perhaps)
+        surely[detections] = is_labelled[best] & ~is_low
+        perhaps[detections] = ~(is_labelled[best] & is_low)
+        return TruthValues(surely, perhaps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Hypotheses:
+class _HypothesisLimit:
     """Which of several hypotheses stay, in a detection that stays."""
 
-    best: _BestScores
+    best: _BestScoreLimit
 
     @property
     def level(self) -> Level:
         """The level of the hypotheses."""
         return self.best.scored.level
 
-    def kept(self, values: Values, positions: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the hypothesis stays."""
         named, results = self.best.scored.read(values), values.elements(self.level)
         if named is None or named.error or results is None:
@@ -168,7 +168,7 @@ class _Hypotheses:
         # Where it is not sure that the detection is one, neither is what stays of it.
         is_detection = self.best.kept(values, results.owners[positions]).surely
         is_low = named.score[positions] < self.best.least
-        return Kept(~is_low & is_detection, ~is_low | ~is_detection)
+        return TruthValues(~is_low & is_detection, ~is_low | ~is_detection)
 
 
 def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
@@ -202,13 +202,15 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
     single = scored(fields)
     if single is not None:
-        return Narrowed(_Scores(single.level, single, least, *_inside(fields, depth)), node)
+        return Narrowed(_OwnScoreLimit(single.level, single, least, *_inside(fields, depth)), node)
     results, several = fields.get("results"), hypotheses(fields)
     if isinstance(results, Listing) and several is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
         texts, has_inner = _inside(others, depth)
-        best = _BestScores(several.level.parent or several.level, several, least, texts, has_inner)
-        kept = Narrowed(_Hypotheses(best), results.element)
+        best = _BestScoreLimit(
+            several.level.parent or several.level, several, least, texts, has_inner
+        )
+        kept = Narrowed(_HypothesisLimit(best), results.element)
         return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
     return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
 
@@ -246,7 +248,7 @@ def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], b
     for node in fields.values():
         child = without_low(node, 0.0, depth - 1)
         for _, leaf, limits in leaves_below(Spot(child)):
-            if any(isinstance(limit, _Detections) for limit in limits):
+            if any(isinstance(limit, _ScoreLimit) for limit in limits):
                 return (), True
             if leaf.json_depth:
                 texts.append(leaf)

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, Table
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Level, Values
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
@@ -47,7 +47,7 @@ class UnknownShapeError(Exception):
     """What the value looks like differs from message to message: the messages decide."""
 
 
-class Kept(NamedTuple):
+class TruthValues(NamedTuple):
     """Of some rows or elements: where something surely stands, and where it may stand."""
 
     surely: Mask
@@ -64,14 +64,14 @@ class Kept(NamedTuple):
         return not self.perhaps.any()
 
 
-def nowhere(size: int) -> Kept:
+def nowhere(size: int) -> TruthValues:
     """Returns the column of a field that none of so many rows or elements has."""
-    return Kept(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
+    return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 
-def unknown(size: int) -> Kept:
+def unknown(size: int) -> TruthValues:
     """Returns that nothing is known of so many rows or elements."""
-    return Kept(np.zeros(size, np.bool_), np.ones(size, np.bool_))
+    return TruthValues(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
 class Limit(Protocol):
@@ -81,7 +81,7 @@ class Limit(Protocol):
     def level(self) -> Level:
         """The level that it is about."""
 
-    def kept(self, values: Values, positions: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where it stands, for some rows or elements of the level."""
 
 
@@ -92,13 +92,13 @@ class Pick:
     level: Level
     place: int
 
-    def kept(self, values: Values, positions: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the elements stand at the place."""
         places = values.places(self.level, positions, from_end=self.place < 0)
         if places is None:
             return unknown(len(positions))
-        kept = places == self.place
-        return Kept(kept, kept)
+        is_kept = places == self.place
+        return TruthValues(is_kept, is_kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,13 +110,13 @@ class LongerThan:
     count: int
     is_longer: bool
 
-    def kept(self, values: Values, positions: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the sequence is that long."""
         lengths = values.numeric(self.level, f"{self.sequence}.length")
         if lengths is None:
             return unknown(len(positions))
-        kept = (lengths[positions] > self.count) == self.is_longer
-        return Kept(kept, kept)
+        is_kept = (lengths[positions] > self.count) == self.is_longer
+        return TruthValues(is_kept, is_kept)
 
 
 class Place(NamedTuple):
@@ -318,7 +318,7 @@ class Shape:
         message = Message(self, level, path, definition, place.depth)
         kind = kind_of_type(definition.type, [field.name for field in definition.fields])
         if kind is ValueKind.TIME:
-            return Leaf(level, (path,), Kind.REAL, Made.SECONDS)
+            return Leaf(level, (path,), Kind.REAL, Conversion.SECONDS)
         are_numbers = all(_is_number(field.kind, field.length) for field in definition.fields)
         sources = [f"{path}.{field.name}" if path else field.name for field in definition.fields]
         if kind is ValueKind.VECTOR and are_numbers:
@@ -404,7 +404,7 @@ class Shape:
             )
         if size <= count:
             return array
-        constant = Leaf(level, (), Kind.INTEGER, Made.CONSTANT, size)
+        constant = Leaf(level, (), Kind.INTEGER, Conversion.CONSTANT, size)
         return Choice((Group({key: constant}),), array)
 
     def _converted(self, name: str, node: Node) -> Node:
@@ -422,14 +422,16 @@ class Shape:
         if not isinstance(array, Items):
             return node
         leaves = [item for item in array.items if isinstance(item, Leaf)]
-        numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
+        is_numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
         sources = [leaf.sources[0] for leaf in leaves]
         if name in POINTS:
-            return _vector(leaves[0].level, sources) if numeric and len(leaves) == 3 else node
+            return _vector(leaves[0].level, sources) if is_numeric and len(leaves) == 3 else node
         if len(leaves) != 4:
             return node
         # PX4 writes w first.
-        return _angles_of(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
+        return (
+            _angles_of(leaves[0].level, [*sources[1:], sources[0]], None) if is_numeric else NOTHING
+        )
 
 
 def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
@@ -480,7 +482,7 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
             inner = descend(node.node, path[nth:])
             return None if inner is None else Narrowed(node.limit, inner)
         if isinstance(node, Listing | Items) and segment.isascii() and segment.isdecimal():
-            node = _picked(node, int(segment[:10]))
+            node = _element_at(node, int(segment[:10]))
         elif isinstance(node, Listing):
             inner = descend(node.element, path[nth:])
             return None if inner is None else Listing(node.level, inner)
@@ -558,12 +560,12 @@ def _step(spot: Spot, segment: str) -> Iterator[Spot]:
             if child is not None:
                 yield Spot(child, limits)
         elif isinstance(node, Listing | Items) and _INDEX.fullmatch(segment):
-            yield Spot(_picked(node, int(segment)), limits)
+            yield Spot(_element_at(node, int(segment)), limits)
         elif isinstance(node, Listing):
             yield from _step(Spot(node.element, limits), segment)
 
 
-def _picked(node: Listing | Items, index: int) -> Node:
+def _element_at(node: Listing | Items, index: int) -> Node:
     if isinstance(node, Listing):
         return Narrowed(Pick(node.level, index), node.element)
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
@@ -588,7 +590,7 @@ def _quaternion_as_xyzw(node: Node) -> Node:
 
 
 def _real(level: Level, source: str) -> Leaf:
-    return Leaf(level, (source,), Kind.REAL, Made.REAL)
+    return Leaf(level, (source,), Kind.REAL, Conversion.REAL)
 
 
 def _vector(level: Level, sources: Sequence[str]) -> Group:
@@ -596,7 +598,7 @@ def _vector(level: Level, sources: Sequence[str]) -> Group:
 
 
 def _angles_of(level: Level, sources: Sequence[str], message: Message | None) -> Group:
-    angles = (Made.ROLL, Made.PITCH, Made.YAW)
+    angles = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
     return Group(
         {
             name: Leaf(level, tuple(sources), Kind.REAL, angle)

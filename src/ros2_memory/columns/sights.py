@@ -103,27 +103,28 @@ def joined(
     slices = unpacked.with_slices_numbered(epoch)
     spot_order = _order(spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL])
     look_order = _order(looks[:, Look.SLICE], looks[:, Look.TOPIC])
-    spot_at, look_at = _places_of(spot_order), np.append(_places_of(look_order), [-1])
-    for at in (_HITS, _SCORES, _BESIDE):
-        table = unpacked.tables[at]
-        table[:, 0] = spot_at[table[:, 0] + unpacked.begins(_SPOTS)[unpacked.part[at]]]
-    look = hits[:, Hit.LOOK] + unpacked.begins(_LOOKS)[unpacked.part[_HITS]]
-    hits[:, Hit.LOOK] = look_at[np.where(hits[:, Hit.LOOK] < 0, -1, look)]
-    # Where a stretch of the clock ends, both that it parts have the fix.
+    unpacked.renumber_references(_places_of(spot_order), _places_of(look_order))
     session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
-    session = session[unpacked.part[_FIXES]]
-    order = np.lexsort((*fixes.T[::-1], session))
-    fixes, session = fixes[order], session[order]
-    is_other = np.ones(len(fixes), np.bool_)
-    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
     tables = (
         spots[spot_order],
         looks[look_order],
         *(table[_order(table[:, 0], table[:, 1])] for table in (hits, scores, beside)),
         unplaced[_order(unplaced[:, 0], unplaced[:, 1], unplaced[:, 2])],
-        fixes[is_other],
+        _distinct_fixes(fixes, session[unpacked.part[_FIXES]]),
     )
     return Sights(topics, labels, tables, len(slices)), slices[:, 1]
+
+
+def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
+    """Returns the fixes of each session in order of time, each once.
+
+    Where a stretch of the clock ends, both that it parts have the fix.
+    """
+    order = np.lexsort((*fixes.T[::-1], session))
+    fixes, session = fixes[order], session[order]
+    is_other = np.ones(len(fixes), np.bool_)
+    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
+    return fixes[is_other]
 
 
 class _Unpacked:
@@ -160,6 +161,21 @@ class _Unpacked:
         self.tables = [
             _table(at, planes.pop(0), part, first[part]) for at, part in enumerate(self.part)
         ]
+
+    def renumber_references(self, spots: Ints, looks: Ints) -> None:
+        """Changes numbers of spots and looks inside their part into their places in the whole.
+
+        Args:
+            spots: the place of each spot of all parts.
+            looks: likewise; a hit without a look keeps -1.
+        """
+        for number in (_HITS, _SCORES, _BESIDE):
+            table = self.tables[number]
+            table[:, 0] = spots[table[:, 0] + self.begins(_SPOTS)[self.part[number]]]
+        hits = self.tables[_HITS]
+        look = hits[:, Hit.LOOK] + self.begins(_LOOKS)[self.part[_HITS]]
+        look = np.where(hits[:, Hit.LOOK] < 0, -1, look)
+        hits[:, Hit.LOOK] = np.append(looks, [-1])[look]
 
     def begins(self, at: int) -> Ints:
         """Returns where the rows of each part begin in a table."""

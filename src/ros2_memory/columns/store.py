@@ -317,7 +317,7 @@ class ColumnStore(Database):
             return [
                 PartHead(
                     self.offset + number,
-                    self.offset + of_topic,
+                    self.offset + topic_number,
                     first,
                     last,
                     numbers,
@@ -325,9 +325,16 @@ class ColumnStore(Database):
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for (number, of_topic, first, last, _, messages, dropped, whole), numbers in zip(
-                    rows, bags_of_parts, strict=True
-                )
+                for (
+                    number,
+                    topic_number,
+                    first,
+                    last,
+                    _,
+                    messages,
+                    dropped,
+                    whole,
+                ), numbers in zip(rows, bags_of_parts, strict=True)
             ]
 
         return self.read(ask, [])
@@ -401,7 +408,7 @@ class ColumnStore(Database):
         )
         since = max(key.start - also_before, MIN_NS)
         return [
-            (key._replace(start=start, parts=self._parts(parts)), data)
+            (key._replace(start=start, parts=self._numbers_of(parts)), data)
             for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
             if start < key.start or parts == key_parts
         ]
@@ -432,7 +439,7 @@ class ColumnStore(Database):
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])
 
-    def _parts(self, ids: str) -> tuple[int, ...]:
+    def _numbers_of(self, ids: str) -> tuple[int, ...]:
         return tuple(number + self.offset for number in json.loads(ids))
 
     # Writing
@@ -446,30 +453,9 @@ class ColumnStore(Database):
 
         def write(connection: sqlite3.Connection) -> None:
             for key, data in fragments:
-                if not all(map(self.is_current, key.parts)):
-                    continue
-                parts = self._ids(key.parts)
-                stored = connection.execute(
-                    "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
-                    " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
-                    " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
-                    " ON CONFLICT DO UPDATE SET data = excluded.data"
-                    " WHERE data <> excluded.data RETURNING id",
-                    (kind, key.settings, key.start, parts, data),
-                ).fetchall()
-                for (number,) in stored:
-                    # What followed before there were all of these parts is not asked for again.
-                    older = connection.execute(
-                        "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
-                        " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
-                        " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
-                        (kind, key.settings, key.start, number, parts),
-                    ).fetchall()
-                    connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
-                    connection.execute(
-                        "INSERT OR IGNORE INTO fragment_part SELECT value, ? FROM json_each(?)",
-                        (number, parts),
-                    )
+                if all(map(self.is_current, key.parts)):
+                    identity = (kind, key.settings, key.start)
+                    _insert_fragment(connection, identity, self._ids(key.parts), data)
 
         return self.write(write)
 
@@ -577,7 +563,7 @@ class ColumnStore(Database):
 
         def write(connection: sqlite3.Connection) -> None:
             usual = bytes_of_topics(connection)
-            stored, taken = _merged_bytes(connection)
+            stored, taken = _query_merged_bytes(connection)
             for parts, at_least in shares:
                 if all(map(self.is_current, parts)):
                     numbers = [part - self.offset for part in parts]
@@ -592,7 +578,7 @@ class ColumnStore(Database):
 
     def merged_bytes(self) -> tuple[int, int]:
         """Returns the bytes of the bags that are in whole parts, and those of their columns."""
-        return self.read(_merged_bytes, (0, 0))
+        return self.read(_query_merged_bytes, (0, 0))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""
@@ -607,7 +593,41 @@ class ColumnStore(Database):
         return self.read(ask, 0)
 
 
-def _merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
+def _insert_fragment(
+    connection: sqlite3.Connection, identity: tuple[str, str, Ns], parts: str, data: bytes
+) -> None:
+    """Stores a fragment if all of its parts are stored, in place of others of some of them.
+
+    Args:
+        connection: to the store.
+        identity: the fragment's kind, settings and start.
+        parts: the numbers of its parts in the file, as JSON.
+        data: of the fragment.
+    """
+    inserted = connection.execute(
+        "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
+        " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
+        " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
+        " ON CONFLICT DO UPDATE SET data = excluded.data"
+        " WHERE data <> excluded.data RETURNING id",
+        (*identity, parts, data),
+    ).fetchall()
+    for (number,) in inserted:
+        # What followed before there were all of these parts is not asked for again.
+        older = connection.execute(
+            "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
+            " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
+            " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
+            (*identity, number, parts),
+        ).fetchall()
+        connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
+        connection.execute(
+            "INSERT OR IGNORE INTO fragment_part SELECT value, ? FROM json_each(?)",
+            (number, parts),
+        )
+
+
+def _query_merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
     [bags] = connection.execute(
         f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
     ).fetchone()

@@ -206,7 +206,7 @@ class Elements:
         taken = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
         return Elements(
             np.repeat(np.arange(positions.size), counts),
-            {path: _rows(column, taken) for path, column in self.columns.items()},
+            {path: _taken(column, taken) for path, column in self.columns.items()},
             {path: inner.rows(taken) for path, inner in self.elements.items()},
         )
 
@@ -277,7 +277,7 @@ class Table:
             log_times=self.log_times[positions],
             publish_times=self.publish_times[positions],
             places=self.places[positions],
-            columns={path: _rows(column, positions) for path, column in self.columns.items()},
+            columns={path: _taken(column, positions) for path, column in self.columns.items()},
             elements={path: inner.rows(positions) for path, inner in self.elements.items()},
             payload_hashes=None if hashes is None else hashes[positions],
         )
@@ -295,11 +295,11 @@ class Table:
 
 def order_of(log_times: IntArray, places: IntArray) -> IntArray | None:
     """Returns the positions by log time, ties by place; None if that is the order already."""
-    later = log_times[1:] > log_times[:-1]
-    if later.all():
+    is_later = log_times[1:] > log_times[:-1]
+    if is_later.all():
         return None
-    tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
-    return None if (later | tied).all() else np.lexsort((places, log_times))
+    is_tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
+    return None if (is_later | is_tied).all() else np.lexsort((places, log_times))
 
 
 def joined(tables: Sequence[Table]) -> Table:
@@ -326,7 +326,7 @@ def joined(tables: Sequence[Table]) -> Table:
     ).sorted()
 
 
-def _rows(column: Column, positions: IntArray) -> Column:
+def _taken(column: Column, positions: IntArray) -> Column:
     return column.rows(positions) if isinstance(column, Texts) else column[positions]
 
 

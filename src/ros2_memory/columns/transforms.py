@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.steps import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
 from ros2_memory.core.model import StampedTransform, Transform
@@ -28,7 +28,7 @@ _TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
 _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
 
 
-class _Names(NamedTuple):
+class _CodedPairs(NamedTuple):
     """The edges of the transforms of a table: `pairs[codes]`; -1 where there is none."""
 
     pairs: list[Pair]
@@ -45,14 +45,14 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
         times: log times (ns) of the rows.
         index: the positions of the rows, ascending; None: all.
     """
-    transforms = _elements(table)
+    transforms = _transforms_of(table)
     if transforms is None:
         return None
     if index is not None:
         transforms = transforms.rows(index)
-    pairs, codes = _names(transforms)
-    translation = _numbers(transforms, _TRANSLATION, METRES)
-    rotation = _numbers(transforms, _ROTATION, QUATERNION)
+    pairs, codes = _coded_pairs(transforms)
+    translation = _rounded_rows(transforms, _TRANSLATION, METRES)
+    rotation = _rounded_rows(transforms, _ROTATION, QUATERNION)
     stamps = np.asarray(transforms.columns[_STAMP], np.int64)
     # tf2 refuses what is not finite, and rotations that are not unit quaternions.
     is_valid = (codes >= 0) & np.isfinite(translation).all(axis=1)
@@ -73,7 +73,7 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
 
     From their names alone, where no number is invalid. None where only the messages have them.
     """
-    transforms = _elements(table)
+    transforms = _transforms_of(table)
     if transforms is None:
         return None
     if index is not None:
@@ -83,7 +83,7 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
     if any(zone is None or zone.nulls or math.isinf(zone.high - zone.low) for zone in zones):
         edges = edges_in(table, np.zeros(len(table), np.int64))
         return None if edges is None else frozenset(edges)
-    pairs, _ = _names(transforms)
+    pairs, _ = _coded_pairs(transforms)
     return frozenset(pairs)
 
 
@@ -122,7 +122,9 @@ class Statics:
         return 200 + 600 * len(self.transforms)
 
 
-STATICS: Final[Kind[Statics]] = Kind("statics", (Statics, StampedTransform, Transform))
+STATICS: Final[FragmentKind[Statics]] = FragmentKind(
+    "statics", (Statics, StampedTransform, Transform)
+)
 """The static transforms of a part, exact."""
 
 
@@ -133,7 +135,7 @@ def stamped_between(
 
     None where only the messages have them.
     """
-    transforms = _elements(table)
+    transforms = _transforms_of(table)
     if transforms is None:
         return None
     stamps = np.asarray(transforms.columns[_STAMP], np.int64)
@@ -141,7 +143,7 @@ def stamped_between(
     return rows if index is None else np.flatnonzero(np.isin(index, rows))
 
 
-def _elements(table: Table) -> Elements | None:
+def _transforms_of(table: Table) -> Elements | None:
     """Returns the transforms of a table, with all columns that they need; None without."""
     transforms = table.elements.get(_LIST)
     if transforms is None or any(not path or path.startswith(_LIST) for path in table.left_out):
@@ -151,11 +153,11 @@ def _elements(table: Table) -> Elements | None:
     return transforms if needed <= held else None
 
 
-def _names(transforms: Elements) -> _Names:
+def _coded_pairs(transforms: Elements) -> _CodedPairs:
     """Returns the edges that occur, in the order of their names."""
     parents, children = transforms.columns[_PARENT], transforms.columns[_CHILD]
     if not isinstance(parents, Texts) or not isinstance(children, Texts):
-        return _Names([], np.full(len(transforms), -1))
+        return _CodedPairs([], np.full(len(transforms), -1))
     several = max(len(children.words), 1)
     used, codes = np.unique(
         parents.codes.astype(np.int64) * several + children.codes, return_inverse=True
@@ -169,10 +171,10 @@ def _names(transforms: Elements) -> _Names:
         if is_edge and (parent, child) not in pairs:
             pairs.append((parent, child))
         numbers.append(pairs.index((parent, child)) if is_edge else -1)
-    return _Names(pairs, np.array(numbers, np.int64)[codes])
+    return _CodedPairs(pairs, np.array(numbers, np.int64)[codes])
 
 
-def _numbers(transforms: Elements, paths: tuple[str, ...], step: Step) -> Floats:
+def _rounded_rows(transforms: Elements, paths: tuple[str, ...], step: Step) -> Floats:
     columns = [np.asarray(transforms.columns[path], np.float64) for path in paths]
     rounded: Floats = np.rint(np.stack(columns, axis=1) * step.per_unit) / step.per_unit
     return rounded

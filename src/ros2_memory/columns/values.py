@@ -52,7 +52,7 @@ class Kind(Enum):
     TEXT = auto()
 
 
-class Made(Enum):
+class Conversion(Enum):
     """How a leaf comes out of its sources."""
 
     STORED = auto()  # the column itself
@@ -66,7 +66,7 @@ class Made(Enum):
 
 Z = TypeVar("Z", Zone, Zones)
 
-_ANGLES: Final = {Made.ROLL: 0, Made.PITCH: 1, Made.YAW: 2}
+_ANGLES: Final = {Conversion.ROLL: 0, Conversion.PITCH: 1, Conversion.YAW: 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +99,7 @@ class Leaf:
         level: where it lies.
         sources: dot-paths in that level of what it is made of.
         kind: what it is.
-        made: how.
+        conversion: how its value comes out of the sources.
         constant: its value, where that is the same everywhere.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
@@ -108,17 +108,21 @@ class Leaf:
     level: Level
     sources: tuple[str, ...]
     kind: Kind
-    made: Made = Made.STORED
+    conversion: Conversion = Conversion.STORED
     constant: int = 0
     json_depth: int = 0
 
     @property
     def is_of_array(self) -> bool:
         """Whether it is an element of an array of numbers, which a table may hold in part."""
-        return self.sources == ("",) and self.made is Made.STORED and self.kind is not Kind.TEXT
+        return (
+            self.sources == ("",)
+            and self.conversion is Conversion.STORED
+            and self.kind is not Kind.TEXT
+        )
 
 
-class Numbers(NamedTuple):
+class LeafNumbers(NamedTuple):
     """The numbers or booleans of a leaf; null is NaN.
 
     Attributes:
@@ -200,22 +204,24 @@ class Values:
         column = self.column(level, path)
         return None if column is None or isinstance(column, Texts) else cast("Numeric", column)
 
-    def numbers(self, leaf: Leaf) -> Numbers | None:
+    def numbers(self, leaf: Leaf) -> LeafNumbers | None:
         """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
-        if leaf.made is Made.CONSTANT:
+        if leaf.conversion is Conversion.CONSTANT:
             size = self.size(leaf.level)
-            return None if size is None else Numbers(np.full(size, float(leaf.constant)))
+            return None if size is None else LeafNumbers(np.full(size, float(leaf.constant)))
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
         held = [column for column in columns if column is not None]
         return self._numbers_of(leaf, held) if len(held) == len(columns) else None
 
-    def _numbers_of(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
-        if leaf.made in _ANGLES:
+    def _numbers_of(self, leaf: Leaf, columns: Sequence[Numeric]) -> LeafNumbers:
+        if leaf.conversion in _ANGLES:
             return self._angle(leaf, columns)
         first, error = columns[0], self.error(leaf)
-        if leaf.made is Made.SECONDS:
-            return Numbers(seconds(first), error / NS_PER_S)
-        return Numbers(first.astype(np.float64) if leaf.made is Made.REAL else first, error)
+        if leaf.conversion is Conversion.SECONDS:
+            return LeafNumbers(seconds(first), error / NS_PER_S)
+        return LeafNumbers(
+            first.astype(np.float64) if leaf.conversion is Conversion.REAL else first, error
+        )
 
     def holds_all(self, leaf: Leaf) -> bool:
         """Returns whether no array that a leaf is an element of is too long to be held."""
@@ -232,17 +238,17 @@ class Values:
         """Returns what is known of a leaf without reading it."""
         return zone_of(leaf, self.table.zone)
 
-    def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
+    def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
         key = (leaf.level, leaf.sources)
         x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
         if key not in self._angles:
             self._angles[key] = _euler(x, y, z, w)
         *angles, length, cosine = self._angles[key]
-        which = _ANGLES[leaf.made]
+        which = _ANGLES[leaf.conversion]
         error = self.error(leaf)
         if error:
-            return Numbers(angles[which], _angle_error(error, length, cosine, angles[which]))
+            return LeafNumbers(angles[which], _angle_error(error, length, cosine, angles[which]))
 
         def exactly(positions: Ints) -> Floats:
             angle_of: dict[tuple[float, float, float, float], float] = {}
@@ -257,7 +263,7 @@ class Values:
 
         # Zero is zero everywhere, and a robot in the plane has nothing else.
         off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
-        return Numbers(angles[which], off, exactly)
+        return LeafNumbers(angles[which], off, exactly)
 
 
 def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
@@ -267,16 +273,16 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
         leaf: the leaf.
         zone: returns the zone of a column of a table, or its zones in some parts, by its path.
     """
-    if leaf.made is Made.CONSTANT:
+    if leaf.conversion is Conversion.CONSTANT:
         return Zone(leaf.constant, leaf.constant, 0)
-    if leaf.made in _ANGLES:
-        most = 90.0 if leaf.made is Made.PITCH else 180.0
+    if leaf.conversion in _ANGLES:
+        most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
     source_zone = zone(leaf.level.full(leaf.sources[0]))
     if source_zone is not None and leaf.is_of_array and leaf.level.parent is not None:
         lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
         return None if lengths is None else _with_long_arrays(source_zone, lengths)
-    if source_zone is None or leaf.made is not Made.SECONDS:
+    if source_zone is None or leaf.conversion is not Conversion.SECONDS:
         return source_zone
     return source_zone.divided(NS_PER_S)
 
@@ -317,13 +323,13 @@ def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
             for whole, part in zip((x, y, z, w), parts, strict=True)
         )
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
-        locked = np.abs(sine) > GIMBAL_LOCK_SINE
+        is_locked = np.abs(sine) > GIMBAL_LOCK_SINE
         both = 2 * np.arctan2(z, w)
         both -= math.tau * np.rint(both / math.tau)
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        roll = np.where(locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
-        yaw = np.where(locked, both, yaw)
+        roll = np.where(is_locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
+        yaw = np.where(is_locked, both, yaw)
         degrees = [np.degrees(angle) for angle in (roll, np.arcsin(sine), yaw)]
         return (*degrees, length * largest, np.sqrt(1 - sine * sine))
 

@@ -50,7 +50,7 @@ class NotWalkedError(Exception):
 
 
 @dataclass(slots=True)
-class Level:
+class LevelColumns:
     """The columns of messages, or of the elements of one sequence, while they are read."""
 
     columns: dict[str, Column] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Level:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def walked(plan: Plan, batch: Batch) -> Level:
+def walked(plan: Plan, batch: Batch) -> LevelColumns:
     """Returns the columns of a batch.
 
     Raises:
@@ -73,7 +73,7 @@ def walked(plan: Plan, batch: Batch) -> Level:
     try:
         if (gathered(batch.buffer, _UINT16, batch.starts) != _LITTLE_ENDIAN).any():
             raise NotWalkedError
-        level = Level(left_out=dict(plan.left_out))
+        level = LevelColumns(left_out=dict(plan.left_out))
         rows = _Bodies(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
     except (IndexError, UnicodeDecodeError) as error:
@@ -108,7 +108,7 @@ def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
 class _Walk:
     buffer: bytes
 
-    def read(self, plan: Plan, rows: _Bodies, at: IntArray, level: Level | None) -> IntArray:
+    def read(self, plan: Plan, rows: _Bodies, at: IntArray, level: LevelColumns | None) -> IntArray:
         """Goes through messages that begin at these positions; returns where they end.
 
         Args:
@@ -131,7 +131,7 @@ class _Walk:
                 at = self._read_sequence(step, rows, at, level)
         return at
 
-    def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
+    def _read_run(self, run: Run, places: IntArray, level: LevelColumns) -> None:
         columns = level.columns
         block = gathered(self.buffer, run.dtype, places)
         for nth, entry in enumerate(run.fields):
@@ -148,7 +148,9 @@ class _Walk:
     def _length(self, rows: _Bodies, at: IntArray) -> IntArray:
         return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64)
 
-    def _read_text(self, text: Text, rows: _Bodies, at: IntArray, level: Level | None) -> IntArray:
+    def _read_text(
+        self, text: Text, rows: _Bodies, at: IntArray, level: LevelColumns | None
+    ) -> IntArray:
         at = _aligned(at, text.align, text.skip)
         sizes = self._length(rows, at)
         at = at + 4
@@ -178,7 +180,7 @@ class _Walk:
         return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in code_of]))
 
     def _read_numbers(
-        self, step: NumberSequence, rows: _Bodies, at: IntArray, level: Level | None
+        self, step: NumberSequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
         at = _aligned(at, step.align, step.skip)
         counts = self._length(rows, at)
@@ -195,9 +197,9 @@ class _Walk:
 
     def _values(self, step: NumberSequence, places: IntArray, counts: IntArray) -> Numbers:
         """Returns the numbers of sequences, but of those that take too long to look at."""
-        short = counts * step.size <= MAX_RANGED_BYTES
-        if not short.all():
-            places, counts = places[short], counts[short]
+        is_short = counts * step.size <= MAX_RANGED_BYTES
+        if not is_short.all():
+            places, counts = places[is_short], counts[is_short]
         if not counts.size:
             return np.zeros(0, step.dtype)
         count = int(counts[0])
@@ -209,7 +211,7 @@ class _Walk:
         )
 
     def _read_sequence(
-        self, step: Sequence, rows: _Bodies, at: IntArray, level: Level | None
+        self, step: Sequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
         if step.length == SEQUENCE:
             at = _aligned(at, step.align, step.skip)
@@ -227,7 +229,7 @@ class _Walk:
         if (end > rows.sizes).any():
             raise NotWalkedError
         if level is not None:
-            inner = Level()
+            inner = LevelColumns()
             self.read(step.plan, rows.of(owners), begins, inner)
             level.elements[step.path] = Elements(owners, inner.columns, inner.elements)
             level.left_out |= {f"{step.path}.{path}": why for path, why in inner.left_out.items()}
@@ -278,7 +280,7 @@ def within(counts: IntArray) -> IntArray:
 
 
 def add_sequence(
-    level: Level, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
+    level: LevelColumns, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
 ) -> None:
     """Adds what is kept of a sequence of numbers.
 
@@ -291,14 +293,14 @@ def add_sequence(
     """
     if is_bool:
         values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
-    ranged = counts * values.itemsize <= MAX_RANGED_BYTES
-    add_ranges(level.columns, path, counts, np.where(ranged, counts, 0), values)
-    few = counts <= MAX_NUMBERS
-    kept = np.repeat(few[ranged], counts[ranged])
-    numbers = values if kept.all() else values[kept]
-    owners = np.repeat(np.arange(counts.size), np.where(few, counts, 0))
+    is_ranged = counts * values.itemsize <= MAX_RANGED_BYTES
+    add_ranges(level.columns, path, counts, np.where(is_ranged, counts, 0), values)
+    is_short = counts <= MAX_NUMBERS
+    is_held = np.repeat(is_short[is_ranged], counts[is_ranged])
+    numbers = values if is_held.all() else values[is_held]
+    owners = np.repeat(np.arange(counts.size), np.where(is_short, counts, 0))
     level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
-    if not few.all():
+    if not is_short.all():
         level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
 
 
@@ -322,13 +324,13 @@ def add_ranges(
     Those are NaN where there is none; `counts` of the `values` are of each.
     """
     columns[f"{path}.length"] = lengths.astype(np.uint32)
-    filled = counts > 0
-    begins = (np.cumsum(counts) - counts)[filled]
-    finite = np.isfinite(values)
+    has_values = counts > 0
+    begins = (np.cumsum(counts) - counts)[has_values]
+    is_finite = np.isfinite(values)
     for end, ufunc, none in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
         extremes = np.full(counts.size, np.nan)
         if values.size:
-            comparable = values if finite.all() else np.where(finite, values, none)
-            extremes[filled] = ufunc.reduceat(comparable, begins)
+            comparable = values if is_finite.all() else np.where(is_finite, values, none)
+            extremes[has_values] = ufunc.reduceat(comparable, begins)
             extremes[np.isinf(extremes)] = np.nan
         columns[f"{path}.{end}"] = extremes

@@ -10,7 +10,7 @@ import numpy as np
 from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import UnknownShapeError, children, shape_of
 from ros2_memory.columns.table import Table, Texts
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
 
 if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
@@ -32,7 +32,11 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
             [(name, node)] = children(node)
     except (UnknownShapeError, ValueError):  # more than one part
         return None
-    if not isinstance(node, Leaf) or node.level is not ROWS or node.made is not Made.STORED:
+    if (
+        not isinstance(node, Leaf)
+        or node.level is not ROWS
+        or node.conversion is not Conversion.STORED
+    ):
         return None
     values = Values(table)
     if node.kind is Kind.TEXT:

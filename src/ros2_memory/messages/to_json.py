@@ -157,12 +157,12 @@ class _Shape(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def _shape_of(cls: type) -> _Shape | None:
+def _shape_of_class(cls: type) -> _Shape | None:
     table = field_table_of_class(cls)
-    return None if table is None else _shape(kind_of_class(cls), table)
+    return None if table is None else _shape_of_table(kind_of_class(cls), table)
 
 
-def _shape(kind: ValueKind, table: FieldTable) -> _Shape:
+def _shape_of_table(kind: ValueKind, table: FieldTable) -> _Shape:
     summaries = summaries_of(table)
     rows = ((name, attribute, summaries.get(name)) for name, attribute in table.attributes.items())
     return _Shape(kind, tuple(rows))
@@ -205,7 +205,7 @@ class ExactJson:
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         cls: type = type(node)
-        shape = _shape_of(cls)
+        shape = _shape_of_class(cls)
         if shape is not None:
             return self._message(node, shape, path, depth)
         if isinstance(node, np.ndarray):
@@ -225,7 +225,7 @@ class ExactJson:
         table = field_table_of(node)
         if table is None:
             return self._text(f"<{type(node).__name__}>", path)
-        return self._message(node, _shape(ValueKind.PLAIN, table), path, depth)
+        return self._message(node, _shape_of_table(ValueKind.PLAIN, table), path, depth)
 
     def _message(self, node: object, shape: _Shape, path: str, depth: int) -> JsonValue:
         kind = shape.kind

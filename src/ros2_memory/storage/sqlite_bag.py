@@ -162,7 +162,7 @@ class SqliteBags:
         with self._opened(path) as (base, topics):
             stored: list[tuple[int, int, int, int, int, int]]
             stored = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
-            right = self._is_indexed_right(base, topics)
+            is_right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
         if any(undecodable for *_, undecodable, _ in stored):
@@ -177,7 +177,7 @@ class SqliteBags:
         impossible = sum(count for _, count, _, _, _, is_impossible in stored if is_impossible)
         counts = sum(count for _, count, *_ in stored)
         orphans = counts - impossible - sum(total.messages for total in totals)
-        notes = [] if right else [_WRONG_INDEX]
+        notes = [] if is_right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
         if impossible:
@@ -206,11 +206,11 @@ class SqliteBags:
             return
         with self._opened(path) as (base, declared):
             wanted = declared.named(topics)
-            right = self._is_indexed_right(base, declared)
-            if not right:
+            is_right = self._is_indexed_right(base, declared)
+            if not is_right:
                 yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
             for time, row, number in _ordered_rows(
-                base, wanted, window, newest_first=newest_first, indexed=right
+                base, wanted, window, newest_first=newest_first, indexed=is_right
             ):
                 yield self._record(base, wanted, time, row, number)
 
@@ -244,17 +244,17 @@ class SqliteBags:
 
     def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:
         """Returns whether the indexes of a file agree with its table; compares them once."""
-        right = self._proven.get(topics.key)
-        if right is None:
+        is_right = self._proven.get(topics.key)
+        if is_right is None:
             ordered = partial(_ordered_rows, base, topics.channels, TimeWindow.everything())
             try:
                 both = zip_longest(ordered(indexed=True), ordered(indexed=False))
-                right = all(starmap(eq, both))
+                is_right = all(starmap(eq, both))
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
-                right = False
-            self._proven.put(topics.key, right, _PROOF_BYTES)
-        return right
+                is_right = False
+            self._proven.put(topics.key, is_right, _PROOF_BYTES)
+        return is_right
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -275,12 +275,12 @@ class SqliteBags:
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)
-                topics = _Topics(key, self._channels(base))
+                topics = _Topics(key, self._read_channels(base))
                 size = 1000 + sum(300 + c.memory_bytes for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
 
-    def _channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
+    def _read_channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
         have = _columns(base, "topics")
         if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")

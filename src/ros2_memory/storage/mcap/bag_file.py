@@ -640,8 +640,8 @@ def _describes(believed: Chunk | None, chunk: Chunk) -> bool:
     """Returns whether an index had all times and channels of a chunk."""
     if believed is None:
         return False
-    within = believed.start <= chunk.start and chunk.end <= believed.end
-    return within and chunk.channels <= believed.channels
+    is_within = believed.start <= chunk.start and chunk.end <= believed.end
+    return is_within and chunk.channels <= believed.channels
 
 
 def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
@@ -688,9 +688,10 @@ def _fetch_loose(
 
     def fetch(place: int, time: Ns) -> Record:
         head = MESSAGE.unpack(file.read(place, MESSAGE.size))
-        channel = _channel(channels, head[2])
-        payload = file.read(place + MESSAGE.size, head[1] + RECORD.size - MESSAGE.size)
-        return _record(channel, time, head[5], payload, uncompressed)
+        _, length, number, _, _, published = head
+        channel = _channel(channels, number)
+        payload = file.read(place + MESSAGE.size, length + RECORD.size - MESSAGE.size)
+        return _record(channel, time, published, payload, uncompressed)
 
     return fetch
 

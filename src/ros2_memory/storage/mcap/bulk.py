@@ -156,6 +156,16 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
+def _require_as_indexed(pairs: Pairs, heads: np.ndarray[tuple[int], np.dtype[np.void]]) -> None:
+    """Compares the heads of message records with what the indexes say of them."""
+    if (
+        (heads["opcode"] != _MESSAGE_OPCODE).any()
+        or (heads["channel"] != pairs.channels).any()
+        or (heads["log_time"] != pairs.times).any()
+    ):
+        raise UnreadableError(NOT_THERE)
+
+
 def batches_of(
     content: ReadChunks,
     pairs: Pairs,
@@ -191,13 +201,8 @@ def batches_of(
         raise UnreadableError(NOT_THERE)
     heads = gathered(buffer, _MESSAGE, at)
     stops = at + RECORD.size + heads["length"]
-    if (
-        (heads["opcode"] != _MESSAGE_OPCODE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
-        or (stops > end).any()
-        or (stops < at + MESSAGE.size).any()
-    ):
+    _require_as_indexed(pairs, heads)
+    if (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
     in_file = np.sort(at)
     if (in_file[1:] == in_file[:-1]).any():
@@ -233,14 +238,14 @@ def batches_of(
 def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
     """Returns the positions of the messages inside a window, channel by channel."""
     order: IntArray = np.argsort(pairs.channels, kind="stable")
-    inside = (pairs.times >= window.start) & (pairs.times < window.stop)
-    return order if inside.all() else order[inside[order]]
+    is_inside = (pairs.times >= window.start) & (pairs.times < window.stop)
+    return order if is_inside.all() else order[is_inside[order]]
 
 
 def _published(stated: IntArray, logged: IntArray) -> IntArray:
     # An unsigned time past the signed range has become negative.
-    impossible = (stated < 0) | (stated == MAX_NS)
-    return np.where(impossible, logged, stated) if impossible.any() else stated
+    is_impossible = (stated < 0) | (stated == MAX_NS)
+    return np.where(is_impossible, logged, stated) if is_impossible.any() else stated
 
 
 def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
@@ -295,7 +300,7 @@ def bare_batches(
             pairs.offsets[order] + steps,
         )
         for number in np.unique(numbers).tolist():
-            rows = numbers == number
-            none = np.zeros(int(rows.sum()), np.int64)
-            logged = times[rows]
-            yield Batch(channels[number], logged, logged, places[rows], b"", none, none)
+            is_of_channel = numbers == number
+            none = np.zeros(int(is_of_channel.sum()), np.int64)
+            logged = times[is_of_channel]
+            yield Batch(channels[number], logged, logged, places[is_of_channel], b"", none, none)

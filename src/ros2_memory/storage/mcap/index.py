@@ -12,7 +12,7 @@ import struct
 import zlib
 from functools import lru_cache
 from itertools import pairwise
-from operator import itemgetter, le
+from operator import attrgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -299,17 +299,17 @@ class Contents:
             total = self.totals.get(number)
             if total is not None:
                 self.back = max(self.back, total.last - first)
-            self._add(number, Extent(count, first, last))
+            self._count(number, Extent(count, first, last))
         return starts, ends
 
     def join(self, other: Contents) -> None:
         """Adds other messages of the file, whose order relative to these is unknown."""
         for number, extent in other.totals.items():
-            self._add(number, extent)
+            self._count(number, extent)
         self.back = max(self.back, other.back)
         self._held += other._held
 
-    def _add(self, number: int, extent: Extent) -> None:
+    def _count(self, number: int, extent: Extent) -> None:
         total = self.totals.setdefault(number, extent)
         if total is not extent:
             total.count += extent.count
@@ -370,7 +370,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         UnreadableError: a message index is not what the summary section says.
     """
     try:
-        index, stated = _index_from_summary(file)
+        index, stated = _index_without_totals(file)
     except (DoubtError, OSError):
         raise
     except Exception as error:
@@ -395,7 +395,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     )
 
 
-def _index_from_summary(file: OpenFile) -> tuple[McapIndex, Statistics]:
+def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
     """Returns the index without what its messages amount to, and what the file states of that."""
     start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
@@ -427,14 +427,16 @@ def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]
         DoubtError: a chunk is not where its index has it, or not of these times; or there is a
             chunk or a message that no index knows.
     """
-    ordered = sorted(chunks, key=itemgetter(0))
+    ordered = sorted(chunks, key=attrgetter("offset"))
     if ordered[-1].offset >= file.size:
         raise DoubtError(_OTHER_CHUNKS)
-    begins = [chunk[0] for chunk in ordered]
-    heads = [_stating(_CHUNK, chunk[1] - _HEAD_BYTES, chunk[2], chunk[3]) for chunk in ordered]
+    begins = [chunk.offset for chunk in ordered]
+    heads = [
+        _stating(_CHUNK, chunk.length - _HEAD_BYTES, chunk.start, chunk.end) for chunk in ordered
+    ]
     if file.read_each(begins, _STATED_BYTES) != heads:
         raise DoubtError(_OTHER_CHUNKS)
-    ends = [MAGIC_SIZE, *[chunk[0] + chunk[1] + chunk[6] for chunk in ordered]]
+    ends = [MAGIC_SIZE, *[chunk.offset + chunk.length + chunk.index_length for chunk in ordered]]
     begins.append(end)
     for at, following in zip(ends, begins, strict=True):
         if at != following:

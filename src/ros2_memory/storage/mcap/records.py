@@ -210,8 +210,8 @@ def is_finished(file: OpenFile) -> bool:
 
 
 def _ends_as_mcap(file: OpenFile) -> bool:
-    whole = file.size >= 2 * MAGIC_SIZE
-    return whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+    is_long_enough = file.size >= 2 * MAGIC_SIZE
+    return is_long_enough and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
 
 
 def starts_as_mcap(file: OpenFile) -> bool:

@@ -74,15 +74,15 @@ class Salvage:
         Raises:
             UnreadableError: the file is not MCAP, or ends within its magic.
         """
-        read_to, data_ended = MAGIC_SIZE, False
+        read_to, has_ended = MAGIC_SIZE, False
         for record in file_records(self._file):
-            data_ended = data_ended or record.opcode == Opcode.DATA_END
+            has_ended = has_ended or record.opcode == Opcode.DATA_END
             within = self._chunk if record.opcode == Opcode.CHUNK else self._whole
             yield from filter(None, starmap(decode_record, within(record)))
             read_to = min(record.end, self._file.size)
             if progress is not None:
                 progress(read_to)
-        if not data_ended:
+        if not has_ended:
             self.lost_bytes += self._file.size - read_to
 
     def _whole(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
@@ -90,10 +90,10 @@ class Salvage:
             return
         size = record.end - record.body_at
         if record.opcode == Opcode.MESSAGE:
-            readable = record.end - record.offset <= self._max_chunk_bytes
+            is_readable = record.end - record.offset <= self._max_chunk_bytes
         else:
-            readable = size <= MAX_SECTION_BYTES
-        if readable:
+            is_readable = size <= MAX_SECTION_BYTES
+        if is_readable:
             yield record.opcode, self._file.read(record.body_at, size)
         else:
             self.lost_bytes += size

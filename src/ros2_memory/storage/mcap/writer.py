@@ -134,11 +134,11 @@ class McapWriter(BagWriter):
         after = self._bags().summarize(target)
         if not after.complete or after.notes:
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
-        again = ContentDigest()
+        written = ContentDigest()
         with OpenFile(target) as file:
             for record in Salvage(file, self._max_chunk_mb << 20).records():
-                again.add(record)
-        if again.digests != digest.digests:
+                written.add(record)
+        if written.digests != digest.digests:
             raise UnreadableError("what was written is not what could be read")
         return after
 
