@@ -181,7 +181,7 @@ class _Kinds:
         return kind
 
     def read(self, batch: Batch) -> _Kind:
-        """Returns the kind of what was read: of large messages no more columns are made."""
+        """Returns how a batch is decoded: once messages are large, without columns from then on."""
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._read_bytes += len(batch.buffer)

@@ -30,7 +30,7 @@ from ros2_memory.columns.shown import (
 )
 from ros2_memory.columns.table import Table, Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
-from ros2_memory.columns.walk import within
+from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
 from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, Detection, detections_of
@@ -412,14 +412,8 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     )
     if not parsed.rows.size:
         return
-    counts = np.bincount(parsed.rows, minlength=len(texts.words))
-    with_any = np.flatnonzero(counts[texts.codes])
-    first, counts = (
-        np.searchsorted(parsed.rows, texts.codes[with_any]),
-        counts[texts.codes[with_any]],
-    )
-    positions = np.repeat(with_any, counts)
-    nth = np.repeat(first, counts) + within(counts)
+    counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
+    positions = np.repeat(np.arange(len(texts)), counts)
     _, rows = placed(values, source.leaf.level, positions, (), surely=True)
     outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
     yield Detections(

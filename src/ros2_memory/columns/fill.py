@@ -254,7 +254,7 @@ class Filling:
         return self.store.renew(self._key(bag), bag)
 
     def _read(self, bag: BagFile, pending: DecodedBags, *, hashed: bool) -> bool:
-        """Adds a bag to what was found; stores a long one, and returns whether it is stored."""
+        """Adds a bag to the pending ones, or stores a long one; returns whether it is stored."""
         if not self._may_be_stored(bag):
             return False
         try:

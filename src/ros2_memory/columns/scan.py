@@ -117,7 +117,7 @@ class Stretch(NamedTuple):
     parts: tuple[int, ...] | None
 
     def key(self, settings: str = "") -> FragmentKey | None:
-        """Returns what tells apart what follows from its rows; None where that may change."""
+        """Returns the key of fragments made of its rows; None where these rows may change."""
         return None if self.parts is None else FragmentKey(self.window.start, settings, self.parts)
 
 
@@ -509,10 +509,10 @@ class Scan:
         latched = np.repeat(
             [unit.table.channel.latched for unit in units], [unit_rows.size for unit_rows in rows]
         )
-        again = relatched_among(messages) & latched
+        is_relatched = relatched_among(messages) & latched
         begin = 0
         for unit, unit_rows in zip(units, rows, strict=True):
-            self._relatched[unit.key] = unit_rows[again[begin : begin + unit_rows.size]]
+            self._relatched[unit.key] = unit_rows[is_relatched[begin : begin + unit_rows.size]]
             begin += unit_rows.size
 
     @cached_property

@@ -572,7 +572,7 @@ def _element_at(node: Listing | Items, index: int) -> Node:
 
 
 def _with_changed_leaves(node: Node, change: Callable[[Node], Node]) -> Node:
-    """Returns a node with what it stands for changed: of a list its elements."""
+    """Returns a node with each value in it changed: of a list, its elements."""
     if isinstance(node, Listing):
         return Listing(node.level, _with_changed_leaves(node.element, change))
     if isinstance(node, Narrowed):

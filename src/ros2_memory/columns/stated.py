@@ -49,7 +49,7 @@ from ros2_memory.columns.shown import (
     placed,
 )
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
-from ros2_memory.columns.walk import within
+from ros2_memory.columns.walk import entries_of_codes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -287,21 +287,7 @@ def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
             for fact in _facts_of_entry(level, type_name, name.words[who], text.words[what])
         ]
     )
-    return _repeated(facts, distinct.shape[1], rows, codes.reshape(-1))
-
-
-def _repeated(facts: Facts, distinct: int, rows: Ints, codes: Ints) -> Facts:
-    """Returns the facts of the code of each row, one after another.
-
-    Args:
-        facts: by code.
-        distinct: how many codes there are.
-        rows: the rows.
-        codes: of the rows.
-    """
-    counts = np.bincount(facts.rows, minlength=distinct)
-    begins, counts = (np.cumsum(counts) - counts)[codes], counts[codes]
-    taken = np.repeat(begins, counts) + within(counts)
+    counts, taken = entries_of_codes(facts.rows, codes.reshape(-1))
     return Facts(np.repeat(rows, counts), facts.codes[taken], facts.values[taken], facts.words)
 
 
@@ -345,7 +331,7 @@ def _command_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]
 
 
 def _alike_goals(values: Values, leaves: Sequence[Leaf]) -> Ints:
-    """Numbers the rows by what they list, as far as columns tell: as the one before, or another.
+    """Returns a number for each row: that of the row before if both list the same goals.
 
     An action server lists a goal with the time at which it accepted it, so one goal does not take
     the place of another without a trace.

@@ -209,18 +209,11 @@ class ColumnStore(Database):
                 "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns"
                 " FROM bag WHERE size >= 0"
             )
-            return {
-                file: BagFile(
-                    file,
-                    size,
-                    mtime,
-                    BagState.CLOSED,
-                    BagSummary.decoded(schemas[schema], counts),
-                    *rest,
-                )
-                for path, size, mtime, schema, counts, *rest in rows
-                for file in [root + path]
-            }
+            bags: dict[str, BagFile] = {}
+            for path, size, mtime, schema, counts, *times in rows:
+                file, summary = root + path, BagSummary.decoded(schemas[schema], counts)
+                bags[file] = BagFile(file, size, mtime, BagState.CLOSED, summary, *times)
+            return bags
 
         return self.read(ask, {})
 

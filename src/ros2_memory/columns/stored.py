@@ -94,7 +94,7 @@ class StoredTable(Table):
         return None if packed is None else packed.zone
 
     def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
-        """Returns what is made of all rows, as of `Table`."""
+        """Returns what `make` makes of all rows, once for the part; see `Table.remember`."""
         if self.memory is None:
             return make()
         key = (self.number, f"={what}")

@@ -153,7 +153,7 @@ class Values:
         self.table = table
         self.rows = len(table.log_times)
         self.kept: dict[object, tuple[Mask, Mask]] = {}
-        self._angles: dict[tuple[Level, tuple[str, ...]], tuple[Floats, ...]] = {}
+        self._angles: dict[tuple[Level, tuple[str, ...]], _Turns] = {}
 
     def elements(self, level: Level) -> Elements | None:
         """Returns the elements of a sequence; None where the table does not hold them."""
@@ -244,11 +244,12 @@ class Values:
         x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
         if key not in self._angles:
             self._angles[key] = _euler(x, y, z, w)
-        *angles, length, cosine = self._angles[key]
+        turn = self._angles[key]
         which = _ANGLES[leaf.conversion]
+        angles = turn.degrees[which]
         error = self.error(leaf)
         if error:
-            return LeafNumbers(angles[which], _angle_error(error, length, cosine, angles[which]))
+            return LeafNumbers(angles, _angle_error(error, turn.length, turn.cosine, angles))
 
         def exactly(positions: Ints) -> Floats:
             angle_of: dict[tuple[float, float, float, float], float] = {}
@@ -262,8 +263,8 @@ class Values:
             return exact
 
         # Zero is zero everywhere, and a robot in the plane has nothing else.
-        off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
-        return LeafNumbers(angles[which], off, exactly)
+        off = np.where(angles == 0.0, 0.0, _ROUNDING_DEG)
+        return LeafNumbers(angles, off, exactly)
 
 
 def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
@@ -288,7 +289,7 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
 
 
 def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:
-    """Returns what is known of the numbers of all arrays, by that of those which are held."""
+    """Returns the zone of all arrays: without bounds where some are too long to be held."""
     are_long = lengths.reaches(MAX_NUMBERS, above=True)
     if isinstance(numbers, Zones):
         low = np.where(are_long, -math.inf, numbers.low)
@@ -306,11 +307,22 @@ def seconds(times: Numeric) -> Floats:
     return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
 
 
-def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
-    """Returns roll, pitch and yaw (degrees), the length, and the cosine of pitch.
+class _Turns(NamedTuple):
+    """Quaternions as angles.
 
-    As `conversions.unit` and `geometry.rpy` compute them.
+    Attributes:
+        degrees: roll, pitch and yaw.
+        length: of the quaternions.
+        cosine: of pitch.
     """
+
+    degrees: tuple[Floats, Floats, Floats]
+    length: Floats
+    cosine: Floats
+
+
+def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> _Turns:
+    """Returns quaternions as angles, as `conversions.unit` and `geometry.rpy` compute them."""
     with np.errstate(all="ignore"):
         squared = x * x + y * y + z * z + w * w
         largest = np.maximum.reduce([np.abs(part) for part in (x, y, z, w)])
@@ -324,14 +336,14 @@ def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
         )
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
         is_locked = np.abs(sine) > GIMBAL_LOCK_SINE
-        both = 2 * np.arctan2(z, w)
-        both -= math.tau * np.rint(both / math.tau)
+        at_lock = 2 * np.arctan2(z, w)
+        at_lock -= math.tau * np.rint(at_lock / math.tau)
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         roll = np.where(is_locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
-        yaw = np.where(is_locked, both, yaw)
-        degrees = [np.degrees(angle) for angle in (roll, np.arcsin(sine), yaw)]
-        return (*degrees, length * largest, np.sqrt(1 - sine * sine))
+        yaw = np.where(is_locked, at_lock, yaw)
+        degrees = np.degrees(roll), np.degrees(np.arcsin(sine)), np.degrees(yaw)
+        return _Turns(degrees, length * largest, np.sqrt(1 - sine * sine))
 
 
 def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -> Floats:

@@ -274,15 +274,27 @@ def _steady(
 
 
 def within(counts: IntArray) -> IntArray:
-    """Returns 0, 1, 2 .. for each count, one after the other."""
+    """Returns the numbers from 0 up to each count, exclusive, one after the other."""
     before = np.cumsum(counts) - counts
     return np.arange(int(counts.sum())) - np.repeat(before, counts)
+
+
+def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntArray]:
+    """Returns how many entries each of some codes has, and their positions, one after the other.
+
+    Args:
+        entries: the code of each entry, ascending.
+        codes: may occur several times.
+    """
+    begins = np.searchsorted(entries, codes)
+    counts = np.searchsorted(entries, codes, side="right") - begins
+    return counts, np.repeat(begins, counts) + within(counts)
 
 
 def add_sequence(
     level: LevelColumns, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
 ) -> None:
-    """Adds what is kept of a sequence of numbers.
+    """Adds the lengths, the ranges and the short arrays of a sequence of numbers.
 
     Args:
         level: takes it.
@@ -327,10 +339,10 @@ def add_ranges(
     has_values = counts > 0
     begins = (np.cumsum(counts) - counts)[has_values]
     is_finite = np.isfinite(values)
-    for end, ufunc, none in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
+    for end, ufunc, neutral in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
         extremes = np.full(counts.size, np.nan)
         if values.size:
-            comparable = values if is_finite.all() else np.where(is_finite, values, none)
+            comparable = values if is_finite.all() else np.where(is_finite, values, neutral)
             extremes[has_values] = ufunc.reduceat(comparable, begins)
             extremes[np.isinf(extremes)] = np.nan
         columns[f"{path}.{end}"] = extremes

@@ -132,7 +132,7 @@ class LongBag:
             )
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
-        """Deletes what was written of it."""
+        """Deletes the parts of it that were written, where it is not stored whole."""
         rows = connection.execute("SELECT path FROM bag WHERE id = ?", (self._number,))
         delete_bags(connection, [path for (path,) in rows.fetchall()])
 
@@ -220,7 +220,7 @@ def _in_parts(table: Table) -> Iterator[Table]:
 
 
 def lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether other definitions may decode what these could not."""
+    """Returns whether a table has no columns: with other definitions it may have some."""
     return any("" in table.left_out for table in tables)
 
 
@@ -283,16 +283,16 @@ def _insert_part(
         (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, whole),
     )
     number = int(cursor.lastrowid or 0)
-    connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?, ?)",
-        [
-            (number, path, *((None, packed.data) if same == path else (same, None)))
-            for path, packed in part.columns.items()
-            # Numbers that are rounded to one take no bytes, but are no constant.
-            if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
-            for same in [part.first_of.get(packed.data, path)]
-        ],
-    )
+    columns: list[tuple[int, str, str | None, bytes | None]] = []
+    for path, packed in part.columns.items():
+        # Numbers that are rounded to one take no bytes, but are no constant.
+        if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
+            first = part.first_of.get(packed.data, path)
+            is_first = first == path
+            columns.append(
+                (number, path, None if is_first else first, packed.data if is_first else None)
+            )
+    connection.executemany("INSERT INTO part_column VALUES (?, ?, ?, ?)", columns)
     connection.executemany(
         "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [

@@ -317,7 +317,7 @@ def euler(node: object) -> dict[str, Degrees] | None:
 
 
 def euler_of(numbers: Quaternion) -> dict[str, Degrees] | None:
-    """Returns the same of four numbers."""
+    """Returns roll, pitch and yaw (degrees) of x, y, z, w; None if these are no rotation."""
     turn = unit(numbers)
     if turn is None:
         return None

@@ -47,9 +47,8 @@ class ByteLru(Generic[T]):
         """Caches `value`, which takes about `size` bytes, and drops the least recently used."""
         entries = self._all
         with entries.lock:
-            replaced = entries.values.pop((self, key), None)
-            if replaced is not None:
-                entries.bytes -= replaced[1]
+            _, replaced = entries.values.pop((self, key), (None, 0))
+            entries.bytes -= replaced
             if size > entries.capacity:
                 return
             entries.values[(self, key)] = (value, size)

@@ -189,12 +189,12 @@ class McapBags:
                 yield from merged(runs, newest_first=newest_first)
             except _ContradictedError as error:
                 # Raised in place of a run: what was yielded lies before all that the run can hold.
-                believed, index = index, self._distrust(file, error)
-                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+                right = self._distrust(file, error)
+                yield ContradictionError(right.contradiction, window.start, window.stop - 1)
                 left, passed = _split_window(window, error.chunk, newest_first=newest_first)
-                if overlooked := _overlooked(believed, index, _wanted(index, topics), passed):
+                if overlooked := _overlooked(index, right, _wanted(right, topics), passed):
                     yield LostError(str(error), *overlooked)
-                runs = self._runs(file, index, topics, left, newest_first=newest_first)
+                runs = self._runs(file, right, topics, left, newest_first=newest_first)
                 yield from merged(runs, newest_first=newest_first)
 
     def batches(

@@ -294,11 +294,8 @@ def bare_batches(
         pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
         steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
-        numbers, times, places = (
-            pairs.channels[order],
-            pairs.times[order],
-            pairs.offsets[order] + steps,
-        )
+        numbers, times = pairs.channels[order], pairs.times[order]
+        places = pairs.offsets[order] + steps
         for number in np.unique(numbers).tolist():
             is_of_channel = numbers == number
             none = np.zeros(int(is_of_channel.sum()), np.int64)

@@ -276,18 +276,16 @@ class Contents:
         Returns:
             The first and the last log time of each chunk with messages, of which there is one.
         """
-        of = pairs.chunks
-        parts = np.append(0, np.flatnonzero(of[1:] != of[:-1]) + 1)
+        parts = _begins_of_groups(pairs.chunks)
         starts = np.minimum.reduceat(pairs.times, parts)
         ends = np.maximum.reduceat(pairs.times, parts)
         # Of a short chunk its bounds will do.
         is_long = ends - starts > SHORTEST_PAUSE_NS
-        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=of.size))]
+        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=pairs.times.size))]
         self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
         order = np.argsort(pairs.channels, kind="stable")
-        numbers, of, times = pairs.channels[order], of[order], pairs.times[order]
-        is_other = (numbers[1:] != numbers[:-1]) | (of[1:] != of[:-1])
-        parts = np.append(0, np.flatnonzero(is_other) + 1)
+        numbers, times = pairs.channels[order], pairs.times[order]
+        parts = _begins_of_groups(numbers, pairs.chunks[order])
         rows = zip(
             numbers[parts].tolist(),
             np.diff(parts, append=numbers.size).tolist(),
@@ -321,6 +319,12 @@ class Contents:
         """As `pauses` of `McapIndex`."""
         firsts, lasts = zip(*self._held, strict=True) if self._held else ([_NONE], [_NONE])
         return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
+
+
+def _begins_of_groups(*columns: IntArray) -> IntArray:
+    """Returns the positions of the rows that differ from the row before; the first is one."""
+    is_other = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return np.append(0, np.flatnonzero(is_other) + 1)
 
 
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:

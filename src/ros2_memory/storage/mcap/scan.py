@@ -156,7 +156,7 @@ class _Scan:
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
     def index(self, note: str) -> McapIndex:
-        """Returns what was found; `note` comes before the notes on it."""
+        """Returns the index of the messages found; `note` comes before its other notes."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
         loose = Pairs.of(*self.loose)
         if loose.times.size:
