@@ -403,30 +403,33 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
     for source in sources:
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
-            if not source.is_file():
-                continue
-            temporary.unlink(missing_ok=True)
-            _refuse_links(source)
-            # Without a log no program has it open; immutable: SQLite creates no file beside it.
-            mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
-            address = f"{source.absolute().as_uri()}?{mode}"
-            with (
-                closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
-                closing(sqlite3.connect(temporary)) as copy,
-            ):
-                if original.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
-                    continue
-                original.backup(copy)
-            with suppress(FileExistsError):
-                os.link(temporary, path)
+            if source.is_file() and _back_up(source, temporary):
+                with suppress(FileExistsError):
+                    os.link(temporary, path)
+                return
         except (OSError, sqlite3.Error) as error:
             log.debug("database_not_copied", path=str(source), reason=str(error))
-        else:
-            return
         finally:
             for file in files_of(temporary):
                 with suppress(OSError):
                     file.unlink(missing_ok=True)
+
+
+def _back_up(source: Path, temporary: Path) -> bool:
+    """Copies a database to a temporary file; returns False if it is of another version."""
+    temporary.unlink(missing_ok=True)
+    _refuse_links(source)
+    # Without a log no program has it open; immutable: SQLite creates no file beside it.
+    mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
+    address = f"{source.absolute().as_uri()}?{mode}"
+    with (
+        closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
+        closing(sqlite3.connect(temporary)) as copy,
+    ):
+        if original.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
+            return False
+        original.backup(copy)
+    return True
 
 
 def _refuse_links(path: Path) -> None:

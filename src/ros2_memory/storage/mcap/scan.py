@@ -74,7 +74,7 @@ class _Scan:
     in_chunks: Declarations = field(default_factory=Declarations)
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
-    found: Contents = field(default_factory=Contents)
+    contents: Contents = field(default_factory=Contents)
     # Of messages outside chunks: channels, log times and offsets.
     loose: tuple[array[int], array[int], array[int]] = field(
         default_factory=lambda: (array("H"), array("Q"), array("q"))
@@ -151,7 +151,8 @@ class _Scan:
         self.messages += content.messages
         pairs = content.pairs
         if pairs.times.size:
-            [first], [last] = (bounds.tolist() for bounds in self.found.add(pairs))
+            firsts, lasts = self.contents.add(pairs)
+            first, last = int(firsts[0]), int(lasts[0])
             numbers = frozenset(pairs.channels.tolist())
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
@@ -162,13 +163,13 @@ class _Scan:
         if loose.times.size:
             beside = Contents()
             beside.add(loose._replace(chunks=np.arange(loose.times.size)))
-            self.found.join(beside)
+            self.contents.join(beside)
         declarations = self.repeated
         differing = declarations.update(self.declared)
         differing = declarations.update(self.in_chunks) or differing
         channels = declarations.channels()
         totals = {
-            channel: total for channel, total in self.found.totals.items() if channel in channels
+            channel: total for channel, total in self.contents.totals.items() if channel in channels
         }
         notes = self._notes(totals, complete=complete)
         if note:
@@ -185,13 +186,13 @@ class _Scan:
             loose.columns({*loose.channels.tolist()}),
             complete=complete,
             notes=tuple(notes),
-            set_back=beyond_disorder(self.found.back),
-            pauses=self.found.pauses,
+            set_back=beyond_disorder(self.contents.back),
+            pauses=self.contents.pauses,
         )
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]
-        timed = sum(total.count for total in self.found.totals.values())
+        timed = sum(total.count for total in self.contents.totals.values())
         if orphans := timed - sum(total.count for total in totals.values()):
             notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:
