@@ -84,16 +84,26 @@ def _walked(
             for element in value
         ]
         return value if all(map(is_, parts, value)) else parts
-    frame = _frame(value) or frame
+    return _walked_object(value, _frame(value) or frame, depth, least, detections)
+
+
+def _walked_object(
+    value: dict[str, JsonValue],
+    frame: str,
+    depth: int,
+    least: float | None,
+    detections: list[Detection],
+) -> JsonValue:
+    """Returns an object as `_walked` does; `frame` is the one that it is in."""
     label = _label(value)
     if label is not None:
         detections.append(Detection(label, _position(value), frame, _score(value)))
         return None if _is_below(value, least) else value
     best = _best_result(value.get("results"))
-    label = None if best is None else _label(_hypothesis(best))
-    if best is not None and label is not None:
+    best_label = None if best is None else _label(_hypothesis(best))
+    if best is not None and best_label is not None:
         position = _position(best) or _position(value)
-        detections.append(Detection(label, position, frame, _score(_hypothesis(best))))
+        detections.append(Detection(best_label, position, frame, _score(_hypothesis(best))))
         return value if least is None else _without_hypotheses(value, best, least)
     fields: dict[str, JsonValue] = {}
     for name, inner in value.items():
