@@ -89,10 +89,10 @@ class PointPose:
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
         """Returns position and rotation in a message; None where it has no position."""
-        found, turned = self.position.of(message), self.orientation.of(message)
-        position, turn = xyz(found), rotation(turned)
+        place, turned = self.position.of(message), self.orientation.of(message)
+        position, turn = xyz(place), rotation(turned)
         if self.arrays:
-            position = triple(found) if position is None else position
+            position = triple(place) if position is None else position
             turn = _px4_rotation(turned) if turn is None else turn
         return None if position is None else (position, turn)
 
@@ -199,8 +199,8 @@ class SchemaExtractor:
 
     def exact_at(self, message: object, type_name: str, path: str) -> JsonValue:
         """Returns one of the `fields` of `shown`, exactly; null where this message has none."""
-        found = self._find(message, type_name, path)
-        return None if found is ABSENT else ExactJson(self.limit).value(found, path)
+        node = self._find(message, type_name, path)
+        return None if node is ABSENT else ExactJson(self.limit).value(node, path)
 
     def shown(self, message: object, type_name: str, fields: Sequence[str] = ()) -> Extracted:
         """Returns the value for a reply: strict JSON, thinned and rounded, with notes.
@@ -241,10 +241,10 @@ class SchemaExtractor:
         """
         plan = self.plan(type_name)
         for route in plan.poses:
-            found = route.of(message)
-            if found is not None:
+            pose = route.of(message)
+            if pose is not None:
                 px4_frame = _px4_frame(plan.pose_frame, message, POSE_FRAMES)
-                return Pose(*found, _text(FRAME.of(message)) or px4_frame)
+                return Pose(*pose, _text(FRAME.of(message)) or px4_frame)
         return _planar_pose(message) if plan is UNMAPPED else None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
@@ -311,10 +311,10 @@ class SchemaExtractor:
         """
         plan = self.plan(type_name)
         for linear, angular in plan.twists:
-            found, turning = linear.of(message), angular.of(message)
-            along, about = xyz(found), xyz(turning)
+            moving, turning = linear.of(message), angular.of(message)
+            along, about = xyz(moving), xyz(turning)
             if along is None and plan is not UNMAPPED:
-                along, about = _velocity(found, 0), _velocity(turning, 2)
+                along, about = _velocity(moving, 0), _velocity(turning, 2)
             if along is not None and about is not None:
                 frame = _text(_CHILD_FRAME.of(message)) or _text(FRAME.of(message))
                 px4_frame = _px4_frame(plan.velocity_frame, message, _VELOCITY_FRAMES)
@@ -340,7 +340,7 @@ class SchemaExtractor:
         listed = _TRANSFORMS.of(message)
         if not isinstance(listed, list):
             return ()
-        edges = (_edge(one, log_time, static=static) for one in listed)
+        edges = (_edge(transform, log_time, static=static) for transform in listed)
         return tuple(edge for edge in edges if edge is not None)
 
     def plan(self, type_name: str) -> Plan:
@@ -366,10 +366,10 @@ class SchemaExtractor:
         segments = tuple(path.split("."))
         mapped = plan.fields.get(segments[0])
         if mapped is not None:
-            found = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
+            node = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
         else:
-            found = ABSENT if plan.fields else descend(message, segments, view)
-        return _plain(_at(message, segments)) if found is ABSENT else found
+            node = ABSENT if plan.fields else descend(message, segments, view)
+        return _plain(_at(message, segments)) if node is ABSENT else node
 
 
 def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
@@ -419,8 +419,8 @@ def _planar_pose(message: object) -> Pose | None:
     heading = next((name for name in HEADINGS if name in names), None)
     if heading is None:
         return None
-    found = PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
-    return None if found is None else Pose(*found, _text(FRAME.of(message)))
+    pose = PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
+    return None if pose is None else Pose(*pose, _text(FRAME.of(message)))
 
 
 def _px4_rotation(node: object) -> Quaternion | None:
@@ -431,15 +431,15 @@ def _px4_rotation(node: object) -> Quaternion | None:
 
 def _velocity(node: object, axis: int) -> Vector3 | None:
     """Returns a velocity that is an array, or one number: along or about this axis."""
-    one = number(node)
-    if one is None:
+    component = number(node)
+    if component is None:
         return triple(node)
-    return (one, 0.0, 0.0) if axis == 0 else (0.0, 0.0, one)
+    return (component, 0.0, 0.0) if axis == 0 else (0.0, 0.0, component)
 
 
 def _px4_frame(route: Route | None, message: object, named: Mapping[int, str]) -> str:
-    found = None if route is None else number(route.of(message))
-    return "" if found is None or not math.isfinite(found) else named.get(int(found), "")
+    frame = None if route is None else number(route.of(message))
+    return "" if frame is None or not math.isfinite(frame) else named.get(int(frame), "")
 
 
 def _converted(name: str, node: object) -> object:
@@ -464,8 +464,8 @@ def _at(message: object, path: Segments) -> object:
     straight = _STRAIGHT[key]
     if straight is not None:
         return straight(message)
-    found = descend(message, path, view)
-    return descend(message, path) if found is ABSENT else found
+    node = descend(message, path, view)
+    return descend(message, path) if node is ABSENT else node
 
 
 def _straight(message: object, path: Segments) -> Callable[[object], object] | None:
@@ -491,22 +491,22 @@ def _straight(message: object, path: Segments) -> Callable[[object], object] | N
 def _plain(node: object) -> object:
     """Returns a node that was asked for by its full path: a quaternion then stays x, y, z, w."""
     if isinstance(node, list):
-        return [_plain(one) for one in node]
+        return [_plain(element) for element in node]
     numbers = xyzw(node) if kind_of(node) is ValueKind.QUATERNION else None
     return node if numbers is None else dict(zip("xyzw", numbers, strict=True))
 
 
 def _no_such_field(type_name: str, path: str, plan: Plan, message: object) -> str:
     names = names_of(message)
-    known = listed(names, at_most=_LISTED_NAMES)
+    fields = listed(names, at_most=_LISTED_NAMES)
     if not plan.fields:
-        there = f"its fields are: {known}" if names else "it has no fields"
-        return f"{type_name} has no field {path!r}; {there}"
+        what_it_has = f"its fields are: {fields}" if names else "it has no fields"
+        return f"{type_name} has no field {path!r}; {what_it_has}"
     turned = [f"{name}.{path}" for name in plan.fields if path in ANGLES and name in _TURNS]
     meant = f" (did you mean {turned[0]}?)" if turned else ""
     return (
         f"{type_name} has no field {path!r}{meant}; its fields are: {', '.join(plan.fields)}; "
-        f"or give a full path in the message, which begins with one of: {known}"
+        f"or give a full path in the message, which begins with one of: {fields}"
     )
 
 

@@ -133,16 +133,16 @@ class Typestores:
             text: the definition followed by the nested ones, as rosbag2 concatenates them.
         """
         key = (name, encoding, text)
-        known = self._types.get(key)
-        if known is not None:
-            return known
+        cached = self._types.get(key)
+        if cached is not None:
+            return cached
         # One thread at a time compiles: another that waits here then finds the type.
         with self._lock:
-            known = self._types.get(key)
-            if known is None:
-                known = self._build(name, encoding, text)
-                self._types.put(key, known, _CACHED_TYPE_BYTES + len(name) + len(text))
-            return known
+            cached = self._types.get(key)
+            if cached is None:
+                cached = self._build(name, encoding, text)
+                self._types.put(key, cached, _CACHED_TYPE_BYTES + len(name) + len(text))
+            return cached
 
     def _build(self, name: str, encoding: str, text: bytes) -> MessageType | str:
         root = full_name(name)
@@ -157,7 +157,7 @@ class Typestores:
 
     def _closure(self, root: str, in_bag: Mapping[str, _Section]) -> Typesdict:
         """Returns the definitions of `root` and of all nested types, checked to be bounded."""
-        found: Typesdict = {}
+        definitions: Typesdict = {}
         visited: set[str] = set()
         members = unrolled = 0
         # Depth first: the trail to a type is what names a definition that contains itself.
@@ -171,13 +171,13 @@ class Typestores:
             visited.add(name)
             if len(trail) > MAX_NESTING:
                 raise _UnusableError(f"its definition nests more than {MAX_NESTING} levels deep")
-            if name not in found:
+            if name not in definitions:
                 definition = self._definition(name, in_bag, trail)
                 members += sum(len(named) + len(kept) for named, kept in definition.values())
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
-                found.update(definition)
-            fields = [field for _, field in found[name][1]]
+                definitions.update(definition)
+            fields = [field for _, field in definitions[name][1]]
             if wide := _WIDE.intersection(map(_primitive, fields)):
                 raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
             unrolled += sum(map(_unrolled, fields))
@@ -187,10 +187,10 @@ class Typestores:
                     " elements"
                 )
             nested = dict.fromkeys(filter(None, map(_nested_type, fields)))
-            todo += [(each, (*trail, name)) for each in reversed(nested)]
+            todo += [(inner, (*trail, name)) for inner in reversed(nested)]
         return {
             name: (constants, [(field_name, _unsigned(field)) for field_name, field in fields])
-            for name, (constants, fields) in found.items()
+            for name, (constants, fields) in definitions.items()
             if name in visited
         }
 
@@ -257,9 +257,11 @@ def _service_event(name: str, text: str) -> tuple[dict[str, _Section], str]:
     introspection (REP-2012): who called when, and the request or the response, if contents are
     published.
     """
-    found = _SEPARATOR.search(text)
-    own, nested = (text, "") if found is None else (text[: found.start()], text[found.start() :])
-    parts = _SERVICE.split(_SERVICE_HEADER.sub("", own, count=1))
+    separator = _SEPARATOR.search(text)
+    own_text, nested = (
+        (text, "") if separator is None else (text[: separator.start()], text[separator.start() :])
+    )
+    parts = _SERVICE.split(_SERVICE_HEADER.sub("", own_text, count=1))
     words = name.removesuffix(_EVENT).split("/")
     is_event = name.endswith(_EVENT) and len(words) == 3 and words[1] == "srv"
     if not is_event or len(parts) != len(_HALVES):
@@ -351,32 +353,32 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
         definitions: those of the type and of its nested types; none contains itself.
         root: the name of the type.
     """
-    known: dict[str, Definition] = {}
+    finished_types: dict[str, Definition] = {}
     waiting = [root]
     while waiting:
         described = definitions[waiting[-1]][1]
-        nested = {_nested_type(field) for _, field in described} - known.keys() - {None}
+        nested = {_nested_type(field) for _, field in described} - finished_types.keys() - {None}
         if nested:
             waiting += sorted(filter(None, nested))
             continue
         fields: list[Field] = []
         for name, field in described:
             if field[0] == Nodetype.BASE or field[0] == Nodetype.NAME:
-                fields.append(Field(name, _kind(field, known)))
+                fields.append(Field(name, _kind(field, finished_types)))
             else:
                 element, length = field[1]
                 stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
-                fields.append(Field(name, _kind(element, known), stated))
+                fields.append(Field(name, _kind(element, finished_types), stated))
         finished = waiting.pop()
-        known[finished] = Definition(finished, tuple(fields))
-    return known[root]
+        finished_types[finished] = Definition(finished, tuple(fields))
+    return finished_types[root]
 
 
-def _kind(field: FieldDesc, known: Mapping[str, Definition]) -> str | Definition:
+def _kind(field: FieldDesc, finished_types: Mapping[str, Definition]) -> str | Definition:
     """Returns what a field that is no array holds: the name of a primitive, or a known type."""
     if field[0] == Nodetype.BASE:
         return str(field[1][0])
-    return known[str(field[1])]
+    return finished_types[str(field[1])]
 
 
 def _nested_type(field: FieldDesc) -> str | None:
@@ -411,8 +413,8 @@ def _unrolled(field: FieldDesc) -> int:
     if field[0] != Nodetype.ARRAY:
         return 0
     element, count = field[1]
-    primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
-    return 0 if primitive else count
+    is_primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
+    return 0 if is_primitive else count
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
@@ -428,7 +430,7 @@ def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:
         if not files:
             raise ConfigError(f"reader.custom_msg_paths: {folder} holds no msg/*.msg file")
         folders = {file.parent.parent for file in files}
-        packages = {each: _package_name(each) for each in folders}
+        packages = {package: _package_name(package) for package in folders}
         for file in files:
             text = file.read_text(encoding="utf-8", errors="replace")
             yield f"{packages[file.parent.parent]}/msg/{file.stem}", text

@@ -60,16 +60,12 @@ def copies_among(messages: Identities) -> NDArray[np.bool_]:
     """
     copies = np.zeros(messages.log_times.size, np.bool_)
     suspects = _shared_by_recordings(messages)
-    some = messages.rows(suspects)
-    order = suspects[np.lexsort((some.recordings, some.log_times))]
+    suspected = messages.rows(suspects)
+    order = suspects[np.lexsort((suspected.recordings, suspected.log_times))]
     counts: dict[tuple[int, int], dict[int, int]] = {}
     recent: deque[tuple[Ns, tuple[int, int]]] = deque()
-    some = messages.rows(order)
-    rows = zip(
-        order.tolist(),
-        *(column.tolist() for column in some),
-        strict=True,
-    )
+    columns = (column.tolist() for column in messages.rows(order))
+    rows = zip(order.tolist(), *columns, strict=True)
     for row, time, published, payload, recording in rows:
         while recent and recent[0][0] < time - COPY_HORIZON_NS:
             counts.pop(recent.popleft()[1], None)
@@ -89,28 +85,28 @@ def relatched_among(messages: Identities) -> NDArray[np.bool_]:
     order = np.lexsort(
         (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
     )
-    some = messages.rows(order)
+    ordered = messages.rows(order)
     is_first = np.ones(order.size, np.bool_)
-    is_first[1:] = (np.diff(some.publish_times) != 0) | (np.diff(some.hashes) != 0)
+    is_first[1:] = (np.diff(ordered.publish_times) != 0) | (np.diff(ordered.hashes) != 0)
     first = np.maximum.accumulate(np.where(is_first, np.arange(order.size), 0))
-    late = some.log_times - some.publish_times > RELATCHED_NS
-    again = (
-        late
-        & (some.log_times > some.log_times[first])
-        & (some.recordings != some.recordings[first])
+    is_late = ordered.log_times - ordered.publish_times > RELATCHED_NS
+    is_again = (
+        is_late
+        & (ordered.log_times > ordered.log_times[first])
+        & (ordered.recordings != ordered.recordings[first])
     )
-    found = np.zeros(order.size, np.bool_)
-    found[order] = again
-    return found
+    relatched = np.zeros(order.size, np.bool_)
+    relatched[order] = is_again
+    return relatched
 
 
 def _shared_by_recordings(messages: Identities) -> IntArray:
     """Returns the rows whose publish time and payload several recordings have."""
     order = np.lexsort((messages.recordings, messages.hashes, messages.publish_times))
-    some = messages.rows(order)
-    same = (np.diff(some.publish_times) == 0) & (np.diff(some.hashes) == 0)
-    group = np.concatenate(([0], np.cumsum(~same))) if order.size else order
-    other = same & (np.diff(some.recordings) != 0)
-    shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
-    shared[group[1:][other]] = True
-    return order[shared[group]] if order.size else order
+    ordered = messages.rows(order)
+    is_same = (np.diff(ordered.publish_times) == 0) & (np.diff(ordered.hashes) == 0)
+    group = np.concatenate(([0], np.cumsum(~is_same))) if order.size else order
+    is_elsewhere = is_same & (np.diff(ordered.recordings) != 0)
+    is_shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
+    is_shared[group[1:][is_elsewhere]] = True
+    return order[is_shared[group]] if order.size else order

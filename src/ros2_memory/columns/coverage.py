@@ -58,22 +58,24 @@ class Coverage:
     def __init__(self, state: State, segments: Sequence[CoveredSegment]) -> None:
         self.state = state
         self.segments = tuple(segments)
-        self.missing = tuple(chain.from_iterable(each.missing for each in segments))
-        numbers = [each.numbers for each in segments]
+        self.missing = tuple(chain.from_iterable(covered.missing for covered in segments))
+        numbers = [covered.numbers for covered in segments]
         begins = np.cumsum([0, *map(len, numbers)])
-        everything = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
-        order = np.argsort(everything, kind="stable")
+        all_numbers = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
+        order = np.argsort(all_numbers, kind="stable")
         self._of_parts: dict[int, IntArray] = {}
         self._bags: dict[int, BagFile] = {}
         self._begins: IntArray = begins
-        self._order: IntArray = order[np.searchsorted(everything[order], 0) :]
-        self._numbers: IntArray = everything[self._order]
+        self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
+        self._numbers: IntArray = all_numbers[self._order]
 
     def missing_in(self, window: TimeWindow) -> Iterator[BagFile]:
         """Yields the bags that are not stored and have messages in a window or near it."""
-        for each in self.segments:
-            if each.missing and window.overlaps(each.segment.first[0], each.segment.latest):
-                yield from each.missing
+        for covered in self.segments:
+            if covered.missing and window.overlaps(
+                covered.segment.first[0], covered.segment.latest
+            ):
+                yield from covered.missing
 
     def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
         """Returns which of some numbers are of bags of the timeline."""
@@ -86,8 +88,8 @@ class Coverage:
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
         """Returns those of the numbers of a part whose bags are bags of the timeline."""
         if part not in self._of_parts:
-            there = self._are_there(numbers)
-            self._of_parts[part] = numbers if there.all() else numbers[there]
+            are_there = self._are_there(numbers)
+            self._of_parts[part] = numbers if are_there.all() else numbers[are_there]
         return self._of_parts[part]
 
     def counts(self, groups: Sequence[IntArray]) -> IntArray:
@@ -108,16 +110,16 @@ class Coverage:
                 return None
             nth = int(self._order[at])
             segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
-            own = self.segments[segment].segment.bags
-            self._bags[number] = own[nth - int(self._begins[segment])]
+            bags = self.segments[segment].segment.bags
+            self._bags[number] = bags[nth - int(self._begins[segment])]
         return self._bags[number]
 
     def unhashed(self) -> list[BagFile]:
         """Returns the stored bags of which copies cannot be recognised."""
         return [
-            each.segment.bags[nth]
-            for each in self.segments
-            for nth in np.flatnonzero((each.numbers >= 0) & ~each.hashed).tolist()
+            covered.segment.bags[nth]
+            for covered in self.segments
+            for nth in np.flatnonzero((covered.numbers >= 0) & ~covered.hashed).tolist()
         ]
 
 
@@ -133,62 +135,64 @@ class Covering:
         self.store = store
         self._bag_dir = bag_dir
         self._lock = Lock()
-        self._known: dict[int, CoveredSegment] = {}
-        self._of: tuple[Timeline, Coverage] | None = None
+        self._by_id: dict[int, CoveredSegment] = {}
+        self._latest: tuple[Timeline, Coverage] | None = None
 
     def of(self, timeline: Timeline) -> Coverage:
         """Returns the coverage of a timeline, as the store is now."""
         failures, state = self.store.failures, self.store.state()
         with self._lock:
-            if self._of is not None:
-                known, coverage = self._of
-                if known is timeline and coverage.state == state:
+            if self._latest is not None:
+                covered_timeline, coverage = self._latest
+                if covered_timeline is timeline and coverage.state == state:
                     return coverage
                 if coverage.state.deletion != state.deletion:
-                    self._known = {}
-            segments = self._covered(timeline, state)
+                    self._by_id = {}
+            segments = self._covered_segments(timeline, state)
             coverage = Coverage(state, segments)
             if self.store.failures != failures:
                 return coverage
             # By identity: a segment is immutable, and lives as long as its entry here.
-            self._known = {id(each.segment): each for each in segments}
-            self._of = timeline, coverage
+            self._by_id = {id(covered.segment): covered for covered in segments}
+            self._latest = timeline, coverage
             return coverage
 
-    def _covered(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        grown = self._of is None or self._of[1].state != state
-        known = {
-            nth: each
+    def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
+        has_changed = self._latest is None or self._latest[1].state != state
+        remembered = {
+            nth: covered
             for nth, segment in enumerate(timeline.segments)
-            if (each := self._known.get(id(segment))) is not None
-            and each.segment is segment
-            and not (grown and each.missing)
+            if (covered := self._by_id.get(id(segment))) is not None
+            and covered.segment is segment
+            and not (has_changed and covered.missing)
         }
-        unknown = [nth for nth in range(len(timeline.segments)) if nth not in known]
+        to_look_up = [nth for nth in range(len(timeline.segments)) if nth not in remembered]
         stored: Mapping[str, StoredBag] = {}
         root = str(self._bag_dir)
-        if len(unknown) > _FEW:
+        if len(to_look_up) > _FEW:
             stored = self.store.bags()
-        elif unknown:
-            bags = chain.from_iterable(timeline.segments[nth].bags for nth in unknown)
+        elif to_look_up:
+            bags = chain.from_iterable(timeline.segments[nth].bags for nth in to_look_up)
             stored = self.store.bags([relative(bag.file, root) for bag in bags])
         return [
-            known[nth] if nth in known else self._segment(segment, stored)
+            remembered[nth] if nth in remembered else self._covered_segment(segment, stored)
             for nth, segment in enumerate(timeline.segments)
         ]
 
-    def _segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
+    def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
         root, offset = str(self._bag_dir), self.store.offset
-        numbers, hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
+        numbers, is_hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
         for nth, bag in enumerate(segment.bags):
-            found = stored.get(relative(bag.file, root))
+            stored_bag = stored.get(relative(bag.file, root))
             if (
-                found is not None
-                and found[1:4] == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+                stored_bag is not None
+                and stored_bag.size == bag.size
+                and stored_bag.mtime_ns == bag.mtime_ns
+                and stored_bag.sidecar_ns == bag.sidecar_ns
                 and bag.state is BagState.CLOSED
             ):
-                numbers[nth], hashed[nth] = offset + found.row, found.hashed
+                numbers[nth], is_hashed[nth] = offset + stored_bag.row, stored_bag.hashed
             else:
                 missing.append(bag)
-        return CoveredSegment(segment, numbers, hashed, tuple(missing))
+        return CoveredSegment(segment, numbers, is_hashed, tuple(missing))

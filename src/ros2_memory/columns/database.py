@@ -161,7 +161,7 @@ class Database:
                 # As one transaction: what is packed is read with the model that it was packed with.
                 opened.connection.execute("BEGIN")
                 try:
-                    found = ask(opened.connection)
+                    answer = ask(opened.connection)
                 finally:
                     if opened.connection.in_transaction:  # not after an error that ended it
                         opened.connection.execute("COMMIT")
@@ -172,7 +172,7 @@ class Database:
                 return unknown
             # After it: of a log that another program has replaced meanwhile pages are read that
             # were never written.
-            return unknown if self._is_lost(opened) else found
+            return unknown if self._is_lost(opened) else answer
 
     def write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
         """Writes all or nothing; returns whether it was written."""
@@ -267,11 +267,11 @@ class Database:
         if self._opened is None and self._may_open():
             self._tried_s = time.monotonic()
             paths = self._candidate_paths()
-            found = open_file(paths, sources=self._sources)
-            self._opened = _in_memory() if isinstance(found, str) else found
+            opened = open_file(paths, sources=self._sources)
+            self._opened = _in_memory() if isinstance(opened, str) else opened
             self.trouble = None
-            if isinstance(found, str) and paths:
-                self.trouble = f"is kept in memory: {found}"
+            if isinstance(opened, str) and paths:
+                self.trouble = f"is kept in memory: {opened}"
         return self._opened
 
     def _move_to_preferred_path(self, before: OpenDatabase) -> None:
@@ -284,21 +284,21 @@ class Database:
         # It stays at a path that is no longer a candidate.
         if before.path is not None:
             paths = paths[: paths.index(before.path)] if before.path in paths else ()
-        found = open_file(paths, again=True, previous=before.path) if paths else ""
-        if isinstance(found, str):
+        opened = open_file(paths, again=True, previous=before.path) if paths else ""
+        if isinstance(opened, str):
             return
         with self._lock:
             if self._closed or self._opened is not before:
-                found.connection.close()
+                opened.connection.close()
                 return
             before.connection.close()
-            self._opened = found
+            self._opened = opened
             self._databases += 1
             self.trouble, self.is_failing = None, False
             if before.path is None:
-                log.info("database_in_file_again", path=str(found.path))
+                log.info("database_in_file_again", path=str(opened.path))
             else:
-                log.info("database_moved", path=str(found.path))
+                log.info("database_moved", path=str(opened.path))
 
     def _is_lost(self, opened: OpenDatabase) -> bool:
         """Returns whether other files are in its place; then it is closed."""
@@ -403,30 +403,33 @@ def _copy_first_valid(sources: Sequence[Path], path: Path) -> None:
     for source in sources:
         temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         try:
-            if not source.is_file():
-                continue
-            temporary.unlink(missing_ok=True)
-            _refuse_links(source)
-            # Without a log no program has it open; immutable: SQLite creates no file beside it.
-            mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
-            address = f"{source.absolute().as_uri()}?{mode}"
-            with (
-                closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
-                closing(sqlite3.connect(temporary)) as copy,
-            ):
-                if original.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
-                    continue
-                original.backup(copy)
-            with suppress(FileExistsError):
-                os.link(temporary, path)
+            if source.is_file() and _back_up(source, temporary):
+                with suppress(FileExistsError):
+                    os.link(temporary, path)
+                return
         except (OSError, sqlite3.Error) as error:
             log.debug("database_not_copied", path=str(source), reason=str(error))
-        else:
-            return
         finally:
-            for each in files_of(temporary):
+            for file in files_of(temporary):
                 with suppress(OSError):
-                    each.unlink(missing_ok=True)
+                    file.unlink(missing_ok=True)
+
+
+def _back_up(source: Path, temporary: Path) -> bool:
+    """Copies a database to a temporary file; returns False if it is of another version."""
+    temporary.unlink(missing_ok=True)
+    _refuse_links(source)
+    # Without a log no program has it open; immutable: SQLite creates no file beside it.
+    mode = "mode=ro" if files_of(source)[1].exists() else "mode=ro&immutable=1"
+    address = f"{source.absolute().as_uri()}?{mode}"
+    with (
+        closing(sqlite3.connect(address, uri=True, timeout=BUSY_S)) as original,
+        closing(sqlite3.connect(temporary)) as copy,
+    ):
+        if original.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
+            return False
+        original.backup(copy)
+    return True
 
 
 def _refuse_links(path: Path) -> None:
@@ -435,9 +438,9 @@ def _refuse_links(path: Path) -> None:
     Raises:
         OSError: the file, its write-ahead log or its folder is a symbolic link.
     """
-    for each in (path.parent, *files_of(path)):
-        if each.is_symlink():
-            raise OSError(errno.ELOOP, f"{each.name} is a symbolic link, which is not followed")
+    for file in (path.parent, *files_of(path)):
+        if file.is_symlink():
+            raise OSError(errno.ELOOP, f"{file.name} is a symbolic link, which is not followed")
 
 
 def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
@@ -454,10 +457,10 @@ def _fault_of(path: Path, *, thorough: bool) -> sqlite3.Error | None:
             connection.execute(_FIRST_ROWS).fetchall()
             if not thorough:
                 return None
-            found = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
+            verdict = connection.execute("PRAGMA quick_check(1)").fetchone()[0]
     except sqlite3.Error as error:
         return error
-    return None if found == "ok" else sqlite3.DatabaseError(found)
+    return None if verdict == "ok" else sqlite3.DatabaseError(verdict)
 
 
 def _in_memory() -> OpenDatabase:
@@ -473,9 +476,9 @@ def is_transient(error: Exception) -> bool:
     Operational errors are those of the machine or of the moment, such as a full disk. Only a table
     that is missing (`SQLITE_ERROR`) and text that is not UTF-8 (no code) are faults of the content.
     """
-    operational = isinstance(error, sqlite3.OperationalError)
-    of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
-    return isinstance(error, MemoryError) or (operational and not of_content)
+    is_operational = isinstance(error, sqlite3.OperationalError)
+    is_of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
+    return isinstance(error, MemoryError) or (is_operational and not is_of_content)
 
 
 def is_busy(error: Exception) -> bool:
@@ -496,15 +499,15 @@ def files_of(path: Path) -> list[Path]:
 
 def _identities(files: Sequence[str]) -> tuple[tuple[int, int] | None, ...]:
     """Returns device and inode of each file; None if there is none."""
-    found: list[tuple[int, int] | None] = []
-    for each in files:
+    identities: list[tuple[int, int] | None] = []
+    for file in files:
         try:
-            status = os.stat(each)  # noqa: PTH116 - at each reading: a path takes three times as long
+            status = os.stat(file)  # noqa: PTH116 - at each reading: a path takes three times as long
         except (FileNotFoundError, NotADirectoryError):
-            found.append(None)
+            identities.append(None)
         else:
-            found.append((status.st_dev, status.st_ino))
-    return tuple(found)
+            identities.append((status.st_dev, status.st_ino))
+    return tuple(identities)
 
 
 def _connect_and_check(path: Path) -> sqlite3.Connection:
@@ -584,6 +587,6 @@ def _set_aside(path: Path, reason: str) -> None:
     """Renames a file so that a new one can be made; the old one stays for inspection."""
     aside = path.with_name(f"{path.name}.aside")
     log.warning("database_set_aside", path=str(path), reason=reason, renamed_to=aside.name)
-    for each in files_of(path)[1:]:
-        each.unlink(missing_ok=True)
+    for file in files_of(path)[1:]:
+        file.unlink(missing_ok=True)
     path.rename(aside)

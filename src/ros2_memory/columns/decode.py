@@ -16,7 +16,7 @@ import numpy as np
 from ros2_memory.columns.objects import level_of
 from ros2_memory.columns.plan import Plan, UnplannedError, plan_of
 from ros2_memory.columns.table import Table, joined, order_of
-from ros2_memory.columns.walk import Level, NotWalkedError, walked
+from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
@@ -106,7 +106,7 @@ def decoded(
             read.
     """
 
-    def found() -> Iterator[list[Table] | BagError]:
+    def read() -> Iterator[list[Table] | BagError]:
         channels = [
             channel
             for channel in reader.channels(path)
@@ -137,7 +137,7 @@ def decoded(
             yield tables
 
     # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-    return map(unless_error, found())
+    return map(unless_error, read())
 
 
 @dataclass(slots=True)
@@ -172,16 +172,16 @@ class _Kinds:
 
     def of(self, channel: Channel) -> _Kind:
         """Returns the kind of a channel."""
-        known = self._known.get(id(channel))
-        if known is None:
+        kind = self._known.get(id(channel))
+        if kind is None:
             definition = self.reader.definition(channel)
             plan, reason = self._plan(channel, definition)
-            known = _Kind(definition, plan, reason, self.hashed(channel))
-            self._known[id(channel)] = known
-        return known
+            kind = _Kind(definition, plan, reason, self.hashed(channel))
+            self._known[id(channel)] = kind
+        return kind
 
     def read(self, batch: Batch) -> _Kind:
-        """Returns the kind of what was read: of large messages no more columns are made."""
+        """Returns how a batch is decoded: once messages are large, without columns from then on."""
         if batch.buffer is not self._buffer:
             self._buffer = batch.buffer
             self._read_bytes += len(batch.buffer)
@@ -233,10 +233,12 @@ class _Group:
             self._bytes += len(batch.buffer)
         channel = batch.channel
         parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
-        for some in _parts_of(batch):
-            self._add(parts, _table(kind, some, self.reader, skip=self.skip_undecodable))
+        for piece in _pieces_of(batch):
+            self._append_alike(
+                parts, _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
+            )
 
-    def _add(self, parts: list[Table], table: Table) -> None:
+    def _append_alike(self, parts: list[Table], table: Table) -> None:
         """Adds a table to those of its topic, of which all have columns or none has."""
         if "" in table.left_out and parts and "" not in parts[0].left_out:
             parts[:] = [
@@ -249,14 +251,14 @@ class _Group:
     def tables(self) -> list[Table]:
         """Returns the tables, each of all its parts."""
         self._buffer = b""
-        found = []
+        tables = []
         while self._parts:
             _, parts = self._parts.popitem()
-            found.append(joined(parts))
-        return found[::-1]
+            tables.append(joined(parts))
+        return tables[::-1]
 
 
-def _parts_of(batch: Batch) -> Iterator[Batch]:
+def _pieces_of(batch: Batch) -> Iterator[Batch]:
     """Yields a batch of a large chunk in parts: to walk one takes some times its bytes."""
     if batch.sizes.sum() <= BATCH_BYTES:
         yield batch
@@ -266,7 +268,7 @@ def _parts_of(batch: Batch) -> Iterator[Batch]:
         yield batch.taken(rows)
 
 
-def _table(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) -> Table:
+def _decoded_batch(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) -> Table:
     """Returns the messages of a batch as a table; what cannot be walked the reader decodes.
 
     With `skip` without those that it cannot decode.
@@ -300,7 +302,7 @@ def _table(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) -> Table
         return replace(table, left_out={"": f"some cannot be decoded: {error.reason}"})
 
 
-def _with_columns(table: Table, level: Level) -> Table:
+def _with_columns(table: Table, level: LevelColumns) -> Table:
     return replace(table, columns=level.columns, elements=level.elements, left_out=level.left_out)
 
 

@@ -30,7 +30,7 @@ from ros2_memory.columns.shown import (
 )
 from ros2_memory.columns.table import Table, Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
-from ros2_memory.columns.walk import within
+from ros2_memory.columns.walk import entries_of_codes
 from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
 from ros2_memory.messages.detections import (
@@ -73,19 +73,19 @@ class Detections(NamedTuple):
 
     def at(self, rows: Ints) -> Detections:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
-        place = np.searchsorted(rows, self.rows)
-        kept = place < rows.size
-        kept[kept] = rows[place[kept]] == self.rows[kept]
+        message = np.searchsorted(rows, self.rows)
+        is_among = message < rows.size
+        is_among[is_among] = rows[message[is_among]] == self.rows[is_among]
         return Detections(
-            place[kept],
-            Texts(self.labels.codes[kept], self.labels.words),
-            self.scores[kept],
-            self.places[kept],
-            Texts(self.frames.codes[kept], self.frames.words),
+            message[is_among],
+            Texts(self.labels.codes[is_among], self.labels.words),
+            self.scores[is_among],
+            self.places[is_among],
+            Texts(self.frames.codes[is_among], self.frames.words),
         )
 
 
-class Found(NamedTuple):
+class StampedDetections(NamedTuple):
     """The detections of some messages.
 
     Attributes:
@@ -147,7 +147,7 @@ class DetectionColumns:
     def __init__(self, extractor: SchemaExtractor) -> None:
         self._sources = ByType(extractor, lambda shape: tuple(sources_in(shape.value)))
 
-    def of(self, table: Table) -> Found | None:
+    def of(self, table: Table) -> StampedDetections | None:
         """Returns the detections of a table's messages; None where they have to be read."""
         definition, sources = table.definition, self._sources.of(table)
         if definition is None or sources is None:
@@ -155,34 +155,45 @@ class DetectionColumns:
         values = Values(table)
         try:
             parts = [part for source in sources for part in found_in(values, source, places=True)]
-            own = _own_frame(definition)
-            found = joined_detections([_with_frames(values, part, own) for part in parts])
-            return Found(found, _stamps(values, definition))
+            header_frames = _header_frames(definition)
+            detections = joined_detections(
+                [_with_frames(values, part, header_frames) for part in parts]
+            )
+            return StampedDetections(detections, _stamps(values, definition))
         except UnknownShapeError:
             return None
 
-    def may_match(self, known: Table | PartZones) -> bool | Mask:
+    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a message may hold a detection, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        sources = self._sources.of(known)
-        found: bool | Mask = sources is None
+        sources = self._sources.of(table_or_parts)
+        possible: bool | Mask = sources is None
         for source in sources or ():
-            found = found | (not isinstance(source, Json) or _may_be_json(known, source.leaf))
-        return found
+            possible = possible | (
+                not isinstance(source, Json) or _may_be_json(table_or_parts, source.leaf)
+            )
+        return possible
 
 
-def detections_by(found: Sequence[Sequence[Detection]]) -> Detections:
+def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
     """Returns the detections of messages that were read one by one."""
-    every = [(row, one) for row, some in enumerate(found) for one in some]
-    places = [(math.nan,) * 3 if one.place is None else one.place for _, one in every]
+    numbered = [
+        (row, detection) for row, detections in enumerate(by_message) for detection in detections
+    ]
+    places = [
+        (math.nan,) * 3 if detection.place is None else detection.place for _, detection in numbered
+    ]
     return Detections(
-        np.array([row for row, _ in every], np.int64),
-        Texts.of([one.label for _, one in every]),
-        np.array([math.nan if one.score is None else one.score for _, one in every], np.float64),
+        np.array([row for row, _ in numbered], np.int64),
+        Texts.of([detection.label for _, detection in numbered]),
+        np.array(
+            [math.nan if detection.score is None else detection.score for _, detection in numbered],
+            np.float64,
+        ),
         np.array(places, np.float64).reshape(-1, 3),
-        Texts.of([one.frame_id for _, one in every]),
+        Texts.of([detection.frame_id for _, detection in numbered]),
     )
 
 
@@ -226,13 +237,15 @@ def sources_in(
             if is_object(element) or isinstance(element, Narrowed):
                 yield from sources_in(element, depth - 1, frames)
     elif is_object(node):
-        yield from _in_object(dict(children(node)), depth, frames)
+        yield from _sources_in_object(dict(children(node)), depth, frames)
 
 
-def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+def _sources_in_object(
+    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+) -> Iterator[Source]:
     named, several = scored(fields), hypotheses(fields)
-    frames = (*frames, *_frame(fields))
-    inner = tuple(_in_fields(fields, depth, frames))
+    frames = (*frames, *_frame_leaves(fields))
+    inner = tuple(_sources_in_fields(fields, depth, frames))
     if named is not None:
         yield Labels(named, inner, frames, (), _points(fields))
     elif several is not None:
@@ -244,7 +257,9 @@ def _in_object(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) ->
         yield from inner
 
 
-def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) -> Iterator[Source]:
+def _sources_in_fields(
+    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+) -> Iterator[Source]:
     for name, node in fields.items():
         element = node.element if isinstance(node, Listing) else None
         if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
@@ -252,7 +267,7 @@ def _in_fields(fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]) ->
         yield from sources_in(node, depth - 1, frames)
 
 
-def _frame(fields: dict[str, Node]) -> Iterator[Leaf]:
+def _frame_leaves(fields: dict[str, Node]) -> Iterator[Leaf]:
     header = fields.get("header")
     if isinstance(header, Message | Group):
         fields = dict(children(header))
@@ -263,7 +278,7 @@ def _frame(fields: dict[str, Node]) -> Iterator[Leaf]:
 
 def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
     """Returns where an object may have its place, first choice first; None: it depends."""
-    found: list[Point] = []
+    points: list[Point] = []
     for path in POSITIONS:
         node: Node | None = Group(fields)
         for name in path:
@@ -280,10 +295,10 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
         numbers = [leaf for leaf in leaves if isinstance(leaf, Leaf) and _is_number(leaf)]
         if len(leaves) == len(numbers) == 3:
             x, y, z = numbers
-            found.append((x, y, z))
+            points.append((x, y, z))
         elif any(not isinstance(leaf, Leaf) for leaf in leaves):
             return None
-    return tuple(found)
+    return tuple(points)
 
 
 def _is_number(leaf: Leaf) -> bool:
@@ -303,38 +318,51 @@ def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detect
     """
     if isinstance(source, Json):
         yield from _in_json(values, source)
-        return
-    if isinstance(source, Words):
-        texts = texts_of(values, source.leaf)
-        has = np.array([bool(word) for word in texts.words], np.bool_)
-        among = np.flatnonzero(has[texts.codes]) if texts.words else np.empty(0, np.int64)
-        yield _found(values, source.leaf.level, texts, among, np.full(len(texts), math.nan))
-        return
+    elif isinstance(source, Words):
+        yield _in_labels(values, source.leaf)
+    else:
+        yield _in_objects(values, source, places=places)
+
+
+def _in_labels(values: Values, leaf: Leaf) -> Detections:
+    """Returns the labels of lists that are not empty, without a score."""
+    texts = texts_of(values, leaf)
+    is_label = np.array([bool(word) for word in texts.words], np.bool_)
+    positions = np.flatnonzero(is_label[texts.codes]) if texts.words else np.empty(0, np.int64)
+    return _detections_at(values, leaf.level, texts, positions, np.full(len(texts), math.nan))
+
+
+def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
+    """Returns the objects that have a name, with their scores; raises as `found_in`."""
     objects = source.scored
     named = objects.read(values)
     if named is None:
         raise UnknownShapeError("names or scores are not held")
     name, score, error = named
-    among, size = np.arange(len(name)), len(name)
+    positions, size = np.arange(len(name)), len(name)
     if source.is_best:
         elements, parent = values.elements(objects.level), objects.level.parent
         if elements is None or parent is None:
             raise UnknownShapeError("hypotheses are not held")
-        among, size = _best(name, score, error, elements.owners), values.size(parent) or 0
+        positions, size = (
+            _best_hypotheses(name, score, error, elements.owners),
+            values.size(parent) or 0,
+        )
     is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
-    among = among[is_named[name.codes[among]]] if name.words else among[:0]
-    if among.size < size and any(
-        found.rows.size
+    positions = positions[is_named[name.codes[positions]]] if name.words else positions[:0]
+    if positions.size < size and any(
+        detections.rows.size
         for inner in source.otherwise
-        for found in found_in(values, inner, places=False)
+        for detections in found_in(values, inner, places=False)
     ):
         raise UnknownShapeError("some objects are detections, and some have such in them")
-    found = _found(values, objects.level, name, among, score)
-    if places:
-        where = _places(values, source, objects.level, among)
-        frames = _frames(values, objects.level, among, source.frames)
-        found = found._replace(places=where, frames=frames)
-    yield found
+    detections = _detections_at(values, objects.level, name, positions, score)
+    if not places:
+        return detections
+    return detections._replace(
+        places=_places_at(values, source, objects.level, positions),
+        frames=_frames_at(values, objects.level, positions, source.frames),
+    )
 
 
 def texts_of(values: Values, leaf: Leaf) -> Texts:
@@ -349,11 +377,15 @@ def texts_of(values: Values, leaf: Leaf) -> Texts:
     return texts
 
 
-def _found(values: Values, level: Level, name: Texts, among: Ints, scores: Floats) -> Detections:
+def _detections_at(
+    values: Values, level: Level, name: Texts, positions: Ints, scores: Floats
+) -> Detections:
     """Returns detections at some places of a level, by their rows, without a place."""
-    _, rows = placed(values, level, among, (), surely=True)
-    labels = Texts(name.codes[among], name.words)
-    return Detections(rows, labels, scores[among], _nowhere(among.size), _no_frames(among.size))
+    _, rows = placed(values, level, positions, (), surely=True)
+    labels = Texts(name.codes[positions], name.words)
+    return Detections(
+        rows, labels, scores[positions], _nowhere(positions.size), _no_frames(positions.size)
+    )
 
 
 def _nowhere(count: int) -> Points:
@@ -364,9 +396,13 @@ def _no_frames(count: int) -> Texts:
     return Texts(np.zeros(count, np.uint32), ("",))
 
 
-def _may_be_json(known: Table | PartZones, leaf: Leaf) -> bool | Mask:
+def _may_be_json(table_or_parts: Table | PartZones, leaf: Leaf) -> bool | Mask:
     """Returns whether a text may be JSON, by its zone, or in which parts by their zones."""
-    zone = zone_of(leaf, known.zone) if isinstance(known, PartZones) else Values(known).zone(leaf)
+    zone = (
+        zone_of(leaf, table_or_parts.zone)
+        if isinstance(table_or_parts, PartZones)
+        else Values(table_or_parts).zone(leaf)
+    )
     return True if zone is None else zone.may_be_json
 
 
@@ -375,26 +411,23 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     if not _may_be_json(values.table, source.leaf):
         return
     texts = texts_of(values, source.leaf)
-    once = values.table.remember(
+    parsed = values.table.remember(
         f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
         lambda: detections_by([_parsed(word, source.depth) for word in texts.words]),
-        lambda found: 1000 + 100 * found.rows.size,
+        lambda detections: 1000 + 100 * detections.rows.size,
     )
-    if not once.rows.size:
+    if not parsed.rows.size:
         return
-    counts = np.bincount(once.rows, minlength=len(texts.words))
-    among = np.flatnonzero(counts[texts.codes])
-    first, counts = np.searchsorted(once.rows, texts.codes[among]), counts[texts.codes[among]]
-    of = np.repeat(among, counts)
-    nth = np.repeat(first, counts) + within(counts)
-    _, rows = placed(values, source.leaf.level, of, (), surely=True)
-    around = _frames(values, source.leaf.level, of, source.frames)
+    counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
+    positions = np.repeat(np.arange(len(texts)), counts)
+    _, rows = placed(values, source.leaf.level, positions, (), surely=True)
+    outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
     yield Detections(
         rows,
-        Texts(once.labels.codes[nth], once.labels.words),
-        once.scores[nth],
-        once.places[nth],
-        or_else(Texts(once.frames.codes[nth], once.frames.words), around),
+        Texts(parsed.labels.codes[nth], parsed.labels.words),
+        parsed.scores[nth],
+        parsed.places[nth],
+        or_else(Texts(parsed.frames.codes[nth], parsed.frames.words), outer_frames),
     )
 
 
@@ -407,7 +440,7 @@ def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
     return detections_of(value)
 
 
-def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
+def _best_hypotheses(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     """Returns the first of the hypotheses of the highest score, for each detection.
 
     Raises:
@@ -417,71 +450,75 @@ def _best(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
     best: Ints = order[begins]
     if error:
         follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-        one, two = order[follows], order[follows + 1]
+        best_of, next_best = order[follows], order[follows + 1]
         with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = score[one] - score[two] <= 2 * error
-        if (is_close & (name.codes[one] != name.codes[two])).any():
+            is_close = score[best_of] - score[next_best] <= 2 * error
+        if (is_close & (name.codes[best_of] != name.codes[next_best])).any():
             raise UnknownShapeError("another hypothesis may be the best")
     return best
 
 
-def _places(values: Values, source: Labels, level: Level, among: Ints) -> Points:
+def _places_at(values: Values, source: Labels, level: Level, positions: Ints) -> Points:
     """Returns the first valid point of each detection (N x 3); NaN where it has none."""
     if source.points is None or source.best_points is None:
         raise UnknownShapeError("points are of another shape in each message")
-    found = _nowhere(among.size)
+    places = _nowhere(positions.size)
     for leaves in (*source.best_points, *source.points):
-        at = _owners(values, level, among, leaves[0].level)
+        at = _owners_at(values, level, positions, leaves[0].level)
         columns = [values.numbers(leaf) for leaf in leaves]
         numbers = [column.values[at] for column in columns if column is not None]
         if len(numbers) < len(leaves):
             raise UnknownShapeError("points are not held")
         point = np.stack(numbers, axis=1).astype(np.float64)
         # All zeros means that nobody filled it in.
-        is_one = np.isfinite(point).all(axis=1) & point.any(axis=1)
-        found = np.where((is_one & np.isnan(found[:, 0]))[:, None], point, found)
-    return found
+        is_given = np.isfinite(point).all(axis=1) & point.any(axis=1)
+        places = np.where((is_given & np.isnan(places[:, 0]))[:, None], point, places)
+    return places
 
 
-def _frames(values: Values, level: Level, among: Ints, leaves: Sequence[Leaf]) -> Texts:
+def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:
     """Returns the frame of each detection: what the innermost object around it names."""
-    found = _no_frames(among.size)
+    frames = _no_frames(positions.size)
     for leaf in leaves:
         texts = texts_of(values, leaf)
-        at = texts.codes[_owners(values, level, among, leaf.level)]
-        found = or_else(Texts(at, texts.words), found)
-    return found
+        codes = texts.codes[_owners_at(values, level, positions, leaf.level)]
+        frames = or_else(Texts(codes, texts.words), frames)
+    return frames
 
 
-def _owners(values: Values, level: Level, among: Ints, around: Level) -> Ints:
+def _owners_at(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
     """Returns, of some elements of a level, the elements or rows around them."""
-    while level != around:
+    while level != outer:
         elements = values.elements(level)
         if elements is None or level.parent is None:
             raise UnknownShapeError("elements are not held")
-        among, level = elements.owners[among], level.parent
-    return among
+        positions, level = elements.owners[positions], level.parent
+    return positions
 
 
 def _kind_at(definition: Definition, *path: str) -> str | Definition:
     """Returns what a field is; empty where there is no such field, or an array."""
-    found = fields_at(definition, path)
-    is_there = len(found) == len(path) and all(each.length is None for each in found)
-    return found[-1].kind if is_there else ""
+    fields = fields_at(definition, path)
+    is_there = len(fields) == len(path) and all(entry.length is None for entry in fields)
+    return fields[-1].kind if is_there else ""
 
 
-def _own_frame(definition: Definition) -> tuple[Leaf, ...]:
+def _header_frames(definition: Definition) -> tuple[Leaf, ...]:
     """Returns the frame in a message's own header, if it has one."""
     if _kind_at(definition, "header", "frame_id") not in {"string", "wstring"}:
         return ()
     return (Leaf(ROWS, ("header.frame_id",), Kind.TEXT),)
 
 
-def _with_frames(values: Values, found: Detections, own: tuple[Leaf, ...]) -> Detections:
+def _with_frames(
+    values: Values, detections: Detections, header_frames: tuple[Leaf, ...]
+) -> Detections:
     """Returns detections with the frame of their message where they name none."""
-    if not own or found.frames.words.count("") == 0:
-        return found
-    return found._replace(frames=or_else(found.frames, _frames(values, ROWS, found.rows, own)))
+    if not header_frames or detections.frames.words.count("") == 0:
+        return detections
+    return detections._replace(
+        frames=or_else(detections.frames, _frames_at(values, ROWS, detections.rows, header_frames))
+    )
 
 
 def _stamps(values: Values, definition: Definition) -> Ints | None:

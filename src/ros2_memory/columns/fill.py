@@ -133,10 +133,10 @@ class Filling:
         coverage = self._scanner.coverage(timeline)
         if coverage is None:
             return []
-        found = [bag for bag in coverage.missing if bag.state is BagState.CLOSED]
-        found += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
-        found = [bag for bag in found if not self._is_refused(self._key(bag))]
-        return self._fitting(sorted(found, key=in_time, reverse=True))
+        bags = [bag for bag in coverage.missing if bag.state is BagState.CLOSED]
+        bags += [bag for bag in coverage.unhashed() if self._is_shared(bag, timeline)]
+        bags = [bag for bag in bags if not self._is_refused(self._key(bag))]
+        return self._fitting(sorted(bags, key=in_time, reverse=True))
 
     def progress(self, timeline: Timeline) -> Progress:
         """Returns how much is stored. Any thread may ask."""
@@ -161,30 +161,30 @@ class Filling:
         stored = [coverage.bag(number) for number in self.store.unmerged()]
         alone = [bag for bag in stored if bag and not self._is_refused(self._key(bag))]
         slots: dict[tuple[str, Ns], list[BagFile]] = defaultdict(list)
-        found: list[Batch] = []
+        batches: list[Batch] = []
         for bag in [*self.waiting(timeline), *alone]:
             slots[self._slot(bag)].append(bag)
         for (_, begin), bags in slots.items():
             if self._is_over(begin, timeline):
-                found.append(Batch(bags, whole=True))
+                batches.append(Batch(bags, whole=True))
             else:
-                found += [Batch([bag], whole=False) for bag in bags if bag not in alone]
-        return found
+                batches += [Batch([bag], whole=False) for bag in bags if bag not in alone]
+        return batches
 
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         bags, whole = batch
-        found = DecodedBags([], [])
+        pending = DecodedBags([], [])
         done = held = 0
         for bag in sorted(bags, key=in_time):
-            begin = len(found.tables)
-            done += self._read(bag, found, hashed=self._is_shared(bag, timeline))
+            begin = len(pending.tables)
+            done += self._read(bag, pending, hashed=self._is_shared(bag, timeline))
             self._large.release()
-            held += sum(table.memory_bytes for table, _ in found.tables[begin:])
+            held += sum(table.memory_bytes for table, _ in pending.tables[begin:])
             if held > _MOST_HELD:
-                done += self._put(found, whole=whole)
-                found, held = DecodedBags([], []), 0
-        return done + self._put(found, whole=whole)
+                done += self._put(pending, whole=whole)
+                pending, held = DecodedBags([], []), 0
+        return done + self._put(pending, whole=whole)
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -239,8 +239,10 @@ class Filling:
             log.info("oldest_columns_deleted", bags=len(keys))
         self.store.give_back()
 
-    def _is_renewed(self, bag: BagFile) -> bool:
+    def _renew(self, bag: BagFile) -> bool:
         """Keeps what is stored of a bag if a new `handover.json` beside it changes nothing in it.
+
+        Returns whether it is kept.
 
         Each rotation writes that of a recording with many bags again, and it concerns one or two of
         these. All messages of the bag count now; if it was stored with as many, all did then.
@@ -251,20 +253,22 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _read(self, bag: BagFile, found: DecodedBags, *, hashed: bool) -> bool:
-        """Adds a bag to what was found; stores a long one, and returns whether it is stored."""
-        if not self._is_settled(bag):
+    def _read(self, bag: BagFile, pending: DecodedBags, *, hashed: bool) -> bool:
+        """Adds a bag to the pending ones, or stores a long one; returns whether it is stored."""
+        if not self._may_be_stored(bag):
             return False
         try:
-            if self._is_renewed(bag):
+            if self._renew(bag):
                 return True
-            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._is_settled, bag))
+            to_store = ReadBag(self._key(bag), bag, hashed, partial(self._may_be_stored, bag))
             # A latched message may come again later, in another recording.
-            groups = decoded(self._reader, bag.path, hashed=lambda each: hashed or each.latched)
+            groups = decoded(
+                self._reader, bag.path, hashed=lambda channel: hashed or channel.latched
+            )
             begin = [*islice(groups, 2)]
             if len(begin) > 1 or bag.end - bag.start > LONG_NS:
                 return self._put_long(to_store, self._released_groups(begin, groups))
-            found.add(to_store, begin[0] if begin else [])
+            pending.add(to_store, begin[0] if begin else [])
         except BagError as error:
             self._refuse(bag, error.reason)
         except Exception as error:
@@ -273,17 +277,17 @@ class Filling:
             self._refuse(bag, type(error).__name__)
         return False
 
-    def _put(self, decoded: DecodedBags, *, whole: bool) -> int:
+    def _put(self, pending: DecodedBags, *, whole: bool) -> int:
         """Stores bags in parts together; each alone where the database refuses that."""
-        bags = [to_store.bag for to_store in decoded.bags]
+        bags = [to_store.bag for to_store in pending.bags]
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
-        written = self.store.put(decoded, whole=whole)
+        written = self.store.put(pending, whole=whole)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                alone = (decoded.chosen([nth]) for nth in range(len(bags)))
-                return sum(self._put(one, whole=whole) for one in alone)
+                alone = (pending.chosen([nth]) for nth in range(len(bags)))
+                return sum(self._put(single, whole=whole) for single in alone)
             self._refuse(bags[0], self.store.refused_for or "")
         if written.parts and whole:
             begin = self._slot(bags[0])[1]
@@ -325,16 +329,17 @@ class Filling:
         length = sum(bag.end - bag.start for bag in bags) // NS_PER_S + len(bags)
         return max(round(self._limits.max_share * size), self._limits.least_bytes_per_s * length)
 
-    def _is_settled(self, bag: BagFile) -> bool:
+    def _may_be_stored(self, bag: BagFile) -> bool:
         return not self._are_files or is_settled(bag, self._bag_dir, self._clock.now())
 
     def _is_shared(self, bag: BagFile, timeline: Timeline) -> bool:
         """Returns whether messages of a bag may lie in another recording, too."""
-        if self._shared is None or self._shared[0] is not timeline:
+        shared_in, files = self._shared or (None, frozenset[str]())
+        if shared_in is not timeline:
             spans = [TimeWindow(*span) for span in timeline.shared_times]
-            files = (bag.file for span in spans for bag in timeline.overlapping(span))
-            self._shared = timeline, frozenset(files)
-        return bag.file in self._shared[1]
+            files = frozenset(bag.file for span in spans for bag in timeline.overlapping(span))
+            self._shared = timeline, files
+        return bag.file in files
 
     def _is_over(self, begin: Ns, timeline: Timeline) -> bool:
         """Returns whether no bag that belongs to ten minutes is to be expected."""
@@ -356,14 +361,14 @@ class Filling:
             return [*bags]
         most = round(_TRIMMED_TO * most)
         oldest, used = self.store.oldest(), self.store.used_bytes()
-        found: list[BagFile] = []
+        fitting: list[BagFile] = []
         for bag in bags:
             size = 2 * self._share([bag])
             is_newer = oldest is not None and bag.start >= oldest
             if (size if is_newer else used + size) <= most:
-                found.append(bag)
+                fitting.append(bag)
                 used += 0 if is_newer else size
-        return found
+        return fitting
 
     def _most_bytes(self) -> int | None:
         """Returns how much the store may take; None: beside the bags, retention sees to that."""

@@ -52,7 +52,7 @@ def forget(file: Path, bag_dir: Path, bags: Sequence[str]) -> None:
             with closing(
                 sqlite3.connect(address, uri=True, timeout=PATIENCE_S, isolation_level=None)
             ) as base:
-                _forget(base, bag_dir, bags)
+                _delete_bags_and_unused(base, bag_dir, bags)
                 rewrite(base)
     except (OSError, sqlite3.Error, ValueError) as error:
         reason = f"the columns may still contain deleted data ({error}); delete the file"
@@ -71,8 +71,8 @@ def delete_catalogue(file: Path) -> None:
         return
     try:
         if file.is_file() and not file.is_symlink() and _is_catalogue(file):
-            for one in files_of(file):
-                one.unlink(missing_ok=True)
+            for path in files_of(file):
+                path.unlink(missing_ok=True)
         for leftover in leftovers(file):
             if _is_catalogue(leftover):
                 leftover.unlink(missing_ok=True)
@@ -107,13 +107,13 @@ def rewrite(base: sqlite3.Connection) -> None:
     """
     give_up_s = time.monotonic() + PATIENCE_S
     for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
-        while not _done(base, statement):
+        while not _executed(base, statement):
             if time.monotonic() > give_up_s:
                 raise sqlite3.OperationalError("other programs use it all the time")
             time.sleep(_PAUSE_S)
 
 
-def _forget(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> None:
+def _delete_bags_and_unused(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> None:
     if base.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
         raise ValueError("it is of another version")
     for pragma in PRAGMAS:
@@ -154,7 +154,7 @@ def _delete_unused(base: sqlite3.Connection) -> None:
     base.execute("DELETE FROM summary WHERE id NOT IN (SELECT summary FROM bag)")
 
 
-def _done(base: sqlite3.Connection, statement: str) -> bool:
+def _executed(base: sqlite3.Connection, statement: str) -> bool:
     """Executes a statement; returns False if another program holds a lock."""
     try:
         row = base.execute(statement).fetchone()

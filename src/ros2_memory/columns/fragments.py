@@ -54,7 +54,7 @@ class Sized(Protocol):
 T = TypeVar("T", bound=Sized)
 
 
-class Kind(NamedTuple, Generic[T]):
+class FragmentKind(NamedTuple, Generic[T]):
     """A kind of fragments: what tells it apart from others in the file, and what it consists of.
 
     Attributes:
@@ -67,33 +67,37 @@ class Kind(NamedTuple, Generic[T]):
 
     name: str
     classes: tuple[type, ...]
-    join: Callable[[Sequence[T]], Sequence[T]] = lambda found: found
+    join: Callable[[Sequence[T]], Sequence[T]] = lambda fragments: fragments
 
 
-def to_bytes(made: object, classes: Sequence[type]) -> bytes:
+def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """Returns a fragment as it is stored: a line of JSON, and the bytes of arrays one by one.
 
     Each list in it begins with what it is: the number of a class, or a number below 0.
     """
-    numbers = {one: nth for nth, one in enumerate(classes)}
+    numbers = {cls: number for number, cls in enumerate(classes)}
     data: list[bytes] = []
 
-    def plain(one: object) -> object:
-        if isinstance(one, bytes):
-            data.append(one)
-            return [_BYTES, len(one)]
-        if isinstance(one, np.ndarray):
-            codec, least, packed = _packed(one)
+    def plain(value: object) -> object:
+        if isinstance(value, bytes):
+            data.append(value)
+            return [_BYTES, len(value)]
+        if isinstance(value, np.ndarray):
+            codec, least, packed = _packed(value)
             data.append(packed)
-            return [_ARRAY, len(packed), codec, least, one.dtype.str, *one.shape]
-        if type(one) in numbers:
-            values = [getattr(one, each.name) for each in fields(one)] if is_dataclass(one) else one
-            return [numbers[type(one)], *map(plain, cast("Iterable[object]", values))]
-        if isinstance(one, tuple | list):
-            return [_TUPLE, *map(plain, one)]
-        return {key: plain(each) for key, each in one.items()} if isinstance(one, dict) else one
+            return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
+        if type(value) in numbers:
+            parts: object = value
+            if is_dataclass(value):
+                parts = [getattr(value, field.name) for field in fields(value)]
+            return [numbers[type(value)], *map(plain, cast("Iterable[object]", parts))]
+        if isinstance(value, tuple | list):
+            return [_TUPLE, *map(plain, value)]
+        if isinstance(value, dict):
+            return {key: plain(entry) for key, entry in value.items()}
+        return value
 
-    head = json.dumps(plain(made))
+    head = json.dumps(plain(fragment))
     return compressed(b"".join((head.encode(), b"\n", *data)))
 
 
@@ -103,28 +107,29 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
     Raises:
         ValueError, TypeError, LookupError, struct.error: the bytes are none.
     """
-    head, values = decompressed(data).split(b"\n", 1)
+    head, tail = decompressed(data).split(b"\n", 1)
     words: dict[str, str] = {}
-    at = 0
+    begin = 0
 
-    def made(one: object) -> object:
-        nonlocal at
-        if isinstance(one, str):
-            return words.setdefault(one, one)  # equal ones are one object: there are thousands
-        if isinstance(one, dict):
-            return {key: made(each) for key, each in one.items()}
-        if not isinstance(one, list):
-            return one
-        what, *rest = one
-        if what >= 0:
-            return classes[what](*map(made, rest))
-        if what == _TUPLE:
-            return tuple(map(made, rest))
-        own = values[at : at + rest[0]]
-        at += rest[0]
-        return own if what == _BYTES else _unpacked(own, *rest[1:])
+    def restored(value: object) -> object:
+        nonlocal begin
+        if isinstance(value, str):
+            return words.setdefault(value, value)  # equal ones are one object: there are thousands
+        if isinstance(value, dict):
+            return {key: restored(entry) for key, entry in value.items()}
+        if not isinstance(value, list):
+            return value
+        number, *rest = value
+        if number >= 0:
+            return classes[number](*map(restored, rest))
+        if number == _TUPLE:
+            return tuple(map(restored, rest))
+        size, *array = rest
+        packed = tail[begin : begin + size]
+        begin += size
+        return packed if number == _BYTES else _unpacked(packed, *array)
 
-    return made(json.loads(head))
+    return restored(json.loads(head))
 
 
 def _packed(array: Array) -> tuple[str, float | None, bytes]:
@@ -132,10 +137,10 @@ def _packed(array: Array) -> tuple[str, float | None, bytes]:
     if array.size >= _FEW:
         flat = array.reshape(-1, order="F")
         for step in (METRES, EXACT):
-            found = pack(flat, step)
-            again = unpack(found.codec, found.count, found.zone.least, found.data)
-            if cast("Array", again).tobytes() == flat.tobytes():
-                return found.codec, found.zone.least, found.data
+            column = pack(flat, step)
+            unpacked = unpack(column.codec, column.count, column.zone.least, column.data)
+            if cast("Array", unpacked).tobytes() == flat.tobytes():
+                return column.codec, column.zone.least, column.data
     return "", None, array.tobytes()
 
 
@@ -163,17 +168,17 @@ class FragmentKey(NamedTuple):
 class Joined(NamedTuple, Generic[T]):
     """The fragments of a stretch of the clock, joined."""
 
-    found: Sequence[T]
+    fragments: Sequence[T]
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory they take."""
-        return 100 + sum(one.memory_bytes for one in self.found)
+        return 100 + sum(fragment.memory_bytes for fragment in self.fragments)
 
 
-def joining(kind: Kind[T]) -> Kind[Joined[T]]:
+def joining(kind: FragmentKind[T]) -> FragmentKind[Joined[T]]:
     """Returns the kind of the joined fragments of a kind."""
-    return Kind(f"{kind.name}-joined", (*kind.classes, Joined))
+    return FragmentKind(f"{kind.name}-joined", (*kind.classes, Joined))
 
 
 class Fragments(Generic[T]):
@@ -187,7 +192,11 @@ class Fragments(Generic[T]):
     """
 
     def __init__(
-        self, store: ColumnStore | None, kind: Kind[T], settings: str, remembered: ByteLru[object]
+        self,
+        store: ColumnStore | None,
+        kind: FragmentKind[T],
+        settings: str,
+        remembered: ByteLru[object],
     ) -> None:
         self._store = store
         self._kind = kind
@@ -203,21 +212,21 @@ class Fragments(Generic[T]):
         asked for next.
         """
         # By name: each kind has one type.
-        found = cast("T | None", self._remembered.get((self._kind.name, key)))
-        if found is None and self._store is not None:
+        fragment = cast("T | None", self._remembered.get((self._kind.name, key)))
+        if fragment is None and self._store is not None:
             for other, data in self._store.fragments(self._name, key, also_before):
-                made = self._loaded(data)
-                if made is not None:
-                    self._remember(other, made)
-                    found = made if other == key else found
-        return found
+                loaded = self._loaded(data)
+                if loaded is not None:
+                    self._remember(other, loaded)
+                    fragment = loaded if other == key else fragment
+        return fragment
 
-    def put(self, key: FragmentKey, made: T) -> None:
+    def put(self, key: FragmentKey, fragment: T) -> None:
         """Remembers a fragment, which waits to be stored."""
-        self._remember(key, made)
+        self._remember(key, fragment)
         if self._store is not None:
             with self._lock:
-                self._waiting.append((key, made))
+                self._waiting.append((key, fragment))
 
     def write(self) -> None:
         """Stores what was made since; not what follows from parts that are deleted meanwhile."""
@@ -225,11 +234,12 @@ class Fragments(Generic[T]):
             waiting = [*self._waiting]
             self._waiting.clear()
         if self._store is not None and waiting:
-            made = [(key, to_bytes(made, self._kind.classes)) for key, made in waiting]
-            self._store.put_fragments(self._name, made)
+            classes = self._kind.classes
+            packed = [(key, to_bytes(fragment, classes)) for key, fragment in waiting]
+            self._store.put_fragments(self._name, packed)
 
-    def _remember(self, key: FragmentKey, made: T) -> None:
-        self._remembered.put((self._kind.name, key), made, made.memory_bytes + _KEY_BYTES)
+    def _remember(self, key: FragmentKey, fragment: T) -> None:
+        self._remembered.put((self._kind.name, key), fragment, fragment.memory_bytes + _KEY_BYTES)
 
     def _loaded(self, data: bytes) -> T | None:
         try:

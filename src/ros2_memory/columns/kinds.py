@@ -19,40 +19,40 @@ from ros2_memory.analysis.topic_events import (
     TopicEvents,
     joined_events,
 )
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.core.arrays import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
 
-def _joined_stands(found: Sequence[Stands]) -> Sequence[Stands]:
-    drops = tuple(drop for part in found for drop in part.drops)
+def _joined_stands(parts: Sequence[Stands]) -> Sequence[Stands]:
+    drops = tuple(drop for part in parts for drop in part.drops)
     return [
-        Stands(stacked([part.blocks for part in found]), drops, max(part.last for part in found))
+        Stands(stacked([part.blocks for part in parts]), drops, max(part.last for part in parts))
     ]
 
 
-def _joined_events(found: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
-    whole = joined_events(found)
+def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
+    whole = joined_events(parts)
     return [] if whole is None else [whole]
 
 
-def _joined_tracks(found: Sequence[TrackPart]) -> Sequence[TrackPart]:
+def _joined_tracks(parts: Sequence[TrackPart]) -> Sequence[TrackPart]:
     by_recording: dict[str, list[TrackPart]] = {}
-    for part in found:
+    for part in parts:
         by_recording.setdefault(part.recording, []).append(part)
     return [*map(united_parts, by_recording.values())]
 
 
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
-PATHS: Final[Kind[PathSlice]] = Kind("path", (*_MOTION, Poses, Frames))
+PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, Frames))
 """The path of the poses of a topic in a slice of the clock."""
-STANDS: Final = Kind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
+STANDS: Final = FragmentKind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
 """Where the robot may have stood in a slice of the clock, by the poses of a topic."""
-EVENTS: Final = Kind(
+EVENTS: Final = FragmentKind(
     "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
 )
 """What came into view, changed or failed on a topic in a part."""
-TRACKS: Final = Kind("track", (TrackPart,), _joined_tracks)
+TRACKS: Final = FragmentKind("track", (TrackPart,), _joined_tracks)
 """Where the poses of a part have the robot in a frame; joined, those of a recording."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Definition
 
 
-class Kind(NamedTuple):
+class ColumnKind(NamedTuple):
     """What a column is: `text` or numpy's name of its dtype, and how exactly it is stored."""
 
     dtype: str
@@ -34,29 +34,31 @@ class Layout:
         left_out: what is no column, and why.
     """
 
-    slots: Mapping[str, Kind]
+    slots: Mapping[str, ColumnKind]
     left_out: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
     def of(cls, table: Table, definition: Definition | None) -> Layout:
         """Returns that of a table; the definition names the steps."""
-        kinds = {path: _kind(column, path, definition) for path, column in columns_in(table)}
+        kinds = {path: _kind_of(column, path, definition) for path, column in columns_in(table)}
         return cls(kinds, table.left_out)
 
     @cached_property
-    def levels(self) -> dict[str, Level]:
+    def levels(self) -> dict[str, LevelPaths]:
         """The columns of the messages (""), and of the elements of each sequence by its path."""
-        levels: dict[str, Level] = {"": Level({}, {})}
-        here = ""
+        levels: dict[str, LevelPaths] = {"": LevelPaths({}, {})}
+        sequence = ""
         for path in self.slots:
             if path.endswith("#"):
-                here = path[:-1]
-                around = max((each for each in levels if here.startswith(f"{each}.")), default="")
-                levels[around].sequences[here.removeprefix(f"{around}.")] = here
-                levels[here] = Level({}, {})
+                sequence = path[:-1]
+                parent = max(
+                    (outer for outer in levels if sequence.startswith(f"{outer}.")), default=""
+                )
+                levels[parent].sequences[sequence.removeprefix(f"{parent}.")] = sequence
+                levels[sequence] = LevelPaths({}, {})
             else:
-                name = path.removeprefix(here).removeprefix(".") if here else path
-                levels[here].columns[name] = path
+                name = path.removeprefix(sequence).removeprefix(".") if sequence else path
+                levels[sequence].columns[name] = path
         return levels
 
     def fits(self, table: Table) -> bool:
@@ -94,11 +96,11 @@ class Layout:
         slots = {}
         for path, words in dict(described["columns"]).items():
             dtype, _, step = str(words).partition(" ")
-            slots[path] = Kind(dtype, Step.parse(step) if step else EXACT)
+            slots[path] = ColumnKind(dtype, Step.parse(step) if step else EXACT)
         return cls(slots, described["left_out"])
 
 
-class Level(NamedTuple):
+class LevelPaths(NamedTuple):
     """The columns of messages or elements, and the sequences in them: by their names, the paths."""
 
     columns: dict[str, str]
@@ -114,8 +116,8 @@ def columns_in(rows: Table | Elements, around: str = "") -> Iterator[tuple[str, 
         yield from columns_in(inner, f"{around}{name}.")
 
 
-def _kind(column: Column, path: str, definition: Definition | None) -> Kind:
+def _kind_of(column: Column, path: str, definition: Definition | None) -> ColumnKind:
     if isinstance(column, Texts):
-        return Kind("text")
+        return ColumnKind("text")
     name = column.dtype.name
-    return Kind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)
+    return ColumnKind(name, step_of(path, definition) if column.dtype.kind == "f" else EXACT)

@@ -18,7 +18,7 @@ from ros2_memory.columns.shown import (
     placed,
     shape_of,
 )
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -92,7 +92,7 @@ def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | Non
     if len(leaves) != 1 or leaves[0][0].level is not ROWS or leaves[0][1]:
         return None
     leaf, _ = leaves[0]
-    return leaf.sources[0] if leaf.made in {Made.STORED, Made.REAL} else None
+    return leaf.sources[0] if leaf.conversion in {Conversion.STORED, Conversion.REAL} else None
 
 
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
@@ -107,14 +107,14 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     )
     ends = np.cumsum([part.rows.size for part in parts])
 
-    def exactly(among: Ints) -> Floats:
-        found = joined[order[among]].astype(np.float64)
+    def exactly(positions: Ints) -> Floats:
+        exact = joined[order[positions]].astype(np.float64)
         for part, end in zip(parts, ends.tolist(), strict=True):
-            places = order[among] - (end - part.rows.size)
-            mine = np.flatnonzero((places >= 0) & (places < part.rows.size))
-            if part.exactly is not None and mine.size:
-                found[mine] = part.exactly(places[mine])
-        return found
+            places = order[positions] - (end - part.rows.size)
+            of_part = np.flatnonzero((places >= 0) & (places < part.rows.size))
+            if part.exactly is not None and of_part.size:
+                exact[of_part] = part.exactly(places[of_part])
+        return exact
 
     is_settled = all(part.exactly is not None or part.error == 0 for part in parts)
     error = max(part.error for part in parts)
@@ -127,9 +127,9 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     )
 
 
-def _leaves(found: Node | None) -> Iterator[tuple[Leaf, Limits]]:
+def _leaves(value: Node | None) -> Iterator[tuple[Leaf, Limits]]:
     """Yields the numbers of a field; not those of a summary."""
-    for spot in () if found is None else opened(Spot(found)):
+    for spot in () if value is None else opened(Spot(value)):
         node = spot.node
         if isinstance(node, Message | Group) and _SUMMARY.issuperset(node.names()):
             continue
@@ -139,29 +139,29 @@ def _leaves(found: Node | None) -> Iterator[tuple[Leaf, Limits]]:
 
 
 def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | None:
-    known = values.numbers(leaf)
-    if known is None or not values.holds_all(leaf):
+    numbers = values.numbers(leaf)
+    if numbers is None or not values.holds_all(leaf):
         return None
-    everything = np.arange(len(known.values))
+    everything = np.arange(len(numbers.values))
     kept, rows = placed(values, leaf.level, everything, limits, surely=True)
     if len(kept) < len(placed(values, leaf.level, everything, limits, surely=False)[0]):
         return None
-    is_all = len(kept) == len(known.values)
-    column = known.values if is_all else known.values[kept]
+    is_all = len(kept) == len(numbers.values)
+    column = numbers.values if is_all else numbers.values[kept]
     is_finite = np.isfinite(column)
     if not is_finite.all():
         column, rows, kept = column[is_finite], rows[is_finite], kept[is_finite]
     if column.dtype.kind != "u" or not (column > _LARGEST_INT64).any():
         is_whole = column.dtype.kind in "iu"
         column = column.astype(np.int64 if is_whole else np.float64, copy=False)
-    found = FieldNumbers(
+    of_field = FieldNumbers(
         rows,
         column,
-        float(np.max(known.error, initial=0.0)),
+        float(np.max(numbers.error, initial=0.0)),
     )
-    if isinstance(known.error, np.ndarray):
-        found = found._replace(errors=known.error[kept])
-    if known.exactly is not None:
-        exactly = known.exactly
-        found = found._replace(exactly=lambda among: exactly(kept[among]))
-    return found
+    if isinstance(numbers.error, np.ndarray):
+        of_field = of_field._replace(errors=numbers.error[kept])
+    if numbers.exactly is not None:
+        exactly = numbers.exactly
+        of_field = of_field._replace(exactly=lambda positions: exactly(kept[positions]))
+    return of_field

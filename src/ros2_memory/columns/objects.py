@@ -9,16 +9,16 @@ import numpy as np
 
 from ros2_memory.columns.plan import Array, Number, NumberSequence, Plan, Run, Sequence, Text, Time
 from ros2_memory.columns.table import MAX_RANGED_BYTES, Elements, Numbers, Texts
-from ros2_memory.columns.walk import Level, add_array, add_sequence
+from ros2_memory.columns.walk import LevelColumns, add_array, add_sequence
 from ros2_memory.core.timebase import NS_PER_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence as Values
 
 
-def level_of(plan: Plan, messages: Values[object]) -> Level:
+def level_of(plan: Plan, messages: Values[object]) -> LevelColumns:
     """Returns the columns of decoded messages of the type of a plan."""
-    level = Level(left_out=dict(plan.left_out))
+    level = LevelColumns(left_out=dict(plan.left_out))
     for step in plan.steps:
         if isinstance(step, Run):
             for entry in step.fields:
@@ -37,7 +37,7 @@ def _values(messages: Values[object], attribute: str) -> Values[object]:
     return list(map(attrgetter(attribute), messages)) if attribute else messages
 
 
-def _add_fixed(level: Level, entry: Number | Time | Array, messages: Values[object]) -> None:
+def _add_fixed(level: LevelColumns, entry: Number | Time | Array, messages: Values[object]) -> None:
     values = _values(messages, entry.attribute)
     if isinstance(entry, Time):
         seconds = np.array(_values(values, "sec"), np.int64)
@@ -54,7 +54,7 @@ def _add_fixed(level: Level, entry: Number | Time | Array, messages: Values[obje
         level.columns[entry.path] = np.array(values, dtype)
 
 
-def _add_numbers(level: Level, step: NumberSequence, messages: Values[object]) -> None:
+def _add_numbers(level: LevelColumns, step: NumberSequence, messages: Values[object]) -> None:
     arrays = [_numbers(value) for value in _values(messages, step.attribute)]
     counts = np.array([array.size for array in arrays], np.int64)
     looked_at = [array for array in arrays if array.size * step.size <= MAX_RANGED_BYTES]
@@ -63,7 +63,7 @@ def _add_numbers(level: Level, step: NumberSequence, messages: Values[object]) -
     add_sequence(level, step.path, counts, values, is_bool=step.is_bool)
 
 
-def _add_elements(level: Level, step: Sequence, messages: Values[object]) -> None:
+def _add_elements(level: LevelColumns, step: Sequence, messages: Values[object]) -> None:
     lists = [
         value if isinstance(value, list) else [] for value in _values(messages, step.attribute)
     ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
 import numpy as np
 
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.table import IN_PART, SPACES, Numbers, Table, Texts, letters_of
 
 if TYPE_CHECKING:
@@ -63,25 +63,31 @@ class Letters(NamedTuple):
     @classmethod
     def of(cls, texts: Texts) -> Letters | None:
         """Returns the letters of texts; None where they are too many."""
-        known: dict[frozenset[str], int] = {}
-        alike = [
-            known.setdefault(frozenset(text.casefold().translate(SPACES).split()), len(known))
+        number_of: dict[frozenset[str], int] = {}
+        spelling = [
+            number_of.setdefault(
+                frozenset(text.casefold().translate(SPACES).split()), len(number_of)
+            )
             for text in texts.words
         ]
-        words = sorted(frozenset().union(*known))
+        words = sorted(frozenset().union(*number_of))
         if len(words) > _MOST_LETTERS:
             return None
-        has = np.array([[word in some for some in known] for word in words], np.bool_)
-        rows = has.reshape(len(words), len(known))[:, np.array(alike, np.int64)[texts.codes]]
+        has_word = np.array(
+            [[word in spelled for spelled in number_of] for word in words], np.bool_
+        )
+        rows = has_word.reshape(len(words), len(number_of))[
+            :, np.array(spelling, np.int64)[texts.codes]
+        ]
         return cls(tuple(words), np.packbits(rows, axis=1), len(texts))
 
     def may_have(self, text: str) -> Mask:
         """Returns in which texts a casefolded text may be; surely, if it is one row of letters."""
-        found = np.full(self.has.shape[1], 0xFF, np.uint8)
+        bits = np.full(self.has.shape[1], 0xFF, np.uint8)
         for letters in letters_of(text):
-            here = [nth for nth, word in enumerate(self.words) if letters in word]
-            found &= np.bitwise_or.reduce(self.has[here], axis=0)
-        return np.unpackbits(found, count=self.size).view(np.bool_)
+            containing = [nth for nth, word in enumerate(self.words) if letters in word]
+            bits &= np.bitwise_or.reduce(self.has[containing], axis=0)
+        return np.unpackbits(bits, count=self.size).view(np.bool_)
 
 
 class Outline(NamedTuple):
@@ -104,12 +110,14 @@ class Outline(NamedTuple):
     @classmethod
     def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
         """Returns the outline of columns, by their paths."""
-        every = [*totals.values()]
+        ordered = [*totals.values()]
         return cls(
             [*totals],
-            np.array([one.size for one in every], np.int64),
-            np.array([one.total for one in every], np.float64),
-            np.array([(*one.least, *one.greatest) for one in every], np.int64).reshape(-1, 4),
+            np.array([column.size for column in ordered], np.int64),
+            np.array([column.total for column in ordered], np.float64),
+            np.array([(*column.least, *column.greatest) for column in ordered], np.int64).reshape(
+                -1, 4
+            ),
             letters,
         )
 
@@ -125,7 +133,9 @@ class Outline(NamedTuple):
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        texts = sum(one.has.nbytes + 100 * len(one.words) for one in self.letters.values())
+        texts = sum(
+            letters.has.nbytes + 100 * len(letters.words) for letters in self.letters.values()
+        )
         return texts + _BYTES + 120 * len(self.paths)
 
 
@@ -137,17 +147,17 @@ def outline_of(table: Table, times: IntArray) -> Outline:
         zone = table.zone(path)
         if zone is not None and (zone.words or "").startswith(IN_PART):
             texts = table.columns[path]
-            found = Letters.of(texts) if isinstance(texts, Texts) else None
-            if found is not None:
-                letters[path] = found
+            in_texts = Letters.of(texts) if isinstance(texts, Texts) else None
+            if in_texts is not None:
+                letters[path] = in_texts
         elif zone is not None and np.isfinite([zone.low, zone.high]).all():
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
-                totals[path] = _totals(column, table.error(path), times)
+                totals[path] = _totals_of(column, table.error(path), times)
     return Outline.of(totals, letters)
 
 
-def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
+def _totals_of(column: Numbers, error: float, times: IntArray) -> Totals:
     is_finite = np.isfinite(column)
     if not is_finite.all():
         column, times = column[is_finite], times[is_finite]
@@ -155,12 +165,12 @@ def _totals(column: Numbers, error: float, times: IntArray) -> Totals:
     with np.errstate(over="ignore", invalid="ignore"):  # not finite where no float holds it
         total = float(numbers.sum(dtype=np.float64))
     if error == 0.0:
-        ends = [int(times[nth]) for nth in (numbers.argmin(), numbers.argmax())]
-        return Totals(len(numbers), total, (ends[0],) * 2, (ends[1],) * 2)
-    least = times[numbers - error <= (numbers + error).min()]
-    most = times[numbers + error >= (numbers - error).max()]
-    spans = [(int(some[0]), int(some[-1])) for some in (least, most)]
+        least, greatest = int(times[numbers.argmin()]), int(times[numbers.argmax()])
+        return Totals(len(numbers), total, (least, least), (greatest, greatest))
+    may_be_least = times[numbers - error <= (numbers + error).min()]
+    may_be_greatest = times[numbers + error >= (numbers - error).max()]
+    spans = [(int(ends[0]), int(ends[-1])) for ends in (may_be_least, may_be_greatest)]
     return Totals(len(numbers), total, *spans)
 
 
-OUTLINE: Final[Kind[Outline]] = Kind("outline", (Outline, Letters))
+OUTLINE: Final[FragmentKind[Outline]] = FragmentKind("outline", (Outline, Letters))

@@ -110,14 +110,14 @@ class Packed:
 def pack(column: Column, step: Step = EXACT) -> Packed:
     """Returns the column as bytes. `step` counts for floats alone; all others are exact."""
     if isinstance(column, Texts):
-        found = _pack_texts(column)
+        packed = _pack_texts(column)
     elif not len(column):
         return Packed(f"{column.dtype.name} constant", 0, 0.0, Zone(), b"")
     elif column.dtype.kind == "f":
-        found = _pack_floats(column, step)
+        packed = _pack_floats(column, step)
     else:
-        found = _pack_integers(column)
-    return _arranged(found) if isinstance(found, _Whole) else found
+        packed = _pack_integers(column)
+    return _arranged(packed) if isinstance(packed, _Whole) else packed
 
 
 def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
@@ -150,10 +150,10 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
             dtype, copy=False
         )
     stored = np.dtype(np.float32) if form == "float32" else dtype
-    rounded = form == "rounded"
-    lowest = int(_ordered(np.array([least], stored), rounded=rounded)[0])
+    is_rounded = form == "rounded"
+    lowest = int(_ordered(np.array([least], stored), rounded=is_rounded)[0])
     whole = _whole_numbers(arrangement, count, lowest, data)
-    return _from_ordered(whole, stored, rounded=rounded).astype(dtype, copy=False)
+    return _from_ordered(whole, stored, rounded=is_rounded).astype(dtype, copy=False)
 
 
 def compressed(data: bytes) -> bytes:
@@ -260,24 +260,24 @@ def _exactly(column: Numbers, zone: Zone) -> _Whole:
 
 
 def _zone_of(values: Floats) -> Zone:
-    there = values
+    numbers = values
     if math.isnan(values.min()):
-        there = values[~np.isnan(values)]
-        if not len(there):
+        numbers = values[~np.isnan(values)]
+        if not len(numbers):
             return Zone(nulls=len(values))
     # -0.0 becomes 0.0
-    least, greatest = float(there.min()) + 0.0, float(there.max()) + 0.0
-    return Zone(least, greatest, len(values) - len(there))
+    least, greatest = float(numbers.min()) + 0.0, float(numbers.max()) + 0.0
+    return Zone(least, greatest, len(values) - len(numbers))
 
 
 def _ordered(values: Numbers, *, rounded: bool = False) -> IntArray:
     """The bits of floats as integers that are ordered as the floats are; NaN is the greatest."""
     integer, magnitude, dropped = _BITS[values.itemsize]
-    same = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
-    missing = np.isnan(same)
-    if missing.any():
-        same[missing] = np.nan
-    bits = same.view(integer).astype(np.int64)
+    zeroed = np.add(values, 0.0, dtype=values.dtype)  # -0.0 becomes 0.0
+    is_nan = np.isnan(zeroed)
+    if is_nan.any():
+        zeroed[is_nan] = np.nan
+    bits = zeroed.view(integer).astype(np.int64)
     if rounded:
         bits = (bits + (1 << (dropped - 1))) >> dropped
         magnitude >>= dropped
@@ -391,8 +391,8 @@ def _in_use(column: Texts) -> Texts:
 
     Words of deleted rows must not stay in the file.
     """
-    used = np.bincount(column.codes, minlength=len(column.words)) > 0
-    return column if used.all() else column.rows(np.arange(len(column)))
+    is_used = np.bincount(column.codes, minlength=len(column.words)) > 0
+    return column if is_used.all() else column.rows(np.arange(len(column)))
 
 
 def folded(words: Collection[str]) -> str | None:

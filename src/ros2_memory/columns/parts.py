@@ -101,20 +101,20 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     Raises:
         ValueError: the table has other columns than the layout.
     """
-    own: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
+    common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
     packed: dict[str, Packed] = {}
     if table.payload_hashes is not None:
         is_hashed = table.payload_hashes != UNHASHED
-        own[PAYLOAD_HASH] = table.payload_hashes
-        own[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
+        common[PAYLOAD_HASH] = table.payload_hashes
+        common[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
         # Those of a table without columns may be log times.
         if is_hashed.all() or "" not in table.left_out:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
     steps = (kind.step for kind in layout.slots.values())
-    columns = [*own.values(), *layout.columns_of(table)]
-    packs = map(pack, columns, chain(repeat(EXACT, len(own)), steps))
-    packed.update(zip((*own, *layout.slots), packs, strict=True))
+    columns = [*common.values(), *layout.columns_of(table)]
+    packs = map(pack, columns, chain(repeat(EXACT, len(common)), steps))
+    packed.update(zip((*common, *layout.slots), packs, strict=True))
     return PackedPart(
         int(table.log_times[0]),
         int(table.log_times[-1]),

@@ -200,9 +200,9 @@ class _Planner:
         layout = self.layout or ()
         unit = max((align for align, _ in layout), default=1)
         ends = () if self.layout is None else tuple(self._end(start) for start in range(unit))
-        objects = any(isinstance(step, Text | Sequence) for step in self.steps)
+        has_objects = any(isinstance(step, Text | Sequence) for step in self.steps)
         steps, left_out = tuple(self.steps), self.left_out
-        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, objects)
+        return Plan(steps, self.first or 1, self.least, unit, ends, left_out, has_objects)
 
     def _end(self, at: int) -> int:
         for align, size in self.layout or ():
@@ -263,10 +263,10 @@ class _Planner:
                 number = Number(at, attribute, dtype, kind == "bool", nth)
                 self._fixed(number, dtype.str, size, size)
             return
-        ranged = length * size <= MAX_RANGED_BYTES
-        array = Array(path, attribute, length, kind == "bool", ranged)
+        is_ranged = length * size <= MAX_RANGED_BYTES
+        array = Array(path, attribute, length, kind == "bool", is_ranged)
         self.left_out[path] = f"an array of {length} numbers"
-        if ranged:
+        if is_ranged:
             self._fixed(array, f"({length},){dtype.str}", size, length * size)
             return
         self._fixed(array, "", size, length * size)
@@ -311,7 +311,7 @@ class _Planner:
     def _flush(self) -> None:
         """Ends the run."""
         if self.size:
-            shown = [(str(nth), *entry[1:]) for nth, entry in enumerate(self.read) if entry[1]]
+            shown = [(str(nth), kind, at) for nth, (_, kind, at) in enumerate(self.read) if kind]
             dtype = np.dtype(
                 {
                     "names": [name for name, _, _ in shown],
@@ -352,16 +352,16 @@ def first_align(kind: str | Definition) -> int:
 
 def fields_at(definition: Definition | None, path: Iterable[str]) -> list[Field]:
     """Returns the fields along a path, each inside the one before, as far as there are such."""
-    found: list[Field] = []
+    fields: list[Field] = []
     kind: str | Definition | None = definition
     for name in path:
         inside = kind.fields if isinstance(kind, Definition) else ()
-        own = next((each for each in inside if each.name == name), None)
-        if own is None:
+        member = next((entry for entry in inside if entry.name == name), None)
+        if member is None:
             break
-        found.append(own)
-        kind = own.kind
-    return found
+        fields.append(member)
+        kind = member.kind
+    return fields
 
 
 def _dtype(kind: str | Definition) -> np.dtype[np.generic[object]]:

@@ -73,9 +73,9 @@ class PoseColumns:
             raise NoPoseError
         try:
             if index is not None:
-                return _read(_Rows(table, index), columns, times)
+                return _read(_RoundedRows(table, index), columns, times)
             return table.remember(
-                "poses", lambda: _read(_Rows(table, None), columns, times), _bytes_of
+                "poses", lambda: _read(_RoundedRows(table, None), columns, times), _bytes_of
             )
         except UnknownShapeError:
             return None
@@ -87,6 +87,13 @@ def _bytes_of(poses: Poses) -> int:
 
 class NoPoseError(Exception):
     """Messages of a type have no pose."""
+
+
+class _Paths(NamedTuple):
+    """Which columns a place and a rotation are in; see `_Columns`."""
+
+    axes: tuple[str, ...]
+    turn: tuple[str, ...]
 
 
 class _Columns(NamedTuple):
@@ -124,8 +131,8 @@ class _Field(NamedTuple):
         """Returns the paths of its fields with these names; none unless all are numbers."""
         if self.length is not None or not isinstance(self.kind, Definition):
             return ()
-        found = [_field(self.kind, (name,)) for name in names]
-        paths = tuple(f"{self.path}.{part.path}" for part in found if part and part.is_number)
+        fields = [_field_at(self.kind, (name,)) for name in names]
+        paths = tuple(f"{self.path}.{part.path}" for part in fields if part and part.is_number)
         return paths if len(paths) == len(names) else ()
 
     def elements(self, count: int) -> tuple[str, ...]:
@@ -141,96 +148,96 @@ class _Field(NamedTuple):
         return tuple(f"{self.path}.{nth}" for nth in range(count))
 
 
-def _field(definition: Definition, path: Segments) -> _Field | None:
+def _field_at(definition: Definition, path: Segments) -> _Field | None:
     """Returns the field at a path; None where there is none.
 
     Raises:
         UnknownShapeError: it leads through a list.
     """
-    found = fields_at(definition, path)
-    if any(each.length is not None for each in found[: len(path) - 1]):
+    fields = fields_at(definition, path)
+    if any(entry.length is not None for entry in fields[: len(path) - 1]):
         raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
-    if len(found) < len(path):
+    if len(fields) < len(path):
         return None
-    return _Field(".".join(path), found[-1].kind, found[-1].length)
+    return _Field(".".join(path), fields[-1].kind, fields[-1].length)
 
 
 def _columns_of(plan: Plan, definition: Definition) -> _Columns:
     """Returns where poses are in messages of a type; without axes where they have none."""
-    found: tuple[tuple[str, ...], tuple[str, ...]] | None = None
-    routes = [*plan.poses]
-    if plan is UNMAPPED:
-        names = [each.name for each in definition.fields]
-        heading = next((name for name in HEADINGS if name in names), None)
-        if heading is not None:
-            routes.append(PlanarPose(*map(Route, ("x", "y", "z", heading))))
-    for route in routes:
-        if isinstance(route, PlanarPose):
-            found = _planar(route, definition)
-        else:
-            found = _point(route, definition)
-        if found is not None:
-            break
-    if found is None:
+    paths = _pose(plan, definition)
+    if paths is None:
         return _Columns((), (), "", "", ())
-    frame = _field(definition, FRAME.segments)
-    named = frame is not None and frame.length is None and frame.kind in _TEXTS
-    numbered = plan.pose_frame and _field(definition, plan.pose_frame.segments)
+    frame = _field_at(definition, FRAME.segments)
+    is_named = frame is not None and frame.length is None and frame.kind in _TEXTS
+    numbered = plan.pose_frame and _field_at(definition, plan.pose_frame.segments)
     return _Columns(
-        *found,
-        frame.path if frame is not None and named else "",
+        *paths,
+        frame.path if frame is not None and is_named else "",
         numbered.path if numbered and numbered.is_number else "",
         _velocity(plan, definition),
     )
 
 
-def _point(
-    route: PointPose, definition: Definition
-) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    place, turned = (
-        _field(definition, each.segments) for each in (route.position, route.orientation)
-    )
-    axes = place.parts("xyz") if place else ()
-    turn = turned.parts("xyzw") if turned else ()
+def _pose(plan: Plan, definition: Definition) -> _Paths | None:
+    """Returns the paths of the first route by which messages of a type have a pose."""
+    routes = [*plan.poses]
+    if plan is UNMAPPED:
+        names = [entry.name for entry in definition.fields]
+        heading = next((name for name in HEADINGS if name in names), None)
+        if heading is not None:
+            routes.append(PlanarPose(*map(Route, ("x", "y", "z", heading))))
+    for route in routes:
+        if isinstance(route, PlanarPose):
+            paths = _planar(route, definition)
+        else:
+            paths = _point(route, definition)
+        if paths is not None:
+            return paths
+    return None
+
+
+def _point(route: PointPose, definition: Definition) -> _Paths | None:
+    position = _field_at(definition, route.position.segments)
+    orientation = _field_at(definition, route.orientation.segments)
+    axes = position.parts("xyz") if position else ()
+    turn = orientation.parts("xyzw") if orientation else ()
     if route.arrays:
-        axes = axes or (place.elements(3) if place else ())
+        axes = axes or (position.elements(3) if position else ())
         # PX4 writes w first.
-        elements = turned.elements(4) if turned and not turn else ()
+        elements = orientation.elements(4) if orientation and not turn else ()
         turn = turn or (*elements[1:], *elements[:1])
-    return (axes, turn) if axes else None
+    return _Paths(axes, turn) if axes else None
 
 
-def _planar(
-    route: PlanarPose, definition: Definition
-) -> tuple[tuple[str, ...], tuple[str, ...]] | None:
-    x, y, z, heading = (
-        each.path if each and each.is_number else ""
-        for each in (
-            _field(definition, axis.segments) for axis in (route.x, route.y, route.z, route.heading)
-        )
-    )
+def _planar(route: PlanarPose, definition: Definition) -> _Paths | None:
+    routes = (route.x, route.y, route.z, route.heading)
+    fields = (_field_at(definition, axis.segments) for axis in routes)
+    x, y, z, heading = (entry.path if entry and entry.is_number else "" for entry in fields)
     if not x or not y:
         return None
-    return (x, y, z) if z else (x, y), (heading,) if heading else ()
+    return _Paths((x, y, z) if z else (x, y), (heading,) if heading else ())
 
 
 def _velocity(plan: Plan, definition: Definition) -> tuple[str, ...]:
-    for linear, angular in plan.twists:
-        along, about = (_field(definition, each.segments) for each in (linear, angular))
-        if along is None or about is None:
+    """Returns the paths of the first linear velocity that an angular one stands beside."""
+    for linear_route, angular_route in plan.twists:
+        linear = _field_at(definition, linear_route.segments)
+        angular = _field_at(definition, angular_route.segments)
+        if linear is None or angular is None:
             continue
-        found, turning = along.parts("xyz"), about.parts("xyz")
-        if not found and plan is not UNMAPPED:
-            found, turning = (
-                (each.path,) if each.is_number else each.elements(3) for each in (along, about)
+        velocity, turning = linear.parts("xyz"), angular.parts("xyz")
+        if not velocity and plan is not UNMAPPED:
+            velocity, turning = (
+                (entry.path,) if entry.is_number else entry.elements(3)
+                for entry in (linear, angular)
             )
-        if found and turning:
-            return found
+        if velocity and turning:
+            return velocity
     return ()
 
 
-class _Rows:
-    """Some rows of a table."""
+class _RoundedRows:
+    """Some rows of a table, with their numbers as the store rounds them."""
 
     def __init__(self, table: Table, index: IntArray | None) -> None:
         self._table = table
@@ -265,7 +272,7 @@ def rounded(values: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
         return np.where(np.abs(values) < _MOST_STEPPED, whole, values)
 
 
-def _read(rows: _Rows, columns: _Columns, times: IntArray) -> Poses:
+def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:
     positions = np.zeros((times.size, 3))
     for axis, path in enumerate(columns.axes):
         positions[:, axis] = rows.floats(path, METRES)
@@ -274,17 +281,17 @@ def _read(rows: _Rows, columns: _Columns, times: IntArray) -> Poses:
         speeds = np.abs(rows.floats(columns.velocity[0], VELOCITY))
         for path in columns.velocity[1:]:
             speeds = np.hypot(speeds, rows.floats(path, VELOCITY))
-    turns, frames = _turns(rows, columns, times.size), _frames(rows, columns, times.size)
+    turns, frames = _turns(rows, columns, times.size), _frames_of(rows, columns, times.size)
     return Poses(times, positions, turns, Frames(frames.codes, frames.words), speeds)
 
 
-def _turns(rows: _Rows, columns: _Columns, count: int) -> Vectors:
+def _turns(rows: _RoundedRows, columns: _Columns, count: int) -> Vectors:
     turns = np.full((count, 4), np.nan)
     if len(columns.turn) == 1:
         halves = rows.floats(columns.turn[0], RADIANS) / 2
-        known = np.isfinite(halves)
-        turns[known, :2] = 0.0
-        turns[known, 2], turns[known, 3] = np.sin(halves[known]), np.cos(halves[known])
+        is_known = np.isfinite(halves)
+        turns[is_known, :2] = 0.0
+        turns[is_known, 2], turns[is_known, 3] = np.sin(halves[is_known]), np.cos(halves[is_known])
     elif columns.turn:
         for part, path in enumerate(columns.turn):
             turns[:, part] = rows.floats(path, EXACT)
@@ -308,7 +315,7 @@ def _at_unit_length(turns: Vectors) -> Vectors:
         return np.where(is_unit[:, None], turns, np.where(is_turn[:, None], scaled, np.nan))
 
 
-def _frames(rows: _Rows, columns: _Columns, count: int) -> Texts:
+def _frames_of(rows: _RoundedRows, columns: _Columns, count: int) -> Texts:
     """Returns the frames: those of the headers, and PX4's where these are empty."""
     frames = Texts(np.zeros(count, np.uint32), ("",) if count else ())
     if columns.frame:
@@ -316,5 +323,6 @@ def _frames(rows: _Rows, columns: _Columns, count: int) -> Texts:
     if not columns.numbered_frame or all(frames.words):
         return frames
     numbers = rows.floats(columns.numbered_frame, METRES).astype(np.int64)
-    own = [POSE_FRAMES.get(number, "") for number in numbers.tolist()]
-    return Texts.of([named or other for named, other in zip(frames.values(), own, strict=True)])
+    px4_frames = [POSE_FRAMES.get(number, "") for number in numbers.tolist()]
+    both = zip(frames.values(), px4_frames, strict=True)
+    return Texts.of([frame or px4_frame for frame, px4_frame in both])

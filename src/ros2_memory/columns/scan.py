@@ -57,7 +57,7 @@ _TOO_LARGE: Final = "its messages are too large to hold their columns"
 
 
 @dataclass(frozen=True, slots=True)
-class Asked:
+class ScanRequest:
     """What a scan is of.
 
     Attributes:
@@ -117,7 +117,7 @@ class Stretch(NamedTuple):
     parts: tuple[int, ...] | None
 
     def key(self, settings: str = "") -> FragmentKey | None:
-        """Returns what tells apart what follows from its rows; None where that may change."""
+        """Returns the key of fragments made of its rows; None where these rows may change."""
         return None if self.parts is None else FragmentKey(self.window.start, settings, self.parts)
 
 
@@ -126,15 +126,15 @@ class Scan:
 
     Args:
         scanner: has what is stored.
-        asked: what it is of.
+        request: what it is of.
     """
 
-    def __init__(self, scanner: Scanner, asked: Asked) -> None:
+    def __init__(self, scanner: Scanner, request: ScanRequest) -> None:
         self._scanner = scanner
-        self._asked = asked
+        self._request = request
         self._coverage: Coverage | None = None
         self._shared = [
-            span for span in asked.shared if asked.window.overlaps(span[0], span[1] - 1)
+            span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
         ]
         self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
@@ -142,8 +142,8 @@ class Scan:
         self._relatched: dict[object, IntArray] = {}
         self._relatched_since = MAX_NS
         self._together: list[PartHead] = []
-        reach = asked.window
-        if asked.relatches:
+        reach = request.window
+        if request.relatches:
             reach = TimeWindow.everything()
         elif self._shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
@@ -163,7 +163,7 @@ class Scan:
     @property
     def window(self) -> TimeWindow:
         """The window that it is of."""
-        return self._asked.window
+        return self._request.window
 
     def rows(
         self, *, newest_first: bool = False, among: TimeWindow | None = None
@@ -179,17 +179,13 @@ class Scan:
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window, may_match = self._asked.window, self._asked.may_match
+        window = self._request.window
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
         sources = [s for s in sources if window.overlaps(s.first, s.last)]
-        ruled_out: set[int] = set()
-        if may_match is not None:
-            heads = [source.part for source in sources if source.part is not None]
-            wanted = self._scanner.matching(heads, may_match)
-            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
-        if not self._asked.may_not_match:
+        ruled_out = self._ruled_out(sources)
+        if not self._request.may_not_match:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
-        if (within := self._asked.within) is not None:
+        if (within := self._request.within) is not None:
             sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
         ahead = together = 1
         waiting: list[Rows] = []
@@ -198,28 +194,28 @@ class Scan:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                parts = sources[nth:ahead]
-                self._together = [each.part for each in parts if each.part is not None]
-            self._asked.check(source.last if newest_first else source.first)
-            may = source.part is None or source.part.number not in ruled_out
+                self._together = [s.part for s in sources[nth:ahead] if s.part is not None]
+            self._request.check(source.last if newest_first else source.first)
+            may_match = source.part is None or source.part.number not in ruled_out
             waiting += [
-                Rows(unit, partial(self._counting, unit), may_match=may)
+                Rows(unit, partial(self._counting, unit), may_match=may_match)
                 for unit in self._units(source)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
             waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
             after = sources[nth + 1] if nth + 1 < len(sources) else None
-            while waiting and (
-                after is None
-                or (
-                    waiting[0].last >= after.last
-                    if newest_first
-                    else waiting[0].first <= after.first
-                )
-            ):
+            while waiting and _is_next(waiting[0], after, newest_first=newest_first):
                 rows = waiting.pop(0)
-                if self._asked.may_be_empty or len(rows):
+                if self._request.may_be_empty or len(rows):
                     yield rows
+
+    def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
+        """Returns the numbers of the parts that have no wanted row, by their zones."""
+        if self._request.may_match is None:
+            return set()
+        heads = [source.part for source in sources if source.part is not None]
+        wanted = self._scanner.matching(heads, self._request.may_match)
+        return {head.number for head, may in zip(heads, wanted, strict=True) if not may}
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
         """Returns the stretches of the clock that the window consists of, the newest first.
@@ -227,8 +223,8 @@ class Scan:
         Those of `STRETCH_NS` in which all rows are of whole parts, also those so long (ns) before
         and after, and what lies between them.
         """
-        found: list[Stretch] = []
-        until = self._asked.window.stop
+        stretches: list[Stretch] = []
+        until = self._request.window.stop
 
         def between(start: Ns) -> Iterator[Stretch]:
             if start < until:
@@ -236,34 +232,34 @@ class Scan:
                 yield Stretch(TimeWindow(start, until), max([until - 1, *latest[-1:]]), None)
 
         for stretch in self._settled_stretches(beside) if self._sources else ():
-            found += [*between(stretch.window.stop), stretch]
+            stretches += [*between(stretch.window.stop), stretch]
             until = stretch.window.start
-        return [*found, *between(self._asked.window.start)]
+        return [*stretches, *between(self._request.window.start)]
 
     def whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the whole parts that all rows in a window are of; None where others are, too.
 
         With them those that latched messages in the window may have been received in before.
         """
-        parts = self._whole_parts(window)
-        late = [part for part in parts or () if self._asked.relatches and self._may_be_late(part)]
+        parts = self._parts_reaching_into(window)
+        late = [part for part in parts or () if self._request.relatches and self._may_be_late(part)]
         if not late:
             return parts
         published = min(self._published[part][0] for part in late)
         if published < window.start - STRETCH_NS:
             return None
         since = min(int(published) - COPY_HORIZON_NS, window.start)
-        return self._whole_parts(TimeWindow(since, window.stop))
+        return self._parts_reaching_into(TimeWindow(since, window.stop))
 
-    def _whole_parts(self, window: TimeWindow) -> tuple[int, ...] | None:
+    def _parts_reaching_into(self, window: TimeWindow) -> tuple[int, ...] | None:
         if self._coverage is None:
             return None
         begin = int(np.searchsorted(self._latest, window.start))
         end = int(np.searchsorted(self._firsts, window.stop))
         if self._others[end] > self._others[begin]:
             return None
-        here = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
-        return tuple(self._numbers[here].tolist())
+        reaching = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
+        return tuple(self._numbers[reaching].tolist())
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
@@ -274,7 +270,9 @@ class Scan:
 
     @cached_property
     def _numbers(self) -> IntArray:
-        return np.array([0 if one.part is None else one.part.number for one in self._sources])
+        return np.array(
+            [0 if source.part is None else source.part.number for source in self._sources]
+        )
 
     @cached_property
     def _heads(self) -> dict[int, PartHead]:
@@ -288,15 +286,17 @@ class Scan:
         heads = [part for part in parts if part is not None]
         if self._coverage is not None and heads:
             counting = self._coverage.counts([head.bags for head in heads])
-            of_all = counting == [head.bags.size for head in heads]
-            is_whole[[part is not None for part in parts]] &= of_all
+            all_count = counting == [head.bags.size for head in heads]
+            is_whole[[part is not None for part in parts]] &= all_count
         is_whole &= self._lasts - self._firsts < STRETCH_NS
         return np.concatenate([[0], np.cumsum(~is_whole)])
 
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
         """Returns the stretches of which all rows are of whole parts; see `stretches`."""
-        window, firsts, latest = self._asked.window, self._firsts, self._latest
-        newest = max((each.latest for each in self._asked.timeline.segments), default=MIN_NS)
+        window, firsts, latest = self._request.window, self._firsts, self._latest
+        newest = max(
+            (segment.latest for segment in self._request.timeline.segments), default=MIN_NS
+        )
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)
@@ -305,7 +305,7 @@ class Scan:
         is_apart = (before[begin] < after[begin]) & (before[end] < after[end])
         lasts = np.maximum(before[end], stops - 1)
         is_inside = (starts - beside >= window.start) & (lasts + beside < window.stop)
-        found = []
+        stretches = []
         for nth in np.flatnonzero(is_apart & is_inside & (stops <= newest)).tolist():
             start, stop, last = int(starts[nth]), int(stops[nth]), int(lasts[nth])
             around = TimeWindow(start - beside, last + beside + 1)
@@ -314,8 +314,8 @@ class Scan:
             has_copies = overlaps_any(self._shared, copied.start, copied.stop)
             parts = self.whole_parts(copied if has_copies else around)
             if parts is not None:
-                found.append(Stretch(TimeWindow(start, stop), last, parts))
-        return found
+                stretches.append(Stretch(TimeWindow(start, stop), last, parts))
+        return stretches
 
     def copies(self) -> Iterator[Rows]:
         """Yields the rows that do not count, as another recording has their messages, too.
@@ -327,9 +327,11 @@ class Scan:
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         for source in self._sources:
             part = None if source.part is None else source.part.number
-            if id(source) not in shared and not (self._asked.relatches and self._may_be_late(part)):
+            if id(source) not in shared and not (
+                self._request.relatches and self._may_be_late(part)
+            ):
                 continue
-            self._asked.check(source.first)
+            self._request.check(source.first)
             for unit in self._units(source):
                 repeated = self._repeated(unit)
                 if repeated.size:
@@ -342,25 +344,25 @@ class Scan:
             if store is None:
                 break
             failures = store.failures
-            self._coverage = self._scanner.coverage(self._asked.timeline)
-            found = [*self._found(reach)]
+            self._coverage = self._scanner.coverage(self._request.timeline)
+            sources = [*self._sources_of(reach)]
             # Meanwhile another process may have replaced parts, or the file may have failed: rows
             # would be missing.
             if self._coverage is None:
-                return found
+                return sources
             before, now = self._coverage.state, store.state()
             if (failures, before.part, before.deletion) == (
                 store.failures,
                 now.part,
                 now.deletion,
             ):
-                return found
+                return sources
         self._coverage = None
-        return [*self._found(reach)]
+        return [*self._sources_of(reach)]
 
-    def _found(self, reach: TimeWindow) -> Iterator[_Source]:
+    def _sources_of(self, reach: TimeWindow) -> Iterator[_Source]:
         """Yields the sources that may have rows in a window."""
-        topic, timeline, coverage = self._asked.topic, self._asked.timeline, self._coverage
+        topic, timeline, coverage = self._request.topic, self._request.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
             plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
             yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
@@ -373,17 +375,17 @@ class Scan:
                 if reach.overlaps(first, last):
                     yield _Source(first, last, None, bag)
 
-    def _ordered(self, found: Iterable[_Source]) -> list[_Source]:
+    def _ordered(self, sources: Iterable[_Source]) -> list[_Source]:
         """Returns sources in order of time; of those of the same times as their bags are."""
-        sources = sorted(found, key=lambda source: (source.first, source.last))
-        if len({(source.first, source.last) for source in sources}) == len(sources):
-            return sources
+        by_time = sorted(sources, key=lambda source: (source.first, source.last))
+        if len({(source.first, source.last) for source in by_time}) == len(by_time):
+            return by_time
 
         def order(source: _Source) -> tuple[Ns, Ns, tuple[Ns, Ns, str] | tuple[()]]:
             bag = source.bag if source.part is None else self._first_bag(source.part)
             return source.first, source.last, () if bag is None else in_time(bag)
 
-        return sorted(sources, key=order)
+        return sorted(by_time, key=order)
 
     def _first_bag(self, part: PartHead) -> BagFile | None:
         """Returns the first bag of a part of which rows count, if any."""
@@ -392,48 +394,52 @@ class Scan:
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
     def _units(self, source: _Source) -> Iterable[Unit]:
-        if source.part is None and self._asked.stored:
+        if source.part is None and self._request.stored:
             return ()
         if source.part is not None and self._coverage is not None:
             unit = self._scanner.part(source.part, self._coverage, self._together)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
-        known = self._decoded.get(source.bag.file)
-        if known is None:
-            hashed = bool(self._shared) or self._asked.relatches
-            tables = _bounded(self._asked.decode(source.bag, self._asked.topic, hashed))
-            known = [
-                BagUnit(source.bag, table, nth) for nth, table in enumerate(tables) if len(table)
-            ]
-            self._decoded[source.bag.file] = known
+        return self._units_of_bag(source.bag)
+
+    def _units_of_bag(self, bag: BagFile) -> list[Unit]:
+        """Returns the tables of a bag, which is decoded unless it was one of the last."""
+        units = self._decoded.get(bag.file)
+        if units is None:
+            hashed = bool(self._shared) or self._request.relatches
+            tables = _without_columns_if_large(
+                self._request.decode(bag, self._request.topic, hashed)
+            )
+            units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
+            self._decoded[bag.file] = units
             while len(self._decoded) > _MOST_DECODED or (
                 len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
             ):
                 self._decoded.popitem(last=False)
-        return known
+        return units
 
     def _decoded_bytes(self) -> int:
         return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
 
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""
-        window = self._asked.window
-        counting = unit.counting()
+        window = self._request.window
+        is_counted = unit.counting()
         if not window.covers(unit.first, unit.last):
             times = unit.times()
-            inside = (times >= window.start) & (times < window.stop)
-            counting = inside if counting is None else counting & inside
+            is_inside = (times >= window.start) & (times < window.stop)
+            is_counted = is_inside if is_counted is None else is_counted & is_inside
         repeated = self._repeated(unit)
         if repeated.size:
-            counting = np.ones(len(unit.table), np.bool_) if counting is None else counting
-            counting[repeated] = False
-        return None if counting is None or counting.all() else np.flatnonzero(counting)
+            is_counted = np.ones(len(unit.table), np.bool_) if is_counted is None else is_counted
+            is_counted[repeated] = False
+        return None if is_counted is None or is_counted.all() else np.flatnonzero(is_counted)
 
     # Copies
 
     def _holding_copies(self) -> list[tuple[Ns, Ns]]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        found: list[tuple[Ns, Ns]] = []
+        spans: list[tuple[Ns, Ns]] = []
         for start, stop in self._shared:
             published = sorted(
                 (-math.inf, math.inf)
@@ -441,9 +447,9 @@ class Scan:
                 else self._published[source.part.number]
                 for source in self._sources_in(TimeWindow(start, stop))
             )
-            if any(before[1] >= after[0] for before, after in pairwise(published)):
-                found.append((start, stop))
-        return found
+            if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
+                spans.append((start, stop))
+        return spans
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""
@@ -456,10 +462,10 @@ class Scan:
                     self._compared.add(begin)
                     end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
-        found = self._copies.get(unit.key, [])
-        if self._asked.relatches:
-            found = [*found, self._received_again(unit)]
-        return np.concatenate(found) if found else np.empty(0, np.int64)
+        copies = self._copies.get(unit.key, [])
+        if self._request.relatches:
+            copies = [*copies, self._received_again(unit)]
+        return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
     def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
         """Finds the copies in a part of a shared span."""
@@ -472,9 +478,9 @@ class Scan:
         copies = copies_among(messages)
         copies &= (messages.log_times >= part.start) & (messages.log_times < part.stop)
         begin = 0
-        for unit, some in zip(units, rows, strict=True):
-            of_unit = some[copies[begin : begin + some.size]]
-            begin += some.size
+        for unit, unit_rows in zip(units, rows, strict=True):
+            of_unit = unit_rows[copies[begin : begin + unit_rows.size]]
+            begin += unit_rows.size
             if of_unit.size:
                 self._copies[unit.key].append(of_unit)
 
@@ -485,11 +491,11 @@ class Scan:
         identities = unit.identities() if may_be_late else None
         if identities is None:
             return none
-        published = identities[0]
-        late = unit.times() - published > RELATCHED_NS
-        if not late.any():
+        published, _ = identities
+        is_late = unit.times() - published > RELATCHED_NS
+        if not is_late.any():
             return none
-        since = max(int(published[late].min()) - COPY_HORIZON_NS, MIN_NS)
+        since = max(int(published[is_late].min()) - COPY_HORIZON_NS, MIN_NS)
         if since < self._relatched_since:
             # As much again before it: late messages come many at once, of about the same age.
             self._relatched_since = max(since - (unit.last - since), MIN_NS)
@@ -501,13 +507,13 @@ class Scan:
         rows = [self._rows_in(unit, window) for unit in units]
         messages = self._messages(units, rows)
         latched = np.repeat(
-            [unit.table.channel.latched for unit in units], [some.size for some in rows]
+            [unit.table.channel.latched for unit in units], [unit_rows.size for unit_rows in rows]
         )
-        again = relatched_among(messages) & latched
+        is_relatched = relatched_among(messages) & latched
         begin = 0
-        for unit, some in zip(units, rows, strict=True):
-            self._relatched[unit.key] = some[again[begin : begin + some.size]]
-            begin += some.size
+        for unit, unit_rows in zip(units, rows, strict=True):
+            self._relatched[unit.key] = unit_rows[is_relatched[begin : begin + unit_rows.size]]
+            begin += unit_rows.size
 
     @cached_property
     def _delays(self) -> dict[int, tuple[float, float]]:
@@ -536,9 +542,9 @@ class Scan:
             yield from self._units(source)
 
     def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
-        times, counting = unit.times(), unit.counting()
-        inside = (times >= window.start) & (times < window.stop)
-        return np.flatnonzero(inside if counting is None else inside & counting)
+        times, is_counted = unit.times(), unit.counting()
+        is_inside = (times >= window.start) & (times < window.stop)
+        return np.flatnonzero(is_inside if is_counted is None else is_inside & is_counted)
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
@@ -546,17 +552,19 @@ class Scan:
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
         numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
-        for unit, some in zip(units, rows, strict=True):
+        for unit, unit_rows in zip(units, rows, strict=True):
             recording = numbers[unit.first_bag.recording]
-            published, hashes = self._identities(unit, some)
+            published, hashes = self._identities(unit, unit_rows)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
             parts.append(
-                Identities(unit.times()[some], published, hashes, np.full(some.size, recording))
+                Identities(
+                    unit.times()[unit_rows], published, hashes, np.full(unit_rows.size, recording)
+                )
             )
         return joined_identities(parts)
 
-    def _identities(self, unit: Unit, some: IntArray) -> tuple[IntArray, IntArray]:
+    def _identities(self, unit: Unit, positions: IntArray) -> tuple[IntArray, IntArray]:
         """Returns publish times and hashes of some rows of a unit.
 
         Bags that were stored before another recording came beside them are read. Rows of one that
@@ -564,14 +572,14 @@ class Scan:
         """
         times = unit.times()
         published, hashes = unit.identities() or (times, np.full(times.size, UNHASHED))
-        unknown = some[hashes[some] == UNHASHED]
+        unknown = positions[hashes[positions] == UNHASHED]
         if not unknown.size:
-            return published[some], hashes[some]
+            return published[positions], hashes[positions]
         published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
         bags = unit.bags()
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._asked.decode(bags[number], self._asked.topic, True):
+            for table in self._request.decode(bags[number], self._request.topic, True):
                 if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
                     continue
                 # A part has ten minutes of a long bag.
@@ -580,18 +588,27 @@ class Scan:
                 if np.array_equal(table.log_times[same], times[rows]):
                     published[rows] = table.publish_times[same]
                     hashes[rows] = table.payload_hashes[same]
-        return published[some], hashes[some]
+        return published[positions], hashes[positions]
 
 
-def _bounded(tables: Iterable[Table]) -> list[Table]:
+def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
+    """Returns whether no row of the sources from `after` on comes before a table."""
+    if after is None:
+        return True
+    return rows.last >= after.last if newest_first else rows.first <= after.first
+
+
+def _without_columns_if_large(tables: Iterable[Table]) -> list[Table]:
     """Returns the tables of a bag; without their columns where these take too much together."""
-    found: list[Table] = []
+    held: list[Table] = []
     size = 0
     for table in tables:
         size += table.memory_bytes
-        found.append(table)
+        held.append(table)
         if size > _MOST_BYTES:
             left_out = {"": _TOO_LARGE}
-            found = [replace(each, columns={}, elements={}, left_out=left_out) for each in found]
+            held = [
+                replace(earlier, columns={}, elements={}, left_out=left_out) for earlier in held
+            ]
         del table
-    return found
+    return held

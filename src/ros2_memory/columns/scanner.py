@@ -14,7 +14,7 @@ import numpy as np
 
 from ros2_memory.columns.coverage import Coverage, Covering
 from ros2_memory.columns.database import row_id
-from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, Sized
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.parts import LOG_TIME
@@ -87,8 +87,8 @@ class _Heads:
 
     def within(self, window: TimeWindow) -> list[PartHead]:
         """Returns the parts that may have rows in a window."""
-        here = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
-        return [self.heads[nth] for nth in np.flatnonzero(here).tolist()]
+        is_within = (self.live > 0) & (self.firsts < window.stop) & (self.lasts >= window.start)
+        return [self.heads[nth] for nth in np.flatnonzero(is_within).tolist()]
 
 
 def _whole_days(window: TimeWindow) -> TimeWindow:
@@ -138,7 +138,9 @@ class Caches:
 
     def namespace(self) -> Caches:
         """Returns caches with keys of their own, within the capacities of these."""
-        return Caches(**{one.name: getattr(self, one.name).namespace() for one in fields(self)})
+        return Caches(
+            **{cache.name: getattr(self, cache.name).namespace() for cache in fields(self)}
+        )
 
 
 class Scanner:
@@ -173,11 +175,11 @@ class Scanner:
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments[OUTLINE.name] = self._outlines
 
-    def fragments(self, kind: Kind[T]) -> Fragments[T]:
+    def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            made = Fragments(self.store, kind, self._settings, self.caches.read)
-            self._fragments.setdefault(kind.name, made)
+            fragments = Fragments(self.store, kind, self._settings, self.caches.read)
+            self._fragments.setdefault(kind.name, fragments)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
 
@@ -220,63 +222,63 @@ class Scanner:
             return []
         state = coverage.state
         span = TimeWindow.everything()
-        known = self.caches.heads.get((topic, span))
-        if known is None and (days := _whole_days(window)).stop - days.start <= _FEW_DAYS_NS:
+        cached = self.caches.heads.get((topic, span))
+        if cached is None and (days := _whole_days(window)).stop - days.start <= _FEW_DAYS_NS:
             span = days
-            known = self.caches.heads.get((topic, span))
-        if known is None or known.coverage is not coverage:
+            cached = self.caches.heads.get((topic, span))
+        if cached is None or cached.coverage is not coverage:
             failures = self.store.failures
             heads: list[PartHead] = []
-            if known is not None and known.coverage.state.deletion == state.deletion:
-                heads = [*known.heads]
-            if known is None or known.coverage.state != state:
+            if cached is not None and cached.coverage.state.deletion == state.deletion:
+                heads = [*cached.heads]
+            if cached is None or cached.coverage.state != state:
                 newest = max((head.number for head in heads), default=0)
                 heads += self.store.parts(topic, span, newest)
                 heads.sort(key=lambda head: (head.first, head.number))
-            known = _Heads.of(heads, coverage)
+            cached = _Heads.of(heads, coverage)
             if self.store.failures == failures:
-                self.caches.heads.put((topic, span), known, 1000 + _HEAD_BYTES * len(heads))
-        return known.within(window)
+                self.caches.heads.put((topic, span), cached, 1000 + _HEAD_BYTES * len(heads))
+        return cached.within(window)
 
     def matching(
         self, heads: Sequence[PartHead], may_match: Callable[[PartZones], bool | Mask]
     ) -> Mask:
         """Returns which of some parts may have rows that are wanted, by their zones."""
-        found = np.ones(len(heads), np.bool_)
+        possible = np.ones(len(heads), np.bool_)
         topics = np.array([head.topic for head in heads], np.int64)
         numbers = np.array([head.number for head in heads], np.int64)
         for number in np.unique(topics).tolist():
             topic = None if self.store is None else self.store.topic(number)
             if topic is not None:
-                own = topics == number
-                zones = partial(self._zones, number, numbers[own])
-                found[own] = may_match(PartZones(topic, zones))
-        return found
+                is_of_topic = topics == number
+                zones = partial(self._zones, number, numbers[is_of_topic])
+                possible[is_of_topic] = may_match(PartZones(topic, zones))
+        return possible
 
     def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
         """Returns the least and greatest value of a column by part; infinite if not stored."""
-        found: dict[int, tuple[float, float]] = {}
+        by_part: dict[int, tuple[float, float]] = {}
         for topic in {head.topic for head in heads}:
             parts = [head.number for head in heads if head.topic == topic]
             zones = self._zones(topic, np.array(parts, np.int64), path)
             bounds = zip(zones.low.tolist(), zones.high.tolist(), strict=True)
-            found.update(zip(parts, bounds, strict=True))
-        return found
+            by_part.update(zip(parts, bounds, strict=True))
+        return by_part
 
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
         assert self.store is not None  # noqa: S101 - there are no parts without one
         key = (topic, path)
-        known, newest = self.caches.zones.get(key) or (Zones.of([], []), 0)
+        zones, newest = self.caches.zones.get(key) or (Zones.of([], []), 0)
         asked = int(parts.max(initial=0))
         if asked > newest:
             failures = self.store.failures
-            known = known.joined(self.store.zones(topic, path, newest))
+            zones = zones.joined(self.store.zones(topic, path, newest))
             if self.store.failures == failures:
                 # Not each part has each column, so what was asked for counts, too.
-                newest = max([asked, *known.parts[-1:].tolist()])
-                self.caches.zones.put(key, (known, newest), known.memory_bytes)
-        return known.among(parts)
+                newest = max([asked, *zones.parts[-1:].tolist()])
+                self.caches.zones.put(key, (zones, newest), zones.memory_bytes)
+        return zones.among(parts)
 
     def part(
         self, head: PartHead, coverage: Coverage, together: Sequence[PartHead] = ()
@@ -296,10 +298,10 @@ class Scanner:
         packed = partial(self.packed, head, together=together)
 
         def load(path: str) -> Column:
-            known = packed(path)
-            if known is None:
+            column = packed(path)
+            if column is None:
                 raise KeyError(path)
-            return self._column(head, path, known, together)
+            return self._column(head, path, column, together)
 
         counting = coverage.of_part(head.number, head.bags)
         if not counting.size:
@@ -351,23 +353,23 @@ class Scanner:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
         assert self.store is not None  # noqa: S101 - as above
-        known = self.caches.packed.get((head.number, path))
-        if known is None:
+        cached = self.caches.packed.get((head.number, path))
+        if cached is None:
             numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
             failures = self.store.failures
-            found = self.store.packed(head.topic, path, numbers)
-            others = [number for number in numbers if number not in found]
+            read = self.store.packed(head.topic, path, numbers)
+            others = [number for number in numbers if number not in read]
             # A part that is gone has no columns either: only of one that is there it says anything.
-            there = self.store.packed(head.topic, LOG_TIME, others) if others else {}
+            present = self.store.packed(head.topic, LOG_TIME, others) if others else {}
             if self.store.failures != failures:
                 raise GoneError
-            found.update(dict.fromkeys(there, _ABSENT))
-            for number, packed in found.items():
+            read.update(dict.fromkeys(present, _ABSENT))
+            for number, packed in read.items():
                 self.caches.packed.put((number, path), packed, _COLUMN_BYTES)
-            known = found.get(head.number)
-            if known is None:
+            cached = read.get(head.number)
+            if cached is None:
                 raise GoneError
-        return None if known is _ABSENT else known
+        return None if cached is _ABSENT else cached
 
     def _column(
         self, head: PartHead, path: str, packed: Packed, together: Sequence[PartHead]
@@ -378,9 +380,9 @@ class Scanner:
             GoneError: the part was deleted meanwhile, or the store cannot be read, or is damaged.
         """
         key = (head.number, path)
-        known = self.caches.read.get(key)
-        if known is not None:
-            return cast("Column", known)
+        cached = self.caches.read.get(key)
+        if cached is not None:
+            return cast("Column", cached)
         assert self.store is not None  # noqa: S101 - as above
         stored = b""
         # The one value of a constant is its least, unless it is a text.
@@ -414,10 +416,10 @@ class Scanner:
             nth = numbers.index(head.number) if head.number in numbers else 0
             goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
             numbers = numbers[nth:] if goes_on else [head.number]
-            found = self.store.part_data(numbers, path, _FETCHED_BYTES // 2)
-            for number, data in found.items():
+            fetched = self.store.part_data(numbers, path, _FETCHED_BYTES // 2)
+            for number, data in fetched.items():
                 self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
-            stored = found.get(head.number)
+            stored = fetched.get(head.number)
             if stored is None:
                 raise GoneError
         return stored

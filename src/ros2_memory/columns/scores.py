@@ -10,19 +10,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeGuard
 
 import numpy as np
 
 from ros2_memory.columns.shown import (
     Choice,
     Group,
-    Kept,
     Listing,
     Message,
     Narrowed,
     Node,
     Spot,
+    TruthValues,
     children,
     leaves_below,
     opened,
@@ -41,6 +41,14 @@ if TYPE_CHECKING:
 Object: TypeAlias = Message | Group
 
 
+class NamedScores(NamedTuple):
+    """The name (blank: none) and the score (NaN: none) of each object, and the error of scores."""
+
+    name: Texts
+    score: Floats
+    error: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Scored:
     """An object that may be a detection: what names it, in order, and what its score is.
@@ -55,39 +63,35 @@ class Scored:
     labels: tuple[Leaf, ...]
     scores: tuple[Leaf, ...]
 
-    def read(self, values: Values) -> tuple[Texts, Floats, float] | None:
-        """Returns the name (blank: none) and score (NaN: none) of each, and the error of scores.
-
-        None where these are not held.
-        """
-        names = [values.texts(leaf) for leaf in self.labels]
-        name = names[0]
-        for other in names[1:]:
-            name = None if name is None or other is None else or_else(name, other, blank=True)
+    def read(self, values: Values) -> NamedScores | None:
+        """Returns the names and scores of all; None where the table does not hold them."""
+        name, *fallbacks = (values.texts(leaf) for leaf in self.labels)
+        for fallback in fallbacks:
+            name = None if name is None or fallback is None else or_else(name, fallback, blank=True)
         if name is None:
             return None
         score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
-            found = values.numbers(leaf)
-            if found is None or not isinstance(found.error, float):
+            numbers = values.numbers(leaf)
+            if numbers is None or not isinstance(numbers.error, float):
                 return None
-            number = found.values.astype(np.float64, copy=False)
-            score = np.where(np.isnan(score), number, score)
-            error = max(error, found.error)
-        return name, score, error
+            column = numbers.values.astype(np.float64, copy=False)
+            score = np.where(np.isnan(score), column, score)
+            error = max(error, numbers.error)
+        return NamedScores(name, score, error)
 
 
-def or_else(one: Texts, other: Texts, *, blank: bool = False) -> Texts:
+def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
     """Returns each of some texts, or another where it is empty (or `blank`)."""
-    is_none = [not (word.strip() if blank else word) for word in one.words]
+    is_none = [not (word.strip() if blank else word) for word in texts.words]
     if not any(is_none):
-        return one
-    codes = np.where(np.array(is_none)[one.codes], other.codes + len(one.words), one.codes)
-    return Texts(codes.astype(np.uint32), (*one.words, *other.words))
+        return texts
+    codes = np.where(np.array(is_none)[texts.codes], fallback.codes + len(texts.words), texts.codes)
+    return Texts(codes.astype(np.uint32), (*texts.words, *fallback.words))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Detections(ABC):
+class _ScoreLimit(ABC):
     """Which detections of a level stay; that is found once for each table."""
 
     level: Level
@@ -96,76 +100,75 @@ class _Detections(ABC):
     texts: tuple[Leaf, ...]
     has_inner: bool
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the detection stays."""
         if self not in values.kept:
-            values.kept[self] = self._kept(values)
+            values.kept[self] = self._all_kept(values)
         surely, perhaps = values.kept[self]
-        return Kept(surely[among], perhaps[among])
+        return TruthValues(surely[positions], perhaps[positions])
 
     @abstractmethod
-    def _kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> TruthValues:
         """Returns where the detections of a table stay."""
 
 
-class _Scores(_Detections):
+class _OwnScoreLimit(_ScoreLimit):
     """Which detections score enough."""
 
-    def _kept(self, values: Values) -> Kept:
-        found = self.scored.read(values)
-        if found is None:
+    def _all_kept(self, values: Values) -> TruthValues:
+        named = self.scored.read(values)
+        if named is None:
             return unknown(values.size(self.level) or 0)
-        name, score, error = found
-        labelled = _has_label(name)
-        surely = ~(labelled & (score < self.least + error))
-        perhaps = ~(labelled & (score < self.least - error))
+        name, score, error = named
+        is_labelled = _has_label(name)
+        surely = ~(is_labelled & (score < self.least + error))
+        perhaps = ~(is_labelled & (score < self.least - error))
         if self.has_inner or may_be_json(values, self.texts):
-            surely &= labelled
-        return Kept(surely, perhaps)
+            surely &= is_labelled
+        return TruthValues(surely, perhaps)
 
 
-class _BestScores(_Detections):
+class _BestScoreLimit(_ScoreLimit):
     """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
 
-    def _kept(self, values: Values) -> Kept:
+    def _all_kept(self, values: Values) -> TruthValues:
         size = values.size(self.level) or 0
-        found, results = self.scored.read(values), values.elements(self.scored.level)
-        if found is None or results is None or found[2]:
+        named, results = self.scored.read(values), values.elements(self.scored.level)
+        if named is None or results is None or named.error:
             return unknown(size)  # also with rounded scores, of which another may be the best
-        name, score, _ = found
-        labelled = _has_label(name)
-        order, begins = ranked(score, results.owners)
+        is_labelled = _has_label(named.name)
+        order, begins = ranked(named.score, results.owners)
         best = order[begins]
-        of = results.owners[best]
+        detections = results.owners[best]
         surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
         if self.has_inner or may_be_json(values, self.texts):
             surely[:] = False
-        is_low = score[best] < self.least
-        surely[of] = labelled[best] & ~is_low
-        perhaps[of] = ~(labelled[best] & is_low)
-        return Kept(surely, perhaps)
+        is_low = named.score[best] < self.least
+        surely[detections] = is_labelled[best] & ~is_low
+        perhaps[detections] = ~(is_labelled[best] & is_low)
+        return TruthValues(surely, perhaps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Hypotheses:
+class _HypothesisLimit:
     """Which of several hypotheses stay, in a detection that stays."""
 
-    best: _BestScores
+    best: _BestScoreLimit
 
     @property
     def level(self) -> Level:
         """The level of the hypotheses."""
         return self.best.scored.level
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the hypothesis stays."""
-        found, results = self.best.scored.read(values), values.elements(self.level)
-        if found is None or found[2] or results is None:
-            return unknown(len(among))
+        named, results = self.best.scored.read(values), values.elements(self.level)
+        if named is None or named.error or results is None:
+            return unknown(len(positions))
         # Where it is not sure that the detection is one, neither is what stays of it.
-        is_one = self.best.kept(values, results.owners[among]).surely
-        is_low = found[1][among] < self.best.least
-        return Kept(~is_low & is_one, ~is_low | ~is_one)
+        is_detection = self.best.kept(values, results.owners[positions]).surely
+        is_low = named.score[positions] < self.best.least
+        return TruthValues(~is_low & is_detection, ~is_low | ~is_detection)
 
 
 def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
@@ -197,15 +200,17 @@ def is_object(node: Node) -> TypeGuard[Object]:
 
 def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
-    found = scored(fields)
-    if found is not None:
-        return Narrowed(_Scores(found.level, found, least, *_inside(fields, depth)), node)
-    results, named = fields.get("results"), hypotheses(fields)
-    if isinstance(results, Listing) and named is not None:
+    single = scored(fields)
+    if single is not None:
+        return Narrowed(_OwnScoreLimit(single.level, single, least, *_inside(fields, depth)), node)
+    results, several = fields.get("results"), hypotheses(fields)
+    if isinstance(results, Listing) and several is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
         texts, has_inner = _inside(others, depth)
-        best = _BestScores(named.level.parent or named.level, named, least, texts, has_inner)
-        kept = Narrowed(_Hypotheses(best), results.element)
+        best = _BestScoreLimit(
+            several.level.parent or several.level, several, least, texts, has_inner
+        )
+        kept = Narrowed(_HypothesisLimit(best), results.element)
         return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
     return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
 
@@ -233,17 +238,17 @@ def scored(fields: Mapping[str, Node]) -> Scored | None:
 def _leaves(
     fields: Mapping[str, Node], names: tuple[str, ...], takes: Callable[[Leaf], bool]
 ) -> tuple[Leaf, ...]:
-    found = [fields[name] for name in names if name in fields]
-    return tuple(node for node in found if isinstance(node, Leaf) and takes(node))
+    nodes = [fields[name] for name in names if name in fields]
+    return tuple(node for node in nodes if isinstance(node, Leaf) and takes(node))
 
 
 def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
     """Returns the texts in an object that may be JSON, and whether there are detections in it."""
     texts: list[Leaf] = []
     for node in fields.values():
-        found = without_low(node, 0.0, depth - 1)
-        for _, leaf, limits in leaves_below(Spot(found)):
-            if any(isinstance(limit, _Detections) for limit in limits):
+        child = without_low(node, 0.0, depth - 1)
+        for _, leaf, limits in leaves_below(Spot(child)):
+            if any(isinstance(limit, _ScoreLimit) for limit in limits):
                 return (), True
             if leaf.json_depth:
                 texts.append(leaf)

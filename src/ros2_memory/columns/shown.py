@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlia
 import numpy as np
 
 from ros2_memory.columns.table import MAX_NUMBERS, Table
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Level, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Level, Values
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
@@ -47,7 +47,7 @@ class UnknownShapeError(Exception):
     """What the value looks like differs from message to message: the messages decide."""
 
 
-class Kept(NamedTuple):
+class TruthValues(NamedTuple):
     """Of some rows or elements: where something surely stands, and where it may stand."""
 
     surely: Mask
@@ -64,14 +64,14 @@ class Kept(NamedTuple):
         return not self.perhaps.any()
 
 
-def nowhere(size: int) -> Kept:
+def nowhere(size: int) -> TruthValues:
     """Returns the column of a field that none of so many rows or elements has."""
-    return Kept(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
+    return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 
-def unknown(size: int) -> Kept:
+def unknown(size: int) -> TruthValues:
     """Returns that nothing is known of so many rows or elements."""
-    return Kept(np.zeros(size, np.bool_), np.ones(size, np.bool_))
+    return TruthValues(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
 class Limit(Protocol):
@@ -81,7 +81,7 @@ class Limit(Protocol):
     def level(self) -> Level:
         """The level that it is about."""
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where it stands, for some rows or elements of the level."""
 
 
@@ -92,13 +92,13 @@ class Pick:
     level: Level
     place: int
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the elements stand at the place."""
-        places = values.places(self.level, among, from_end=self.place < 0)
+        places = values.places(self.level, positions, from_end=self.place < 0)
         if places is None:
-            return unknown(len(among))
-        kept = places == self.place
-        return Kept(kept, kept)
+            return unknown(len(positions))
+        is_kept = places == self.place
+        return TruthValues(is_kept, is_kept)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,13 +110,13 @@ class LongerThan:
     count: int
     is_longer: bool
 
-    def kept(self, values: Values, among: Ints) -> Kept:
+    def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where the sequence is that long."""
         lengths = values.numeric(self.level, f"{self.sequence}.length")
         if lengths is None:
-            return unknown(len(among))
-        kept = (lengths[among] > self.count) == self.is_longer
-        return Kept(kept, kept)
+            return unknown(len(positions))
+        is_kept = (lengths[positions] > self.count) == self.is_longer
+        return TruthValues(is_kept, is_kept)
 
 
 class Place(NamedTuple):
@@ -224,27 +224,27 @@ class Spot(NamedTuple):
 
 
 def placed(
-    values: Values, level: Level, among: Ints, limits: Limits, *, surely: bool
+    values: Values, level: Level, positions: Ints, limits: Limits, *, surely: bool
 ) -> tuple[Ints, Ints]:
     """Returns which of some rows or elements stand in the value, and the row of each.
 
     Args:
         values: of the table.
         level: of the rows or elements.
-        among: their positions.
+        positions: their positions.
         limits: on what stands there.
         surely: whether those that may or may not stand there are left out.
     """
-    here, kept, owners = level, among, among
+    current, kept, owners = level, positions, positions
     while True:
         for limit in limits:
-            if limit.level == here and len(kept):
+            if limit.level == current and len(kept):
                 mask = limit.kept(values, owners)[0 if surely else 1]
                 kept, owners = kept[mask], owners[mask]
-        found = values.elements(here)
-        if here.parent is None or found is None:
+        elements = values.elements(current)
+        if current.parent is None or elements is None:
             return kept, owners
-        owners, here = found.owners[owners], here.parent
+        owners, current = elements.owners[owners], current.parent
 
 
 class Shape:
@@ -273,13 +273,13 @@ class Shape:
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        found = {name: self._at(path) for name, path in self._fields.items()}
-        if all(node is None for node in found.values()):
+        nodes = {name: self._at(path) for name, path in self._fields.items()}
+        if all(node is None for node in nodes.values()):
             return self._message()
         return Group(
             {
                 name: NOTHING if node is None else self._converted(name, node)
-                for name, node in found.items()
+                for name, node in nodes.items()
             }
         )
 
@@ -291,17 +291,17 @@ class Shape:
         """
         segments = tuple(path.split("."))
         mapped = self._fields.get(segments[0])
-        found: Node | None = None
+        node: Node | None = None
         if mapped is not None:
             whole = self._at(mapped)
             if whole is not None:
-                found = descend(self._converted(segments[0], whole), segments[1:])
+                node = descend(self._converted(segments[0], whole), segments[1:])
         elif not self._fields:
-            found = descend(self._message(), segments)
-        if found is not None:
-            return found
+            node = descend(self._message(), segments)
+        if node is not None:
+            return node
         plain = self._at(segments)
-        return None if plain is None else _changed(plain, _as_numbers)
+        return None if plain is None else _with_changed_leaves(plain, _quaternion_as_xyzw)
 
     def shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
@@ -318,13 +318,13 @@ class Shape:
         message = Message(self, level, path, definition, place.depth)
         kind = kind_of_type(definition.type, [field.name for field in definition.fields])
         if kind is ValueKind.TIME:
-            return Leaf(level, (path,), Kind.REAL, Made.SECONDS)
+            return Leaf(level, (path,), Kind.REAL, Conversion.SECONDS)
         are_numbers = all(_is_number(field.kind, field.length) for field in definition.fields)
         sources = [f"{path}.{field.name}" if path else field.name for field in definition.fields]
         if kind is ValueKind.VECTOR and are_numbers:
             return _vector(level, sources)
         if kind is ValueKind.QUATERNION:
-            return _turned(level, sources, message) if are_numbers else NOTHING
+            return _angles_of(level, sources, message) if are_numbers else NOTHING
         return message
 
     def plain(self, place: Place) -> Node:
@@ -353,9 +353,9 @@ class Shape:
             raise UnknownShapeError(f"{place.path} is no sequence of bytes")
 
         def leaf(kind: Kind, *path: str) -> Leaf:
-            found = descend(message, path)
-            if isinstance(found, Leaf) and found.kind is kind:
-                return found
+            child = descend(message, path)
+            if isinstance(child, Leaf) and child.kind is kind:
+                return child
             raise UnknownShapeError(f"{'.'.join(path)} is not as in the standard definition")
 
         count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
@@ -370,11 +370,11 @@ class Shape:
         return self.shown(Place(ROWS, "", self.definition, None, 0))
 
     def _at(self, path: Sequence[str]) -> Node | None:
-        found = descend(self._message(), path)
-        if found is not None:
-            return found
+        node = descend(self._message(), path)
+        if node is not None:
+            return node
         plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
-        return None if plain is None else _changed(plain, self._as_shown)
+        return None if plain is None else _with_changed_leaves(plain, self._as_shown)
 
     def _as_shown(self, node: Node) -> Node:
         """Returns the end of a walk through definitions as the value shows it."""
@@ -404,7 +404,7 @@ class Shape:
             )
         if size <= count:
             return array
-        constant = Leaf(level, (), Kind.INTEGER, Made.CONSTANT, size)
+        constant = Leaf(level, (), Kind.INTEGER, Conversion.CONSTANT, size)
         return Choice((Group({key: constant}),), array)
 
     def _converted(self, name: str, node: Node) -> Node:
@@ -422,21 +422,23 @@ class Shape:
         if not isinstance(array, Items):
             return node
         leaves = [item for item in array.items if isinstance(item, Leaf)]
-        numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
+        is_numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
         sources = [leaf.sources[0] for leaf in leaves]
         if name in POINTS:
-            return _vector(leaves[0].level, sources) if numeric and len(leaves) == 3 else node
+            return _vector(leaves[0].level, sources) if is_numeric and len(leaves) == 3 else node
         if len(leaves) != 4:
             return node
         # PX4 writes w first.
-        return _turned(leaves[0].level, [*sources[1:], sources[0]], None) if numeric else NOTHING
+        return (
+            _angles_of(leaves[0].level, [*sources[1:], sources[0]], None) if is_numeric else NOTHING
+        )
 
 
-def shape_of(known: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
+def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
     """Returns the shape of a table's type, or of some parts'; None where the messages decide."""
-    if known.definition is None or "" in known.left_out:
+    if table_or_parts.definition is None or "" in table_or_parts.left_out:
         return None
-    return Shape(known.definition, known.channel.type, extractor)
+    return Shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
 
 
 class ByType(Generic[T]):
@@ -452,9 +454,9 @@ class ByType(Generic[T]):
         self._make = make
         self._known: dict[tuple[Definition, str], T | None] = {}
 
-    def of(self, known: Table | PartZones) -> T | None:
+    def of(self, table_or_parts: Table | PartZones) -> T | None:
         """Returns that of a table's type, or of some parts'; None where the messages decide."""
-        shape = shape_of(known, self._extractor)
+        shape = shape_of(table_or_parts, self._extractor)
         if shape is None:
             return None
         key = (shape.definition, shape.type)
@@ -480,15 +482,15 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
             inner = descend(node.node, path[nth:])
             return None if inner is None else Narrowed(node.limit, inner)
         if isinstance(node, Listing | Items) and segment.isascii() and segment.isdecimal():
-            node = _picked(node, int(segment[:10]))
+            node = _element_at(node, int(segment[:10]))
         elif isinstance(node, Listing):
             inner = descend(node.element, path[nth:])
             return None if inner is None else Listing(node.level, inner)
         elif isinstance(node, Message | Group):
-            found = node.child(segment)
-            if found is None:
+            child = node.child(segment)
+            if child is None:
                 return None
-            node = found
+            node = child
         else:
             return None
     return node
@@ -558,50 +560,49 @@ def _step(spot: Spot, segment: str) -> Iterator[Spot]:
             if child is not None:
                 yield Spot(child, limits)
         elif isinstance(node, Listing | Items) and _INDEX.fullmatch(segment):
-            yield Spot(_picked(node, int(segment)), limits)
+            yield Spot(_element_at(node, int(segment)), limits)
         elif isinstance(node, Listing):
             yield from _step(Spot(node.element, limits), segment)
 
 
-def _picked(node: Listing | Items, index: int) -> Node:
+def _element_at(node: Listing | Items, index: int) -> Node:
     if isinstance(node, Listing):
         return Narrowed(Pick(node.level, index), node.element)
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
 
 
-def _changed(node: Node, change: Callable[[Node], Node]) -> Node:
-    """Returns a node with what it stands for changed: of a list its elements."""
+def _with_changed_leaves(node: Node, change: Callable[[Node], Node]) -> Node:
+    """Returns a node with each value in it changed: of a list, its elements."""
     if isinstance(node, Listing):
-        return Listing(node.level, _changed(node.element, change))
+        return Listing(node.level, _with_changed_leaves(node.element, change))
     if isinstance(node, Narrowed):
-        return Narrowed(node.limit, _changed(node.node, change))
+        return Narrowed(node.limit, _with_changed_leaves(node.node, change))
     return change(node)
 
 
-def _as_numbers(node: Node) -> Node:
-    """Returns what was found by its full path: a quaternion then stays x, y, z, w."""
+def _quaternion_as_xyzw(node: Node) -> Node:
+    """Returns a rotation as the x, y, z, w of its message, and not as angles; others unchanged."""
     if not isinstance(node, Group) or node.turned is None:
         return node
     message = node.turned
-    return Group(
-        {name: _real(message.level, f"{message.path}.{name}".lstrip(".")) for name in "xyzw"}
-    )
+    path = f"{message.path}." if message.path else ""
+    return Group({name: _real(message.level, f"{path}{name}") for name in "xyzw"})
 
 
 def _real(level: Level, source: str) -> Leaf:
-    return Leaf(level, (source,), Kind.REAL, Made.REAL)
+    return Leaf(level, (source,), Kind.REAL, Conversion.REAL)
 
 
 def _vector(level: Level, sources: Sequence[str]) -> Group:
-    return Group({axis: _real(level, each) for axis, each in zip("xyz", sources, strict=True)})
+    return Group({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
 
 
-def _turned(level: Level, sources: Sequence[str], message: Message | None) -> Group:
-    angles = (Made.ROLL, Made.PITCH, Made.YAW)
+def _angles_of(level: Level, sources: Sequence[str], message: Message | None) -> Group:
+    angles = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
     return Group(
         {
-            name: Leaf(level, tuple(sources), Kind.REAL, made)
-            for name, made in zip(ANGLES, angles, strict=True)
+            name: Leaf(level, tuple(sources), Kind.REAL, angle)
+            for name, angle in zip(ANGLES, angles, strict=True)
         },
         message,
     )

@@ -62,12 +62,12 @@ _IN_SLICES: Final = {
 
 def packed(sights: Sights) -> bytes:
     """Returns the sights of some slices of the clock as bytes."""
-    slices = [sights.tables[at][:, 0] for at in _IN_SLICES if len(sights.tables[at])]
-    begin = min((int(each.min()) for each in slices), default=0)
+    slices = [sights.tables[number][:, 0] for number in _IN_SLICES if len(sights.tables[number])]
+    begin = min((int(array.min()) for array in slices), default=0)
     coded = []
-    for at, table in enumerate(sights.tables):
+    for number, table in enumerate(sights.tables):
         columns = table.T.copy()
-        times = _IN_SLICES.get(at)
+        times = _IN_SLICES.get(number)
         if times is not None:
             if times.last is not None:
                 columns[times.last] -= columns[times.first]
@@ -77,10 +77,10 @@ def packed(sights: Sights) -> bytes:
             columns[0] -= begin
         steps = np.diff(columns, axis=1, prepend=0)
         coded.append(((steps << 1) ^ (steps >> _SIGN)).view(np.uint64))
-    width = 4 if all(int(each.max(initial=0)) < 1 << 32 for each in coded) else 8
+    width = 4 if all(int(array.max(initial=0)) < 1 << 32 for array in coded) else 8
     names = json.dumps((sights.topics, sights.labels)).encode()
     head = _HEAD.pack(width, begin, *map(len, sights.tables), len(names))
-    planes = [byte_planes(column, width) for each in coded for column in each.view(np.int64)]
+    planes = [byte_planes(column, width) for array in coded for column in array.view(np.int64)]
     return compressed(b"".join((head, names, *planes)))
 
 
@@ -95,35 +95,36 @@ def joined(
     epoch (the coordinate system of a part) are different ones. Fixes are in order of time for each
     session: at one time there may be several robots.
     """
-    found = _Unpacked(parts)
-    spots, looks, hits, scores, beside, unplaced, fixes = found.tables
-    topics = found.renamed(found.topics, [(_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)])
-    labels = found.renamed(found.labels, [(_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)])
+    unpacked = _Unpacked(parts)
+    spots, looks, hits, scores, beside, unplaced, fixes = unpacked.tables
+    topics = unpacked.renamed(unpacked.topics, [(_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)])
+    labels = unpacked.renamed(unpacked.labels, [(_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)])
     epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
-    slices = found.with_slices_numbered(epoch)
+    slices = unpacked.with_slices_numbered(epoch)
     spot_order = _order(spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL])
     look_order = _order(looks[:, Look.SLICE], looks[:, Look.TOPIC])
-    spot_at, look_at = _places_of(spot_order), np.append(_places_of(look_order), [-1])
-    for at in (_HITS, _SCORES, _BESIDE):
-        table = found.tables[at]
-        table[:, 0] = spot_at[table[:, 0] + found.begins(_SPOTS)[found.part[at]]]
-    look = hits[:, Hit.LOOK] + found.begins(_LOOKS)[found.part[_HITS]]
-    hits[:, Hit.LOOK] = look_at[np.where(hits[:, Hit.LOOK] < 0, -1, look)]
-    # Where a stretch of the clock ends, both that it parts have the fix.
+    unpacked.renumber_references(_places_of(spot_order), _places_of(look_order))
     session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
-    session = session[found.part[_FIXES]]
-    order = np.lexsort((*fixes.T[::-1], session))
-    fixes, session = fixes[order], session[order]
-    is_other = np.ones(len(fixes), np.bool_)
-    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
     tables = (
         spots[spot_order],
         looks[look_order],
         *(table[_order(table[:, 0], table[:, 1])] for table in (hits, scores, beside)),
         unplaced[_order(unplaced[:, 0], unplaced[:, 1], unplaced[:, 2])],
-        fixes[is_other],
+        _distinct_fixes(fixes, session[unpacked.part[_FIXES]]),
     )
     return Sights(topics, labels, tables, len(slices)), slices[:, 1]
+
+
+def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
+    """Returns the fixes of each session in order of time, each once.
+
+    Where a stretch of the clock ends, both that it parts have the fix.
+    """
+    order = np.lexsort((*fixes.T[::-1], session))
+    fixes, session = fixes[order], session[order]
+    is_other = np.ones(len(fixes), np.bool_)
+    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
+    return fixes[is_other]
 
 
 class _Unpacked:
@@ -150,9 +151,9 @@ class _Unpacked:
             self.labels.append(labels)
             counts.append(rows)
             slices.append(begin)
-            for own, columns, count in zip(planes, TABLES, rows, strict=True):
+            for blocks, columns, count in zip(planes, TABLES, rows, strict=True):
                 shape = (len(columns), width, count)
-                own.append(np.frombuffer(data, np.uint8, math.prod(shape), at).reshape(shape))
+                blocks.append(np.frombuffer(data, np.uint8, math.prod(shape), at).reshape(shape))
                 at += math.prod(shape)
         self._sizes = np.array(counts, np.int64).reshape(-1, len(TABLES)).T
         self.part = [np.repeat(np.arange(len(parts)), sizes) for sizes in self._sizes]
@@ -160,6 +161,21 @@ class _Unpacked:
         self.tables = [
             _table(at, planes.pop(0), part, first[part]) for at, part in enumerate(self.part)
         ]
+
+    def renumber_references(self, spots: Ints, looks: Ints) -> None:
+        """Changes numbers of spots and looks inside their part into their places in the whole.
+
+        Args:
+            spots: the place of each spot of all parts.
+            looks: likewise; a hit without a look keeps -1.
+        """
+        for number in (_HITS, _SCORES, _BESIDE):
+            table = self.tables[number]
+            table[:, 0] = spots[table[:, 0] + self.begins(_SPOTS)[self.part[number]]]
+        hits = self.tables[_HITS]
+        look = hits[:, Hit.LOOK] + self.begins(_LOOKS)[self.part[_HITS]]
+        look = np.where(hits[:, Hit.LOOK] < 0, -1, look)
+        hits[:, Hit.LOOK] = np.append(looks, [-1])[look]
 
     def begins(self, at: int) -> Ints:
         """Returns where the rows of each part begin in a table."""
@@ -171,14 +187,14 @@ class _Unpacked:
         self, names: Sequence[Sequence[str]], columns: Sequence[tuple[int, int]]
     ) -> tuple[str, ...]:
         """Returns the names of all parts, sorted, having changed their numbers in some columns."""
-        every = sorted({name for own in names for name in own})
-        number = {name: nth for nth, name in enumerate(every)}
-        numbers = np.array([number[name] for own in names for name in own], np.int64)
+        united = sorted({name for part_names in names for name in part_names})
+        number = {name: nth for nth, name in enumerate(united)}
+        numbers = np.array([number[name] for part_names in names for name in part_names], np.int64)
         begins = np.cumsum([0, *map(len, names)])
         for at, column in columns:
             table = self.tables[at]
             table[:, column] = numbers[table[:, column] + begins[self.part[at]]]
-        return tuple(every)
+        return tuple(united)
 
     def with_slices_numbered(self, epoch: Ints) -> Ints:
         """Returns all slices with their epochs, having changed slices to their numbers."""
@@ -187,19 +203,19 @@ class _Unpacked:
         epochs = np.concatenate([epoch[self.part[at]] for at in _IN_SLICES])
         rows, number = distinct_rows((slices, epochs))
         ends = np.cumsum([len(table) for table in tables])[:-1]
-        for table, own in zip(tables, np.split(number, ends), strict=True):
-            table[:, 0] = own
+        for table, table_slices in zip(tables, np.split(number, ends), strict=True):
+            table[:, 0] = table_slices
         return rows
 
 
 def _table(at: int, planes: Sequence[Bytes], part: Ints, begin: Ints) -> Ints:
     """Returns the rows of one table of all parts; `part` and its first slice are of each row."""
-    width = max((each.shape[1] for each in planes), default=4)
+    width = max((block.shape[1] for block in planes), default=4)
     wide = [np.zeros((len(TABLES[at]), width, 0), np.uint8)]
-    wide += [each if each.shape[1] == width else _widened(each) for each in planes]
-    every = np.ascontiguousarray(np.concatenate(wide, axis=2).transpose(0, 2, 1))
-    coded = every.view(f"<u{width}")[:, :, 0].astype(np.uint64)
-    del wide, every
+    wide += [block if block.shape[1] == width else _widened(block) for block in planes]
+    stacked = np.ascontiguousarray(np.concatenate(wide, axis=2).transpose(0, 2, 1))
+    coded = stacked.view(f"<u{width}")[:, :, 0].astype(np.uint64)
+    del wide, stacked
     # In place: in a week of a detector that sees things everywhere there are millions.
     sign = coded & 1
     coded >>= 1

@@ -48,8 +48,8 @@ from ros2_memory.columns.shown import (
     leaves_below,
     placed,
 )
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
-from ros2_memory.columns.walk import within
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
+from ros2_memory.columns.walk import entries_of_codes
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -105,13 +105,21 @@ _CHARGE: Final = (Word(CHARGE),)
 _COMMAND: Final = (Word(COMMAND),)
 
 
+class _Entry(NamedTuple):
+    """Where log entries, or the entries of diagnostics, have what they state."""
+
+    level: Leaf
+    name: Leaf
+    text: Leaf
+
+
 class _Plan(NamedTuple):
     """What is looked for in the messages of a type."""
 
     type: str
     labels: tuple[Source, ...] = ()
     flags: tuple[tuple[str, Leaf], ...] = ()
-    entry: tuple[Leaf, ...] = ()
+    entry: _Entry | None = None
     numbers: tuple[Leaf, ...] = ()
 
     @classmethod
@@ -123,17 +131,17 @@ class _Plan(NamedTuple):
         """
         value, type_name = shape.value, shape.type
         if type_name == GOALS:
-            return cls(type_name, numbers=tuple(_of_goals(value)))
+            return cls(type_name, numbers=tuple(_goal_leaves(value)))
         if has_errors(type_name):
-            return cls(type_name, entry=_entry(value, type_name))
+            return cls(type_name, entry=_entry_leaves(value, type_name))
         numbers: tuple[Leaf, ...] = ()
         if type_name in VELOCITIES:
-            numbers = tuple(_numbers_in(value))
+            numbers = tuple(_command_leaves(value))
         elif type_name == BATTERY:
-            numbers = tuple(_charge(value))
+            numbers = tuple(_charge_leaves(value))
         if not has_events(type_name):
             return cls(type_name, numbers=numbers)
-        flags = tuple(_flags(value, ""))
+        flags = tuple(_flag_leaves(value, ""))
         if len(flags) > MOST[FLAG]:
             raise UnknownShapeError("more booleans than are tracked")
         return cls(type_name, tuple(sources_in(value)), flags, numbers=numbers)
@@ -147,18 +155,20 @@ class _Plan(NamedTuple):
         values, nothing = Values(table), np.empty(0, np.int64)
         if self.type == GOALS:
             stated = Stated(table.log_times)
-            return FromColumns(stated, nothing, _alike(values, self.numbers))
+            return FromColumns(stated, nothing, _alike_goals(values, self.numbers))
         if self.entry:
-            facts = _entries(values, self.entry, self.type)
+            facts = _entry_facts(values, self.entry, self.type)
             return FromColumns(Stated(table.log_times, facts), nothing)
-        labels = joined_facts([facts for each in self.labels for facts in _labels(values, each)])
+        labels = joined_facts(
+            [facts for source in self.labels for facts in _label_facts(values, source)]
+        )
         if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
             raise UnknownShapeError("more labels than are tracked")
         numbers, to_read = NOTHING, nothing
         if self.numbers:
-            of = _charges if self.type == BATTERY else _commands
-            numbers, to_read = of(values, self.numbers)
-        flags = [_booleans(values, path, leaf) for path, leaf in self.flags]
+            facts_of = _charge_facts if self.type == BATTERY else _command_facts
+            numbers, to_read = facts_of(values, self.numbers)
+        flags = [_flag_facts(values, path, leaf) for path, leaf in self.flags]
         return FromColumns(
             Stated(table.log_times, joined_facts([labels, *flags, numbers])), to_read
         )
@@ -167,7 +177,7 @@ class _Plan(NamedTuple):
 # What a type has
 
 
-def _flags(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
+def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
     """Yields the booleans of objects; none of lists."""
     if isinstance(node, Narrowed):
         raise UnknownShapeError("an element of a list stands alone")
@@ -175,35 +185,35 @@ def _flags(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
         yield path, node
     elif is_object(node):
         for name, inner in children(node):
-            yield from _flags(inner, f"{path}.{name}" if path else name)
+            yield from _flag_leaves(inner, f"{path}.{name}" if path else name)
 
 
-def _entry(value: Node, type_name: str) -> tuple[Leaf, ...]:
+def _entry_leaves(value: Node, type_name: str) -> _Entry:
     """Returns level, name and text of a log entry, or of the elements of a list of diagnostics."""
     node: Node | None = value
     if type_name == DIAGNOSTICS:
         listed = _child(value, "status")
         node = listed.element if isinstance(listed, Listing) else None
     text = "message" if type_name == DIAGNOSTICS else "msg"
-    found = [] if node is None else [_child(node, name) for name in ("level", "name", text)]
-    leaves = tuple(leaf for leaf in found if isinstance(leaf, Leaf))
+    nodes = [] if node is None else [_child(node, name) for name in ("level", "name", text)]
+    leaves = tuple(leaf for leaf in nodes if isinstance(leaf, Leaf))
     kinds = [leaf.kind for leaf in leaves]
     if kinds != [Kind.INTEGER, Kind.TEXT, Kind.TEXT]:
         raise UnknownShapeError("the definition is not the standard one")
-    return leaves
+    return _Entry(*leaves)
 
 
 def _child(node: Node, name: str) -> Node | None:
     return node.child(name) if is_object(node) else None
 
 
-def _charge(value: Node) -> Iterator[Leaf]:
+def _charge_leaves(value: Node) -> Iterator[Leaf]:
     leaf = _child(value, "percentage")
     if isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
         yield leaf
 
 
-def _numbers_in(value: Node) -> Iterator[Leaf]:
+def _command_leaves(value: Node) -> Iterator[Leaf]:
     """Yields the floats of a command."""
     for _, leaf, limits in leaves_below(Spot(value)):
         if limits or leaf.level != ROWS:
@@ -212,13 +222,16 @@ def _numbers_in(value: Node) -> Iterator[Leaf]:
             yield leaf
 
 
-def _of_goals(value: Node) -> Iterator[Leaf]:
+def _goal_leaves(value: Node) -> Iterator[Leaf]:
     """Yields what tells the goals of a status apart, but for their ids, and their statuses."""
     listed = _child(value, "status_list")
     if not isinstance(listed, Listing):
         raise UnknownShapeError("the definition is not the standard one")
     for _, leaf, _ in leaves_below(Spot(listed.element)):
-        if leaf.level == listed.level and leaf.made in {Made.STORED, Made.SECONDS}:
+        if leaf.level == listed.level and leaf.conversion in {
+            Conversion.STORED,
+            Conversion.SECONDS,
+        }:
             yield leaf
     for end in ("least", "greatest"):
         yield Leaf(listed.level, (f"goal_info.goal_id.uuid.{end}",), Kind.REAL)
@@ -227,57 +240,58 @@ def _of_goals(value: Node) -> Iterator[Leaf]:
 # What a table holds
 
 
-def _labels(values: Values, source: Source) -> Iterator[Facts]:
+def _label_facts(values: Values, source: Source) -> Iterator[Facts]:
     """Yields the labels at one place of the messages, with their scores."""
-    for found in found_in(values, source, places=False):
-        words = [Word(LABEL, label) for label in found.labels.words]
-        yield Facts(found.rows, found.labels.codes.astype(np.int64), found.scores, words)
+    for detections in found_in(values, source, places=False):
+        words = [Word(LABEL, label) for label in detections.labels.words]
+        yield Facts(
+            detections.rows, detections.labels.codes.astype(np.int64), detections.scores, words
+        )
 
 
-def _booleans(values: Values, path: str, leaf: Leaf) -> Facts:
+def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
     zone, rows = values.zone(leaf), np.arange(values.rows)
     if zone is not None and zone.least is not None and zone.least == zone.greatest:
         flags = np.full(rows.size, float(zone.least))
     else:
-        found = values.numbers(leaf)
-        if found is None:
+        numbers = values.numbers(leaf)
+        if numbers is None:
             raise UnknownShapeError(f"{path} is not held")
-        flags = found.values.astype(np.float64)
+        flags = numbers.values.astype(np.float64)
     return Facts(rows, np.zeros(rows.size, np.int64), flags, [Word(FLAG, path)])
 
 
-def _entries(values: Values, entry: tuple[Leaf, ...], type_name: str) -> Facts:
+def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
     """Returns what log entries or diagnostics state: each that is alike is looked at once."""
-    zone = values.zone(entry[0])
-    if zone is not None and (zone.greatest is None or not _of_entry(int(zone.greatest), type_name)):
+    zone = values.zone(entry.level)
+    if zone is not None and (
+        zone.greatest is None or not _facts_of_entry(int(zone.greatest), type_name)
+    ):
         return NOTHING
-    level, (name, text) = values.numbers(entry[0]), [texts_of(values, leaf) for leaf in entry[1:]]
-    if level is None:
+    numbers = values.numbers(entry.level)
+    name, text = texts_of(values, entry.name), texts_of(values, entry.text)
+    if numbers is None:
         raise UnknownShapeError("levels are not held")
-    numbers = level.values.astype(np.int64)
-    telling = [each for each in np.unique(numbers).tolist() if _of_entry(each, type_name)]
-    among = np.flatnonzero(np.isin(numbers, telling))
-    _, rows = placed(values, entry[0].level, among, (), surely=True)
+    levels = numbers.values.astype(np.int64)
+    telling = [level for level in np.unique(levels).tolist() if _facts_of_entry(level, type_name)]
+    positions = np.flatnonzero(np.isin(levels, telling))
+    _, rows = placed(values, entry.level.level, positions, (), surely=True)
     if rows.size and np.bincount(rows).max() > MOST[STATUS]:
         raise UnknownShapeError("more levels than are tracked")
-    keys = np.stack([numbers[among], name.codes[among], text.codes[among]])
-    alike, codes = np.unique(keys, axis=1, return_inverse=True)
-    once = Facts.of(
+    keys = np.stack([levels[positions], name.codes[positions], text.codes[positions]])
+    distinct, codes = np.unique(keys, axis=1, return_inverse=True)
+    facts = Facts.of(
         [
-            (nth, fact)
-            for nth, (number, who, what) in enumerate(alike.T.tolist())
-            for fact in _of_entry(number, type_name, name.words[who], text.words[what])
+            (code, fact)
+            for code, (level, who, what) in enumerate(distinct.T.tolist())
+            for fact in _facts_of_entry(level, type_name, name.words[who], text.words[what])
         ]
     )
-    # Each entry has the facts of its code, one after another.
-    codes = codes.reshape(-1)
-    counts = np.bincount(once.rows, minlength=alike.shape[1])
-    begins, counts = (np.cumsum(counts) - counts)[codes], counts[codes]
-    nth = np.repeat(begins, counts) + within(counts)
-    return Facts(np.repeat(rows, counts), once.codes[nth], once.values[nth], once.words)
+    counts, taken = entries_of_codes(facts.rows, codes.reshape(-1))
+    return Facts(np.repeat(rows, counts), facts.codes[taken], facts.values[taken], facts.words)
 
 
-def _of_entry(level: int, type_name: str, name: str = "", text: str = "") -> tuple[Fact, ...]:
+def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") -> tuple[Fact, ...]:
     """Returns the facts of a log entry, or of diagnostics of one entry."""
     value: JsonValue = {"level": level, "name": name, "msg": text}
     if type_name == DIAGNOSTICS:
@@ -285,45 +299,47 @@ def _of_entry(level: int, type_name: str, name: str = "", text: str = "") -> tup
     return state_of(value, type_name).facts
 
 
-def _charges(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _charge_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
-    found = values.numbers(leaves[0])
-    if found is None or not isinstance(found.error, float):
+    numbers = values.numbers(leaves[0])
+    if numbers is None or not isinstance(numbers.error, float):
         raise UnknownShapeError("the charge is not held")
-    charges = found.values.astype(np.float64)
-    low, levels, high = (charge_levels(charges + off) for off in (-found.error, 0, found.error))
-    known = np.flatnonzero((levels >= 0) & (low == high))
-    charge = Facts(known, np.zeros(known.size, np.int64), levels[known].astype(np.float64), _CHARGE)
+    charges = numbers.values.astype(np.float64)
+    low, levels, high = (charge_levels(charges + off) for off in (-numbers.error, 0, numbers.error))
+    settled = np.flatnonzero((levels >= 0) & (low == high))
+    charge = Facts(
+        settled, np.zeros(settled.size, np.int64), levels[settled].astype(np.float64), _CHARGE
+    )
     return charge, np.flatnonzero(low != high)
 
 
-def _commands(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _command_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
     surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:
-        found = values.numbers(leaf)
-        if found is None or not isinstance(found.error, float):
+        column = values.numbers(leaf)
+        if column is None or not isinstance(column.error, float):
             raise UnknownShapeError("the command is not held")
-        numbers = found.values.astype(np.float64)
-        surely &= is_still(numbers, found.error)
-        perhaps &= is_still(numbers, -found.error)
-    known = np.flatnonzero(surely == perhaps)
-    moves = (~surely[known]).astype(np.float64)
-    return Facts(known, np.zeros(known.size, np.int64), moves, _COMMAND), np.flatnonzero(
+        numbers = column.values.astype(np.float64)
+        surely &= is_still(numbers, column.error)
+        perhaps &= is_still(numbers, -column.error)
+    settled = np.flatnonzero(surely == perhaps)
+    moves = (~surely[settled]).astype(np.float64)
+    return Facts(settled, np.zeros(settled.size, np.int64), moves, _COMMAND), np.flatnonzero(
         surely != perhaps
     )
 
 
-def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
-    """Numbers the rows by what they list, as far as columns tell: as the one before, or another.
+def _alike_goals(values: Values, leaves: Sequence[Leaf]) -> Ints:
+    """Returns a number for each row: that of the row before if both list the same goals.
 
     An action server lists a goal with the time at which it accepted it, so one goal does not take
     the place of another without a trace.
     """
     columns = [values.numbers(leaf) for leaf in leaves]
-    found = [column.values for column in columns if column is not None]
+    numbers = [column.values for column in columns if column is not None]
     elements = values.elements(leaves[0].level) if leaves else None
-    if len(found) < len(columns) or elements is None:
+    if len(numbers) < len(columns) or elements is None:
         raise UnknownShapeError("goals are not held")
     first = np.searchsorted(elements.owners, np.arange(values.rows + 1))
     counts = np.diff(first)
@@ -332,8 +348,8 @@ def _alike(values: Values, leaves: Sequence[Leaf]) -> Ints:
     nth = np.arange(elements.owners.size) - first[elements.owners]
     before = np.maximum(first[np.maximum(elements.owners - 1, 0)] + nth, 0)
     before = np.minimum(before, max(elements.owners.size - 1, 0))
-    differs = np.zeros(elements.owners.size, np.bool_)
-    for column in found:
-        differs |= column != column[before]
-    is_new[elements.owners[differs]] = True
+    is_different = np.zeros(elements.owners.size, np.bool_)
+    for column in numbers:
+        is_different |= column != column[before]
+    is_new[elements.owners[is_different]] = True
     return np.cumsum(is_new)

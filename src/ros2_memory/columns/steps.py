@@ -114,10 +114,10 @@ def step_of(path: str, definition: Definition | None = None) -> Step:
 def _type_at(path: str, definition: Definition | None) -> str:
     """The type of the message at a path; empty where it is not known."""
     names = path.split(".") if path else []
-    found = fields_at(definition, names)
-    if len(found) < len(names):
+    fields = fields_at(definition, names)
+    if len(fields) < len(names):
         return ""
-    kind = found[-1].kind if found else definition
+    kind = fields[-1].kind if fields else definition
     return kind.type if isinstance(kind, Definition) else ""
 
 

@@ -209,28 +209,21 @@ class ColumnStore(Database):
                 "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns"
                 " FROM bag WHERE size >= 0"
             )
-            return {
-                file: BagFile(
-                    file,
-                    size,
-                    mtime,
-                    BagState.CLOSED,
-                    BagSummary.decoded(schemas[schema], counts),
-                    *rest,
-                )
-                for path, size, mtime, schema, counts, *rest in rows
-                for file in [root + path]
-            }
+            bags: dict[str, BagFile] = {}
+            for path, size, mtime, schema, counts, *times in rows:
+                file, summary = root + path, BagSummary.decoded(schemas[schema], counts)
+                bags[file] = BagFile(file, size, mtime, BagState.CLOSED, summary, *times)
+            return bags
 
         return self.read(ask, {})
 
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
-        among = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
+        condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
         rows = self._rows(
             list[tuple[str, int, Ns, Ns, int, int]](),
             "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
-            f" WHERE definitions IN ('', ?) {among}",
+            f" WHERE definitions IN ('', ?) {condition}",
             self._definitions,
             *(() if paths is None else (json.dumps(paths),)),
         )
@@ -270,19 +263,23 @@ class ColumnStore(Database):
         """Returns all topics that were ever stored, by their numbers."""
 
         def ask(connection: sqlite3.Connection) -> dict[int, Topic]:
-            known = {each: topic for each, topic in self._topics.items() if self.is_current(each)}
+            topics = {
+                topic_number: topic
+                for topic_number, topic in self._topics.items()
+                if self.is_current(topic_number)
+            }
             rows = connection.execute(
                 "SELECT topic.id, name, topic.encoding, latched, layout, type,"
                 " definition.encoding, text"
                 " FROM topic JOIN definition ON definition.id = definition WHERE topic.id > ?",
-                (max(known, default=self.offset) - self.offset,),
+                (max(topics, default=self.offset) - self.offset,),
             )
             for number, name, encoding, latched, layout, *schema in rows:
                 channel = Channel(name, encoding, Schema(*schema), bool(latched))
                 topic = Topic(channel, Layout.from_json(layout), self._definition_of)
-                known[self.offset + number] = topic
-            self._topics = known
-            return known
+                topics[self.offset + number] = topic
+            self._topics = topics
+            return topics
 
         return self.read(ask, {})
 
@@ -307,13 +304,13 @@ class ColumnStore(Database):
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(row[4]) for row in rows]
-            every = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
-            own = np.split(every, np.cumsum([*map(len, bags)])[:-1]) if rows else []
+            bags = [json.loads(numbers) for _, _, _, _, numbers, *_ in rows]
+            all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
+            bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [
                 PartHead(
                     self.offset + number,
-                    self.offset + of_topic,
+                    self.offset + topic_number,
                     first,
                     last,
                     numbers,
@@ -321,9 +318,16 @@ class ColumnStore(Database):
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for (number, of_topic, first, last, _, messages, dropped, whole), numbers in zip(
-                    rows, own, strict=True
-                )
+                for (
+                    number,
+                    topic_number,
+                    first,
+                    last,
+                    _,
+                    messages,
+                    dropped,
+                    whole,
+                ), numbers in zip(rows, bags_of_parts, strict=True)
             ]
 
         return self.read(ask, [])
@@ -372,14 +376,14 @@ class ColumnStore(Database):
                 " WHERE coalesce(own.data, other.data) IS NOT NULL",
                 (self._ids(parts), path),
             )
-            found: dict[int, bytes] = {}
+            by_part: dict[int, bytes] = {}
             size = 0
             for part, data in rows:
-                found[part + self.offset] = data
+                by_part[part + self.offset] = data
                 size += len(data)
                 if size > most_bytes:
                     break
-            return found
+            return by_part
 
         return self.read(ask, {})
 
@@ -390,16 +394,16 @@ class ColumnStore(Database):
 
         They are of the same settings, the newest first.
         """
-        own, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
+        key_parts, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
         query = (
             "SELECT start_ns, parts, data FROM fragment"
             " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC"
         )
         since = max(key.start - also_before, MIN_NS)
         return [
-            (key._replace(start=start, parts=self._parts(parts)), data)
+            (key._replace(start=start, parts=self._numbers_of(parts)), data)
             for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
-            if start < key.start or parts == own
+            if start < key.start or parts == key_parts
         ]
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
@@ -428,12 +432,12 @@ class ColumnStore(Database):
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])
 
-    def _parts(self, ids: str) -> tuple[int, ...]:
+    def _numbers_of(self, ids: str) -> tuple[int, ...]:
         return tuple(number + self.offset for number in json.loads(ids))
 
     # Writing
 
-    def put_fragments(self, kind: str, made: Sequence[tuple[FragmentKey, bytes]]) -> bool:
+    def put_fragments(self, kind: str, fragments: Sequence[tuple[FragmentKey, bytes]]) -> bool:
         """Stores fragments in place of those of the same time, settings and some of the parts.
 
         Not those of a part that is not stored any more. What was stored of the same parts may be
@@ -441,31 +445,10 @@ class ColumnStore(Database):
         """
 
         def write(connection: sqlite3.Connection) -> None:
-            for key, data in made:
-                if not all(map(self.is_current, key.parts)):
-                    continue
-                parts = self._ids(key.parts)
-                stored = connection.execute(
-                    "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
-                    " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
-                    " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
-                    " ON CONFLICT DO UPDATE SET data = excluded.data"
-                    " WHERE data <> excluded.data RETURNING id",
-                    (kind, key.settings, key.start, parts, data),
-                ).fetchall()
-                for (number,) in stored:
-                    # What followed before there were all of these parts is not asked for again.
-                    older = connection.execute(
-                        "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
-                        " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
-                        " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
-                        (kind, key.settings, key.start, number, parts),
-                    ).fetchall()
-                    connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
-                    connection.execute(
-                        "INSERT OR IGNORE INTO fragment_part SELECT value, ? FROM json_each(?)",
-                        (number, parts),
-                    )
+            for key, data in fragments:
+                if all(map(self.is_current, key.parts)):
+                    identity = (kind, key.settings, key.start)
+                    _insert_fragment(connection, identity, self._ids(key.parts), data)
 
         return self.write(write)
 
@@ -573,7 +556,7 @@ class ColumnStore(Database):
 
         def write(connection: sqlite3.Connection) -> None:
             usual = bytes_of_topics(connection)
-            stored, taken = _merged_bytes(connection)
+            stored, taken = _query_merged_bytes(connection)
             for parts, at_least in shares:
                 if all(map(self.is_current, parts)):
                     numbers = [part - self.offset for part in parts]
@@ -588,7 +571,7 @@ class ColumnStore(Database):
 
     def merged_bytes(self) -> tuple[int, int]:
         """Returns the bytes of the bags that are in whole parts, and those of their columns."""
-        return self.read(_merged_bytes, (0, 0))
+        return self.read(_query_merged_bytes, (0, 0))
 
     def used_bytes(self) -> int:
         """Returns the bytes of the file that hold something."""
@@ -603,7 +586,41 @@ class ColumnStore(Database):
         return self.read(ask, 0)
 
 
-def _merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
+def _insert_fragment(
+    connection: sqlite3.Connection, identity: tuple[str, str, Ns], parts: str, data: bytes
+) -> None:
+    """Stores a fragment if all of its parts are stored, in place of others of some of them.
+
+    Args:
+        connection: to the store.
+        identity: the fragment's kind, settings and start.
+        parts: the numbers of its parts in the file, as JSON.
+        data: of the fragment.
+    """
+    inserted = connection.execute(
+        "INSERT INTO fragment (kind, settings, start_ns, parts, data)"
+        " SELECT ?1, ?2, ?3, ?4, ?5 WHERE json_array_length(?4) ="
+        " (SELECT count(*) FROM part WHERE id IN (SELECT value FROM json_each(?4)))"
+        " ON CONFLICT DO UPDATE SET data = excluded.data"
+        " WHERE data <> excluded.data RETURNING id",
+        (*identity, parts, data),
+    ).fetchall()
+    for (number,) in inserted:
+        # What followed before there were all of these parts is not asked for again.
+        older = connection.execute(
+            "DELETE FROM fragment WHERE kind = ?1 AND settings = ?2 AND start_ns = ?3"
+            " AND id <> ?4 AND id IN (SELECT fragment FROM fragment_part"
+            " WHERE part IN (SELECT value FROM json_each(?5))) RETURNING id",
+            (*identity, number, parts),
+        ).fetchall()
+        connection.executemany("DELETE FROM fragment_part WHERE fragment = ?", older)
+        connection.execute(
+            "INSERT OR IGNORE INTO fragment_part SELECT value, ? FROM json_each(?)",
+            (number, parts),
+        )
+
+
+def _query_merged_bytes(connection: sqlite3.Connection) -> tuple[int, int]:
     [bags] = connection.execute(
         f"SELECT total(size) FROM bag WHERE size > 0 AND id NOT IN ({UNMERGED})"
     ).fetchone()

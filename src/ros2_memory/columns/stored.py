@@ -37,12 +37,12 @@ class Lazily(Mapping[str, V]):
         self._made: dict[str, V] = {}
 
     def __getitem__(self, name: str) -> V:
-        made = self._made.get(name)
-        if made is None:
+        value = self._made.get(name)
+        if value is None:
             if name not in self._names:
                 raise KeyError(name)
-            made = self._made[name] = self._make(name)
-        return made
+            value = self._made[name] = self._make(name)
+        return value
 
     def __contains__(self, name: object) -> bool:
         return name in self._names
@@ -94,16 +94,16 @@ class StoredTable(Table):
         return None if packed is None else packed.zone
 
     def remember(self, what: str, make: Callable[[], V], size_of: Callable[[V], int]) -> V:
-        """Returns what is made of all rows, as of `Table`."""
+        """Returns what `make` makes of all rows, once for the part; see `Table.remember`."""
         if self.memory is None:
             return make()
         key = (self.number, f"={what}")
-        known = self.memory.get(key)
-        if known is not None:
-            return cast("V", known)  # by name: each has one type
-        made = make()
-        self.memory.put(key, made, size_of(made))
-        return made
+        cached = self.memory.get(key)
+        if cached is not None:
+            return cast("V", cached)  # by name: each has one type
+        value = make()
+        self.memory.put(key, value, size_of(value))
+        return value
 
 
 @dataclass(frozen=True, eq=False)

@@ -141,9 +141,9 @@ class Texts:
     @classmethod
     def of(cls, values: Sequence[str]) -> Texts:
         """Returns the column of these strings."""
-        known: dict[str, int] = {}
-        codes = [known.setdefault(value, len(known)) for value in values]
-        return cls(np.array(codes, np.uint32), tuple(known))
+        code_of: dict[str, int] = {}
+        codes = [code_of.setdefault(value, len(code_of)) for value in values]
+        return cls(np.array(codes, np.uint32), tuple(code_of))
 
     def __len__(self) -> int:
         """Returns the number of rows."""
@@ -168,12 +168,12 @@ class Texts:
 
 def joined_texts(parts: Sequence[Texts]) -> Texts:
     """Returns columns of texts one after the other."""
-    known: dict[str, int] = {}
+    code_of: dict[str, int] = {}
     codes = [np.empty(0, np.uint32)]
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return Texts(np.concatenate(codes), tuple(known))
+        recoded = [code_of.setdefault(word, len(code_of)) for word in part.words]
+        codes.append(np.array(recoded, np.uint32)[part.codes])
+    return Texts(np.concatenate(codes), tuple(code_of))
 
 
 Column: TypeAlias = "Numbers | Texts"
@@ -203,11 +203,11 @@ class Elements:
         first = np.searchsorted(self.owners, positions, "left")
         counts = np.searchsorted(self.owners, positions, "right") - first
         before = np.cumsum(counts) - counts
-        own = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
+        taken = np.repeat(first - before, counts) + np.arange(int(counts.sum()))
         return Elements(
             np.repeat(np.arange(positions.size), counts),
-            {path: _rows(column, own) for path, column in self.columns.items()},
-            {path: inner.rows(own) for path, inner in self.elements.items()},
+            {path: _taken(column, taken) for path, column in self.columns.items()},
+            {path: inner.rows(taken) for path, inner in self.elements.items()},
         )
 
 
@@ -277,7 +277,7 @@ class Table:
             log_times=self.log_times[positions],
             publish_times=self.publish_times[positions],
             places=self.places[positions],
-            columns={path: _rows(column, positions) for path, column in self.columns.items()},
+            columns={path: _taken(column, positions) for path, column in self.columns.items()},
             elements={path: inner.rows(positions) for path, inner in self.elements.items()},
             payload_hashes=None if hashes is None else hashes[positions],
         )
@@ -295,11 +295,11 @@ class Table:
 
 def order_of(log_times: IntArray, places: IntArray) -> IntArray | None:
     """Returns the positions by log time, ties by place; None if that is the order already."""
-    later = log_times[1:] > log_times[:-1]
-    if later.all():
+    is_later = log_times[1:] > log_times[:-1]
+    if is_later.all():
         return None
-    tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
-    return None if (later | tied).all() else np.lexsort((places, log_times))
+    is_tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
+    return None if (is_later | is_tied).all() else np.lexsort((places, log_times))
 
 
 def joined(tables: Sequence[Table]) -> Table:
@@ -326,7 +326,7 @@ def joined(tables: Sequence[Table]) -> Table:
     ).sorted()
 
 
-def _rows(column: Column, positions: IntArray) -> Column:
+def _taken(column: Column, positions: IntArray) -> Column:
     return column.rows(positions) if isinstance(column, Texts) else column[positions]
 
 
@@ -349,7 +349,7 @@ def _joined_levels(
 
     def elements(path: str) -> Elements:
         inner = [part.elements[path] for part in parts]
-        owners = [each.owners + rows for each, rows in zip(inner, before, strict=False)]
+        owners = [sequence.owners + rows for sequence, rows in zip(inner, before, strict=False)]
         return Elements(np.concatenate(owners), *_joined_levels(inner))
 
     columns = {

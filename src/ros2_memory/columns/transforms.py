@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.frames import Edge, Edges, Floats, unit_quaternions
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.columns.steps import METRES, QUATERNION, Step
 from ros2_memory.columns.table import Elements, Table, Texts
 from ros2_memory.core.model import StampedTransform, Transform
@@ -28,7 +28,7 @@ _TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
 _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
 
 
-class _Names(NamedTuple):
+class _CodedPairs(NamedTuple):
     """The edges of the transforms of a table: `pairs[codes]`; -1 where there is none."""
 
     pairs: list[Pair]
@@ -45,24 +45,26 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
         times: log times (ns) of the rows.
         index: the positions of the rows, ascending; None: all.
     """
-    found = _elements(table)
-    if found is None:
+    transforms = _transforms_of(table)
+    if transforms is None:
         return None
     if index is not None:
-        found = found.rows(index)
-    pairs, codes = _names(found)
-    translation = _numbers(found, _TRANSLATION, METRES)
-    rotation = _numbers(found, _ROTATION, QUATERNION)
-    stamps = np.asarray(found.columns[_STAMP], np.int64)
+        transforms = transforms.rows(index)
+    pairs, codes = _coded_pairs(transforms)
+    translation = _rounded_rows(transforms, _TRANSLATION, METRES)
+    rotation = _rounded_rows(transforms, _ROTATION, QUATERNION)
+    stamps = np.asarray(transforms.columns[_STAMP], np.int64)
     # tf2 refuses what is not finite, and rotations that are not unit quaternions.
-    fine = (codes >= 0) & np.isfinite(translation).all(axis=1)
-    fine &= np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
+    is_valid = (codes >= 0) & np.isfinite(translation).all(axis=1)
+    is_valid &= np.isfinite(rotation).all(axis=1) & (rotation != 0).any(axis=1)
     edges: dict[Pair, Edge] = {}
     for nth, pair in enumerate(pairs):
-        here = np.flatnonzero(fine & (codes == nth))
-        if here.size:
-            turned = unit_quaternions(rotation[here])
-            edges[pair] = Edge(stamps[here], times[found.owners[here]], translation[here], turned)
+        rows = np.flatnonzero(is_valid & (codes == nth))
+        if rows.size:
+            turned = unit_quaternions(rotation[rows])
+            edges[pair] = Edge(
+                stamps[rows], times[transforms.owners[rows]], translation[rows], turned
+            )
     return edges
 
 
@@ -71,8 +73,8 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
 
     From their names alone, where no number is invalid. None where only the messages have them.
     """
-    found = _elements(table)
-    if found is None:
+    transforms = _transforms_of(table)
+    if transforms is None:
         return None
     if index is not None:
         edges = edges_in(table, np.zeros(index.size, np.int64), index)
@@ -81,7 +83,7 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
     if any(zone is None or zone.nulls or math.isinf(zone.high - zone.low) for zone in zones):
         edges = edges_in(table, np.zeros(len(table), np.int64))
         return None if edges is None else frozenset(edges)
-    pairs, _ = _names(found)
+    pairs, _ = _coded_pairs(transforms)
     return frozenset(pairs)
 
 
@@ -93,15 +95,15 @@ def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntAr
     edges = edges_in(table, times, index)
     if edges is None:
         return None
-    found = [np.zeros(0, np.int64)]
+    changes = [np.zeros(0, np.int64)]
     for child in {child for _, child in edges}:
-        of_child = [edge for (_, one), edge in edges.items() if one == child]
+        of_child = [edge for (_, other), edge in edges.items() if other == child]
         for edge in of_child:
             numbers = np.column_stack((edge.translation, edge.rotation))
             new = np.append([True], (numbers[1:] != numbers[:-1]).any(axis=1))
             # Those of several parents may alternate.
-            found.append(edge.log_times[new] if len(of_child) == 1 else edge.log_times)
-    return np.unique(np.concatenate(found))
+            changes.append(edge.log_times[new] if len(of_child) == 1 else edge.log_times)
+    return np.unique(np.concatenate(changes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +122,9 @@ class Statics:
         return 200 + 600 * len(self.transforms)
 
 
-STATICS: Final[Kind[Statics]] = Kind("statics", (Statics, StampedTransform, Transform))
+STATICS: Final[FragmentKind[Statics]] = FragmentKind(
+    "statics", (Statics, StampedTransform, Transform)
+)
 """The static transforms of a part, exact."""
 
 
@@ -131,29 +135,29 @@ def stamped_between(
 
     None where only the messages have them.
     """
-    found = _elements(table)
-    if found is None:
+    transforms = _transforms_of(table)
+    if transforms is None:
         return None
-    stamps = np.asarray(found.columns[_STAMP], np.int64)
-    rows = np.unique(found.owners[(stamps >= earliest) & (stamps <= latest)])
+    stamps = np.asarray(transforms.columns[_STAMP], np.int64)
+    rows = np.unique(transforms.owners[(stamps >= earliest) & (stamps <= latest)])
     return rows if index is None else np.flatnonzero(np.isin(index, rows))
 
 
-def _elements(table: Table) -> Elements | None:
+def _transforms_of(table: Table) -> Elements | None:
     """Returns the transforms of a table, with all columns that they need; None without."""
-    found = table.elements.get(_LIST)
-    if found is None or any(not path or path.startswith(_LIST) for path in table.left_out):
+    transforms = table.elements.get(_LIST)
+    if transforms is None or any(not path or path.startswith(_LIST) for path in table.left_out):
         return None
-    held = found.columns.keys()
+    held = transforms.columns.keys()
     needed = {_PARENT, _CHILD, _STAMP, *_TRANSLATION, *_ROTATION}
-    return found if needed <= held else None
+    return transforms if needed <= held else None
 
 
-def _names(found: Elements) -> _Names:
+def _coded_pairs(transforms: Elements) -> _CodedPairs:
     """Returns the edges that occur, in the order of their names."""
-    parents, children = found.columns[_PARENT], found.columns[_CHILD]
+    parents, children = transforms.columns[_PARENT], transforms.columns[_CHILD]
     if not isinstance(parents, Texts) or not isinstance(children, Texts):
-        return _Names([], np.full(len(found), -1))
+        return _CodedPairs([], np.full(len(transforms), -1))
     several = max(len(children.words), 1)
     used, codes = np.unique(
         parents.codes.astype(np.int64) * several + children.codes, return_inverse=True
@@ -167,10 +171,10 @@ def _names(found: Elements) -> _Names:
         if is_edge and (parent, child) not in pairs:
             pairs.append((parent, child))
         numbers.append(pairs.index((parent, child)) if is_edge else -1)
-    return _Names(pairs, np.array(numbers, np.int64)[codes])
+    return _CodedPairs(pairs, np.array(numbers, np.int64)[codes])
 
 
-def _numbers(found: Elements, paths: tuple[str, ...], step: Step) -> Floats:
-    columns = [np.asarray(found.columns[path], np.float64) for path in paths]
+def _rounded_rows(transforms: Elements, paths: tuple[str, ...], step: Step) -> Floats:
+    columns = [np.asarray(transforms.columns[path], np.float64) for path in paths]
     rounded: Floats = np.rint(np.stack(columns, axis=1) * step.per_unit) / step.per_unit
     return rounded

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -29,7 +30,6 @@ from ros2_memory.columns.shown import (
     MAX_LEAVES,
     ByType,
     Group,
-    Kept,
     Limits,
     Listing,
     Message,
@@ -37,6 +37,7 @@ from ros2_memory.columns.shown import (
     Nothing,
     Shape,
     Spot,
+    TruthValues,
     UnknownShapeError,
     at_field,
     children,
@@ -47,7 +48,7 @@ from ros2_memory.columns.shown import (
     unknown,
 )
 from ros2_memory.columns.table import MAX_NUMBERS, Table, Zone, as_float
-from ros2_memory.columns.values import Kind, Leaf, Level, Numbers, Values, zone_of
+from ros2_memory.columns.values import Kind, Leaf, LeafNumbers, Level, Values, zone_of
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.messages.detections import MAX_DEPTH, looks_like_json, without_low_scores
 
@@ -79,7 +80,7 @@ class ColumnCondition:
     def __init__(self, condition: Condition, extractor: SchemaExtractor) -> None:
         self._plans = ByType(extractor, partial(_Plan.of, condition))
 
-    def truth(self, table: Table) -> Kept:
+    def truth(self, table: Table) -> TruthValues:
         """Returns which rows of a table meet the condition."""
         plan, values = self._plans.of(table), Values(table)
         if plan is None:
@@ -96,19 +97,19 @@ class ColumnCondition:
             return counted
         # A text in which detections were left out is another text: both have to pass.
         whole = _any_of(plan.whole, values)
-        return Kept(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
+        return TruthValues(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
 
-    def may_match(self, known: Table | PartZones) -> bool | Mask:
+    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a row may meet the condition, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        plan = self._plans.of(known)
+        plan = self._plans.of(table_or_parts)
         if plan is None:
             return True
-        if isinstance(known, PartZones):
-            return plan.may_match(lambda leaf: zone_of(leaf, known.zone))
-        return plan.may_match(Values(known).zone)
+        if isinstance(table_or_parts, PartZones):
+            return plan.may_match(lambda leaf: zone_of(leaf, table_or_parts.zone))
+        return plan.may_match(Values(table_or_parts).zone)
 
 
 class _Plan(NamedTuple):
@@ -130,30 +131,30 @@ class _Plan(NamedTuple):
         return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
 
     def may_match(self, zone_of: ZoneOf) -> bool | Mask:
-        found: bool | Mask = False
+        possible: bool | Mask = False
         for test in self.whole:
-            found = found | test.may_match(zone_of)
-            if found is True:
+            possible = possible | test.may_match(zone_of)
+            if possible is True:
                 break
-        return found
+        return possible
 
 
-def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> Kept:
+def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> TruthValues:
     """Returns which rows pass any of the tests."""
     surely, perhaps = np.zeros(values.rows, np.bool_), np.zeros(values.rows, np.bool_)
     for test in tests:
         if not test.may_match(values.zone):
             continue
-        for level, found, limits in test.found(values):
-            if found is None:
-                return Kept(surely, np.ones(values.rows, np.bool_))
-            certain = np.flatnonzero(found.surely)
+        for level, passing, limits in test.passing(values):
+            if passing is None:
+                return TruthValues(surely, np.ones(values.rows, np.bool_))
+            certain = np.flatnonzero(passing.surely)
             surely[placed(values, level, certain, limits, surely=True)[1]] = True
-            possible = np.flatnonzero(found.perhaps)
+            possible = np.flatnonzero(passing.perhaps)
             perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
         if surely.all():
             break
-    return Kept(surely, perhaps | surely)
+    return TruthValues(surely, perhaps | surely)
 
 
 def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
@@ -167,15 +168,15 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
             # A missing z is NaN, which is near only what is infinitely far away.
             if test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
         ]
-    found: list[_LeafTest | _PlaceTest] = []
+    tests: list[_LeafTest | _PlaceTest] = []
     for spot in spots:
         for path, leaf, limits in leaves_below(spot):
             # Elements of lists have no name of their own.
             is_element = field is not None and not path
-            made = _LeafTest(test, leaf, limits, is_element, condition.least_score)
-            if made.is_needed:
-                found.append(made)
-    return found
+            leaf_test = _LeafTest(test, leaf, limits, is_element, condition.least_score)
+            if leaf_test.is_needed:
+                tests.append(leaf_test)
+    return tests
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,20 +236,20 @@ class _LeafTest:
         numbers: Sequence[float] = self.numbers
         if self.leaf.kind is Kind.BOOLEAN:
             numbers = [value for value in (False, True) if self.passes(value=value)]
-        found: bool | Mask = False
+        possible: bool | Mask = False
         for number in numbers:
-            found = found | zone.spans(number)
-        return found
+            possible = possible | zone.spans(number)
+        return possible
 
-    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
         """Yields which rows or elements of a level pass; None where the table cannot say."""
         leaf = self.leaf
         if leaf.kind is Kind.TEXT:
-            yield leaf.level, self._among_texts(values), self.limits
+            yield leaf.level, self._passing_texts(values), self.limits
             return
         numbers = values.numbers(leaf)
         if numbers is not None:
-            yield leaf.level, self._among_numbers(numbers), self.limits
+            yield leaf.level, self._passing_numbers(numbers), self.limits
         if leaf.is_of_array and leaf.level.parent is not None:
             yield from self._in_long_arrays(values, leaf.level.parent, is_part=numbers is not None)
         elif numbers is None:
@@ -258,15 +259,15 @@ class _LeafTest:
     def _folded(self) -> str | None:
         return None if isinstance(self.test, Beyond) else self.test.folded
 
-    def _among_texts(self, values: Values) -> Kept | None:
+    def _passing_texts(self, values: Values) -> TruthValues | None:
         """Returns which texts pass; None where the table cannot say."""
         may = values.letters(self.leaf, self._folded or "")
         is_word = isinstance(self.test, Contains) and self.test.is_one_word
         if may is not None and (not may.any() or (is_word and not self.leaf.json_depth)):
-            return Kept(may, may)
+            return TruthValues(may, may)
         texts = values.texts(self.leaf)
         if texts is None:
-            return None if may is None else Kept(np.zeros_like(may), may)
+            return None if may is None else TruthValues(np.zeros_like(may), may)
         used = [True] * len(texts.words)
         if may is not None:
             used = (np.bincount(texts.codes[may], minlength=len(texts.words)) > 0).tolist()
@@ -276,26 +277,26 @@ class _LeafTest:
             for word, is_used in zip(texts.words, used, strict=True)
         ]
         passed = np.array(flags, np.bool_)[texts.codes] if flags else np.zeros(0, np.bool_)
-        return Kept(passed, passed)
+        return TruthValues(passed, passed)
 
-    def _among_numbers(self, numbers: Numbers) -> Kept:
+    def _passing_numbers(self, numbers: LeafNumbers) -> TruthValues:
         column, error, exactly = numbers
         if column.dtype.kind == "b":
             if_false, if_true = self.passes(value=False), self.passes(value=True)
             passed = np.where(column, if_true, if_false)
-            return Kept(passed, passed)
-        passed = self._passed(column)
+            return TruthValues(passed, passed)
+        passed = self._passing_exactly(column)
         if isinstance(error, float) and error == 0.0:
-            return Kept(passed, passed)
-        near = np.isinf(error) | np.zeros(len(column), np.bool_)
+            return TruthValues(passed, passed)
+        is_near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in self._bounds:
             with np.errstate(invalid="ignore"):  # infinity less infinity
-                near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
+                is_near |= (np.abs(column - as_float(bound)) <= error) & (error > 0.0)
         if exactly is None:
-            return Kept(passed & ~near, passed | near)
-        among = np.flatnonzero(near)
-        passed[among] = self._passed(exactly(among))
-        return Kept(passed, passed)
+            return TruthValues(passed & ~is_near, passed | is_near)
+        unsettled = np.flatnonzero(is_near)
+        passed[unsettled] = self._passing_exactly(exactly(unsettled))
+        return TruthValues(passed, passed)
 
     @property
     def _bounds(self) -> tuple[int | float, ...]:
@@ -304,7 +305,7 @@ class _LeafTest:
             return self.numbers
         return (self.test.limit, self.test.stored)
 
-    def _passed(self, column: Numeric) -> Mask:
+    def _passing_exactly(self, column: Numeric) -> Mask:
         if not isinstance(self.test, Beyond):
             return equal_to_any(column, self.numbers)
         passed = beyond(column, self.test.limit, above=self.test.above)
@@ -314,7 +315,7 @@ class _LeafTest:
 
     def _in_long_arrays(
         self, values: Values, level: Level, *, is_part: bool
-    ) -> Iterator[tuple[Level, Kept | None, Limits]]:
+    ) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
         """Yields the rows or elements whose arrays are too long to be held, by what is known."""
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
@@ -322,8 +323,8 @@ class _LeafTest:
             if not is_part:
                 yield level, None, self.limits
             return
-        here = lengths > (MAX_NUMBERS if is_part else 0)
-        if not here.any():
+        is_long = lengths > (MAX_NUMBERS if is_part else 0)
+        if not is_long.any():
             return
         least, greatest = (values.numeric(level, f"{path}.{end}") for end in ("least", "greatest"))
         kept = unknown(len(lengths))
@@ -333,10 +334,10 @@ class _LeafTest:
             kept = self._between(least, greatest, error)
         limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
         # Of one that is picked from an array, what is known of all says only what it may be.
-        surely = here & kept.surely & (len(limits) == len(self.limits))
-        yield level, Kept(surely, here & kept.perhaps), limits
+        surely = is_long & kept.surely & (len(limits) == len(self.limits))
+        yield level, TruthValues(surely, is_long & kept.perhaps), limits
 
-    def _between(self, least: Numeric, greatest: Numeric, error: float) -> Kept:
+    def _between(self, least: Numeric, greatest: Numeric, error: float) -> TruthValues:
         """Returns in which arrays a number passes, by their least and greatest finite ones.
 
         NaN where those are not known. Integers of more than 53 bits were rounded.
@@ -364,7 +365,7 @@ class _LeafTest:
             perhaps |= is_real and math.isinf(at)
         if not is_real:
             surely &= ~is_rounded
-        return Kept(surely, perhaps | surely)
+        return TruthValues(surely, perhaps | surely)
 
 
 def _without_low(word: str, least: float, depth: int) -> str:
@@ -375,10 +376,10 @@ def _without_low(word: str, least: float, depth: int) -> str:
     value: JsonValue = word
     for _ in range(around):
         value = {"": value}
-    found = without_low_scores(value, least)
-    while isinstance(found, dict):
-        found = found[""]
-    return str(found)
+    kept = without_low_scores(value, least)
+    while isinstance(kept, dict):
+        kept = kept[""]
+    return str(kept)
 
 
 def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
@@ -396,15 +397,15 @@ def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
 
 def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
     """Returns which numbers equal one of these, compared as Python does: exactly."""
-    found = np.zeros(len(column), np.bool_)
+    is_equal = np.zeros(len(column), np.bool_)
     for number in numbers:
         nearest = as_float(number)
         if column.dtype.kind in "iu":
             if math.isfinite(nearest) and number == math.floor(number):
-                found |= column == int(number)
+                is_equal |= column == int(number)
         elif nearest == number:
-            found |= column == np.float64(nearest)
-    return found
+            is_equal |= column == np.float64(nearest)
+    return is_equal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -418,29 +419,29 @@ class _PlaceTest:
     def may_match(self, zone_of: ZoneOf) -> bool | Mask:
         """Returns whether some position may be near, as far as known without reading any."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
-        found: bool | Mask = True
+        possible: bool | Mask = True
         for leaf, center in zip(self.leaves, self._center, strict=False):
             zone = zone_of(leaf)
-            found = found if zone is None else found & zone.may_be_near(center, reach)
-        return found
+            possible = possible if zone is None else possible & zone.may_be_near(center, reach)
+        return possible
 
-    def found(self, values: Values) -> Iterator[tuple[Level, Kept | None, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
         """Yields which rows or elements of a level are near; None where the table cannot say."""
         leaves = self.leaves[: len(self._center)]
         columns = [values.numbers(leaf) for leaf in leaves]
-        known = [column for column in columns if column is not None]
+        held = [column for column in columns if column is not None]
         level = self.leaves[0].level
-        if len(known) < len(columns):
+        if len(held) < len(columns):
             yield level, None, self.limits
         else:
-            yield level, self._near(known), self.limits
+            yield level, self._near(held), self.limits
 
     @property
     def _center(self) -> tuple[float, ...]:
         test = self.test
         return (test.x, test.y) if test.z is None else (test.x, test.y, test.z)
 
-    def _near(self, columns: Sequence[Numbers]) -> Kept:
+    def _near(self, columns: Sequence[LeafNumbers]) -> TruthValues:
         tolerance = self.test.tolerance_m
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
         axes += [np.full(len(axes[0]), np.nan)] * (len(self._center) - len(axes))
@@ -451,22 +452,22 @@ class _PlaceTest:
             error = sum(column.error for column in columns)
             margin = error + tolerance * _ROUNDING
             has_infinite = np.logical_or.reduce([np.isinf(axis) for axis in axes])
-            doubtful = (np.abs(apart - tolerance) <= margin) | (apart < _TINY_M)
-            doubtful |= np.isinf(apart) | has_infinite
-            near = apart <= tolerance
+            is_doubtful = (np.abs(apart - tolerance) <= margin) | (apart < _TINY_M)
+            is_doubtful |= np.isinf(apart) | has_infinite
+            is_near = apart <= tolerance
         if np.any(error):
-            return Kept(near & ~doubtful, near | doubtful)
-        for nth in np.flatnonzero(doubtful).tolist():
+            return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
+        for nth in np.flatnonzero(is_doubtful).tolist():
             x, y, z = (*(float(axis[nth]) for axis in axes), math.nan)[:3]
-            near[nth] = self.test.is_near(x, y, z)
-        return Kept(near, near)
+            is_near[nth] = self.test.is_near(x, y, z)
+        return TruthValues(is_near, is_near)
 
 
 def _positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
     """Yields the positions in a value, as `analysis.conditions.positions` finds them."""
     for whole in opened(spot):
-        own = [*_own_positions(whole)]
-        yield from own or _positions_below(whole)
+        direct = [*_own_positions(whole)]
+        yield from direct or _positions_below(whole)
 
 
 def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
@@ -480,10 +481,9 @@ def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
                 waiting.append(Spot(node.element, limits))
             elif isinstance(node, Message | Group):
                 fields = dict(children(node))
-                for key in POSITION_KEYS:
-                    if key in fields:
-                        for inner in opened(Spot(fields[key], limits)):
-                            yield from _own_positions(inner)
+                named = [Spot(fields[key], limits) for key in POSITION_KEYS if key in fields]
+                for inner in chain.from_iterable(map(opened, named)):
+                    yield from _own_positions(inner)
                 waiting.extend(Spot(child, limits) for child in fields.values())
 
 
@@ -496,13 +496,13 @@ def _own_positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
                 yield from _own_positions(inner)
     elif isinstance(node, Message | Group):
         fields = dict(children(node))
-        found = [fields.get(axis) for axis in "xyz"]
+        axes = [fields.get(axis) for axis in "xyz"]
         is_position = all(
             isinstance(axis, Nothing) or (isinstance(axis, Leaf) and axis.kind is not Kind.TEXT)
-            for axis in found[:2]
+            for axis in axes[:2]
         )
         if is_position:
             numeric = {Kind.INTEGER, Kind.REAL}
-            leaves = [axis for axis in found if isinstance(axis, Leaf) and axis.kind in numeric]
-            if all(axis in leaves for axis in found[:2]):
+            leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.kind in numeric]
+            if all(axis in leaves for axis in axes[:2]):
                 yield tuple(leaves), limits

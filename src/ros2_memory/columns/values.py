@@ -52,7 +52,7 @@ class Kind(Enum):
     TEXT = auto()
 
 
-class Made(Enum):
+class Conversion(Enum):
     """How a leaf comes out of its sources."""
 
     STORED = auto()  # the column itself
@@ -66,7 +66,7 @@ class Made(Enum):
 
 Z = TypeVar("Z", Zone, Zones)
 
-_ANGLES: Final = {Made.ROLL: 0, Made.PITCH: 1, Made.YAW: 2}
+_ANGLES: Final = {Conversion.ROLL: 0, Conversion.PITCH: 1, Conversion.YAW: 2}
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,10 +81,10 @@ class Level:
 
     def full(self, path: str) -> str:
         """Returns the dot-path, from the message on, of a column of this level."""
-        here = self
-        while here.parent is not None:
-            path = f"{here.name}.{path}" if path else here.name
-            here = here.parent
+        level = self
+        while level.parent is not None:
+            path = f"{level.name}.{path}" if path else level.name
+            level = level.parent
         return path
 
 
@@ -99,7 +99,7 @@ class Leaf:
         level: where it lies.
         sources: dot-paths in that level of what it is made of.
         kind: what it is.
-        made: how.
+        conversion: how its value comes out of the sources.
         constant: its value, where that is the same everywhere.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
@@ -108,17 +108,21 @@ class Leaf:
     level: Level
     sources: tuple[str, ...]
     kind: Kind
-    made: Made = Made.STORED
+    conversion: Conversion = Conversion.STORED
     constant: int = 0
     json_depth: int = 0
 
     @property
     def is_of_array(self) -> bool:
         """Whether it is an element of an array of numbers, which a table may hold in part."""
-        return self.sources == ("",) and self.made is Made.STORED and self.kind is not Kind.TEXT
+        return (
+            self.sources == ("",)
+            and self.conversion is Conversion.STORED
+            and self.kind is not Kind.TEXT
+        )
 
 
-class Numbers(NamedTuple):
+class LeafNumbers(NamedTuple):
     """The numbers or booleans of a leaf; null is NaN.
 
     Attributes:
@@ -149,7 +153,7 @@ class Values:
         self.table = table
         self.rows = len(table.log_times)
         self.kept: dict[object, tuple[Mask, Mask]] = {}
-        self._angles: dict[tuple[Level, tuple[str, ...]], tuple[Floats, ...]] = {}
+        self._angles: dict[tuple[Level, tuple[str, ...]], _Turns] = {}
 
     def elements(self, level: Level) -> Elements | None:
         """Returns the elements of a sequence; None where the table does not hold them."""
@@ -162,17 +166,17 @@ class Values:
         """Returns how many rows or elements a level has; None where that is not held."""
         if level.parent is None:
             return self.rows
-        found = self.elements(level)
-        return None if found is None else len(found.owners)
+        elements = self.elements(level)
+        return None if elements is None else len(elements.owners)
 
-    def places(self, level: Level, among: Ints, *, from_end: bool) -> Ints | None:
+    def places(self, level: Level, positions: Ints, *, from_end: bool) -> Ints | None:
         """Returns the places of some elements in their lists: 0, 1, ... or -1, -2, ..."""
-        found = self.elements(level)
-        if found is None:
+        elements = self.elements(level)
+        if elements is None:
             return None
-        owners = found.owners
-        edge = np.searchsorted(owners, owners[among], side="right" if from_end else "left")
-        return among - edge
+        owners = elements.owners
+        edge = np.searchsorted(owners, owners[positions], side="right" if from_end else "left")
+        return positions - edge
 
     def column(self, level: Level, path: str) -> Column | None:
         """Returns a column of a level; None where the table does not hold it."""
@@ -181,8 +185,8 @@ class Values:
 
     def texts(self, leaf: Leaf) -> Texts | None:
         """Returns the texts of a leaf; None where the table does not hold them."""
-        found = self.column(leaf.level, leaf.sources[0])
-        return found if isinstance(found, Texts) else None
+        column = self.column(leaf.level, leaf.sources[0])
+        return column if isinstance(column, Texts) else None
 
     def letters(self, leaf: Leaf, text: str) -> Mask | None:
         """Returns which texts of a leaf may have a casefolded text; None where that is not known.
@@ -197,25 +201,27 @@ class Values:
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
         """Returns a column of numbers or booleans; None where the table does not hold it."""
-        found = self.column(level, path)
-        return None if found is None or isinstance(found, Texts) else cast("Numeric", found)
+        column = self.column(level, path)
+        return None if column is None or isinstance(column, Texts) else cast("Numeric", column)
 
-    def numbers(self, leaf: Leaf) -> Numbers | None:
+    def numbers(self, leaf: Leaf) -> LeafNumbers | None:
         """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
-        if leaf.made is Made.CONSTANT:
+        if leaf.conversion is Conversion.CONSTANT:
             size = self.size(leaf.level)
-            return None if size is None else Numbers(np.full(size, float(leaf.constant)))
+            return None if size is None else LeafNumbers(np.full(size, float(leaf.constant)))
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
-        found = [column for column in columns if column is not None]
-        return self._made(leaf, found) if len(found) == len(columns) else None
+        held = [column for column in columns if column is not None]
+        return self._numbers_of(leaf, held) if len(held) == len(columns) else None
 
-    def _made(self, leaf: Leaf, columns: Sequence[Numeric]) -> Numbers:
-        if leaf.made in _ANGLES:
-            return self._turned(leaf, columns)
+    def _numbers_of(self, leaf: Leaf, columns: Sequence[Numeric]) -> LeafNumbers:
+        if leaf.conversion in _ANGLES:
+            return self._angle(leaf, columns)
         first, error = columns[0], self.error(leaf)
-        if leaf.made is Made.SECONDS:
-            return Numbers(seconds(first), error / NS_PER_S)
-        return Numbers(first.astype(np.float64) if leaf.made is Made.REAL else first, error)
+        if leaf.conversion is Conversion.SECONDS:
+            return LeafNumbers(seconds(first), error / NS_PER_S)
+        return LeafNumbers(
+            first.astype(np.float64) if leaf.conversion is Conversion.REAL else first, error
+        )
 
     def holds_all(self, leaf: Leaf) -> bool:
         """Returns whether no array that a leaf is an element of is too long to be held."""
@@ -232,32 +238,33 @@ class Values:
         """Returns what is known of a leaf without reading it."""
         return zone_of(leaf, self.table.zone)
 
-    def _turned(self, leaf: Leaf, parts: Sequence[Numeric]) -> Numbers:
+    def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
         key = (leaf.level, leaf.sources)
         x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
         if key not in self._angles:
             self._angles[key] = _euler(x, y, z, w)
-        *angles, length, cosine = self._angles[key]
-        which = _ANGLES[leaf.made]
+        turn = self._angles[key]
+        which = _ANGLES[leaf.conversion]
+        angles = turn.degrees[which]
         error = self.error(leaf)
         if error:
-            return Numbers(angles[which], _angle_error(error, length, cosine, angles[which]))
+            return LeafNumbers(angles, _angle_error(error, turn.length, turn.cosine, angles))
 
-        def exactly(among: Ints) -> Floats:
-            known: dict[tuple[float, float, float, float], float] = {}
-            found = np.empty(len(among))
-            rows = zip(*(part[among].tolist() for part in (x, y, z, w)), strict=True)
+        def exactly(positions: Ints) -> Floats:
+            angle_of: dict[tuple[float, float, float, float], float] = {}
+            exact = np.empty(len(positions))
+            rows = zip(*(part[positions].tolist() for part in (x, y, z, w)), strict=True)
             for nth, numbers in enumerate(rows):
-                if numbers not in known:
-                    angles_of = euler_of(numbers)
-                    known[numbers] = math.nan if angles_of is None else angles_of[ANGLES[which]]
-                found[nth] = known[numbers]
-            return found
+                if numbers not in angle_of:
+                    euler = euler_of(numbers)
+                    angle_of[numbers] = math.nan if euler is None else euler[ANGLES[which]]
+                exact[nth] = angle_of[numbers]
+            return exact
 
         # Zero is zero everywhere, and a robot in the plane has nothing else.
-        off = np.where(angles[which] == 0.0, 0.0, _ROUNDING_DEG)
-        return Numbers(angles[which], off, exactly)
+        off = np.where(angles == 0.0, 0.0, _ROUNDING_DEG)
+        return LeafNumbers(angles, off, exactly)
 
 
 def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
@@ -267,22 +274,22 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
         leaf: the leaf.
         zone: returns the zone of a column of a table, or its zones in some parts, by its path.
     """
-    if leaf.made is Made.CONSTANT:
+    if leaf.conversion is Conversion.CONSTANT:
         return Zone(leaf.constant, leaf.constant, 0)
-    if leaf.made in _ANGLES:
-        most = 90.0 if leaf.made is Made.PITCH else 180.0
+    if leaf.conversion in _ANGLES:
+        most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
-    found = zone(leaf.level.full(leaf.sources[0]))
-    if found is not None and leaf.is_of_array and leaf.level.parent is not None:
+    source_zone = zone(leaf.level.full(leaf.sources[0]))
+    if source_zone is not None and leaf.is_of_array and leaf.level.parent is not None:
         lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
-        return None if lengths is None else _with_long_arrays(found, lengths)
-    if found is None or leaf.made is not Made.SECONDS:
-        return found
-    return found.divided(NS_PER_S)
+        return None if lengths is None else _with_long_arrays(source_zone, lengths)
+    if source_zone is None or leaf.conversion is not Conversion.SECONDS:
+        return source_zone
+    return source_zone.divided(NS_PER_S)
 
 
 def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:
-    """Returns what is known of the numbers of all arrays, by that of those which are held."""
+    """Returns the zone of all arrays: without bounds where some are too long to be held."""
     are_long = lengths.reaches(MAX_NUMBERS, above=True)
     if isinstance(numbers, Zones):
         low = np.where(are_long, -math.inf, numbers.low)
@@ -300,11 +307,22 @@ def seconds(times: Numeric) -> Floats:
     return np.where(np.abs(times) < _EXACT_BELOW, times / NS_PER_S, parts)
 
 
-def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
-    """Returns roll, pitch and yaw (degrees), the length, and the cosine of pitch.
+class _Turns(NamedTuple):
+    """Quaternions as angles.
 
-    As `conversions.unit` and `geometry.rpy` compute them.
+    Attributes:
+        degrees: roll, pitch and yaw.
+        length: of the quaternions.
+        cosine: of pitch.
     """
+
+    degrees: tuple[Floats, Floats, Floats]
+    length: Floats
+    cosine: Floats
+
+
+def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> _Turns:
+    """Returns quaternions as angles, as `conversions.unit` and `geometry.rpy` compute them."""
     with np.errstate(all="ignore"):
         squared = x * x + y * y + z * z + w * w
         largest = np.maximum.reduce([np.abs(part) for part in (x, y, z, w)])
@@ -317,15 +335,15 @@ def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> tuple[Floats, ...]:
             for whole, part in zip((x, y, z, w), parts, strict=True)
         )
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
-        locked = np.abs(sine) > GIMBAL_LOCK_SINE
-        both = 2 * np.arctan2(z, w)
-        both -= math.tau * np.rint(both / math.tau)
+        is_locked = np.abs(sine) > GIMBAL_LOCK_SINE
+        at_lock = 2 * np.arctan2(z, w)
+        at_lock -= math.tau * np.rint(at_lock / math.tau)
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        roll = np.where(locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
-        yaw = np.where(locked, both, yaw)
-        degrees = [np.degrees(angle) for angle in (roll, np.arcsin(sine), yaw)]
-        return (*degrees, length * largest, np.sqrt(1 - sine * sine))
+        roll = np.where(is_locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
+        yaw = np.where(is_locked, at_lock, yaw)
+        degrees = np.degrees(roll), np.degrees(np.arcsin(sine)), np.degrees(yaw)
+        return _Turns(degrees, length * largest, np.sqrt(1 - sine * sine))
 
 
 def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -> Floats:

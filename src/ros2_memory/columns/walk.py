@@ -50,7 +50,7 @@ class NotWalkedError(Exception):
 
 
 @dataclass(slots=True)
-class Level:
+class LevelColumns:
     """The columns of messages, or of the elements of one sequence, while they are read."""
 
     columns: dict[str, Column] = field(default_factory=dict)
@@ -58,7 +58,7 @@ class Level:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def walked(plan: Plan, batch: Batch) -> Level:
+def walked(plan: Plan, batch: Batch) -> LevelColumns:
     """Returns the columns of a batch.
 
     Raises:
@@ -73,8 +73,8 @@ def walked(plan: Plan, batch: Batch) -> Level:
     try:
         if (gathered(batch.buffer, _UINT16, batch.starts) != _LITTLE_ENDIAN).any():
             raise NotWalkedError
-        level = Level(left_out=dict(plan.left_out))
-        rows = _Rows(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
+        level = LevelColumns(left_out=dict(plan.left_out))
+        rows = _Bodies(batch.starts + _HEADER_BYTES, sizes - _HEADER_BYTES)
         end = walk.read(plan, rows, np.zeros(sizes.size, np.int64), level)
     except (IndexError, UnicodeDecodeError) as error:
         raise NotWalkedError from error
@@ -85,8 +85,8 @@ def walked(plan: Plan, batch: Batch) -> Level:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Rows:
-    """What is walked: where each message's body begins in the buffer, and its bytes.
+class _Bodies:
+    """The bodies that are walked: where each message's begins in the buffer, and its bytes.
 
     Positions count from there, since alignment does.
     """
@@ -94,8 +94,8 @@ class _Rows:
     origins: IntArray
     sizes: IntArray
 
-    def of(self, rows: IntArray) -> _Rows:
-        return _Rows(self.origins[rows], self.sizes[rows])
+    def of(self, rows: IntArray) -> _Bodies:
+        return _Bodies(self.origins[rows], self.sizes[rows])
 
 
 def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
@@ -108,7 +108,7 @@ def _aligned(positions: IntArray, align: int, skip: int = 0) -> IntArray:
 class _Walk:
     buffer: bytes
 
-    def read(self, plan: Plan, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+    def read(self, plan: Plan, rows: _Bodies, at: IntArray, level: LevelColumns | None) -> IntArray:
         """Goes through messages that begin at these positions; returns where they end.
 
         Args:
@@ -131,7 +131,7 @@ class _Walk:
                 at = self._read_sequence(step, rows, at, level)
         return at
 
-    def _read_run(self, run: Run, places: IntArray, level: Level) -> None:
+    def _read_run(self, run: Run, places: IntArray, level: LevelColumns) -> None:
         columns = level.columns
         block = gathered(self.buffer, run.dtype, places)
         for nth, entry in enumerate(run.fields):
@@ -145,10 +145,12 @@ class _Walk:
                 number = block[str(nth)]
                 columns[entry.path] = number != 0 if entry.is_bool else np.ascontiguousarray(number)
 
-    def _length(self, rows: _Rows, at: IntArray) -> IntArray:
+    def _length(self, rows: _Bodies, at: IntArray) -> IntArray:
         return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64)
 
-    def _read_text(self, text: Text, rows: _Rows, at: IntArray, level: Level | None) -> IntArray:
+    def _read_text(
+        self, text: Text, rows: _Bodies, at: IntArray, level: LevelColumns | None
+    ) -> IntArray:
         at = _aligned(at, text.align, text.skip)
         sizes = self._length(rows, at)
         at = at + 4
@@ -173,12 +175,12 @@ class _Walk:
                 return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
         buffer, ends = self.buffer, (places + sizes).tolist()
         words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
-        known: dict[bytes, int] = {}
-        codes = [known.setdefault(word, len(known)) for word in words]
-        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in known]))
+        code_of: dict[bytes, int] = {}
+        codes = [code_of.setdefault(word, len(code_of)) for word in words]
+        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in code_of]))
 
     def _read_numbers(
-        self, step: NumberSequence, rows: _Rows, at: IntArray, level: Level | None
+        self, step: NumberSequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
         at = _aligned(at, step.align, step.skip)
         counts = self._length(rows, at)
@@ -195,9 +197,9 @@ class _Walk:
 
     def _values(self, step: NumberSequence, places: IntArray, counts: IntArray) -> Numbers:
         """Returns the numbers of sequences, but of those that take too long to look at."""
-        short = counts * step.size <= MAX_RANGED_BYTES
-        if not short.all():
-            places, counts = places[short], counts[short]
+        is_short = counts * step.size <= MAX_RANGED_BYTES
+        if not is_short.all():
+            places, counts = places[is_short], counts[is_short]
         if not counts.size:
             return np.zeros(0, step.dtype)
         count = int(counts[0])
@@ -209,7 +211,7 @@ class _Walk:
         )
 
     def _read_sequence(
-        self, step: Sequence, rows: _Rows, at: IntArray, level: Level | None
+        self, step: Sequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
         if step.length == SEQUENCE:
             at = _aligned(at, step.align, step.skip)
@@ -227,14 +229,14 @@ class _Walk:
         if (end > rows.sizes).any():
             raise NotWalkedError
         if level is not None:
-            inner = Level()
+            inner = LevelColumns()
             self.read(step.plan, rows.of(owners), begins, inner)
             level.elements[step.path] = Elements(owners, inner.columns, inner.elements)
             level.left_out |= {f"{step.path}.{path}": why for path, why in inner.left_out.items()}
         return end
 
     def _stepped(
-        self, plan: Plan, rows: _Rows, at: IntArray, counts: IntArray
+        self, plan: Plan, rows: _Bodies, at: IntArray, counts: IntArray
     ) -> tuple[IntArray, IntArray]:
         """Returns where elements of various sizes begin, and where their sequences end."""
         most, total = int(counts.max(initial=0)), int(counts.sum())
@@ -244,9 +246,9 @@ class _Walk:
         begins = np.zeros(total, np.int64)
         for nth in range(most):
             left = np.flatnonzero(counts > nth)
-            here = _aligned(end[left], plan.align)
-            begins[first[left] + nth] = here
-            end[left] = self.read(plan, rows.of(left), here, None)
+            starts = _aligned(end[left], plan.align)
+            begins[first[left] + nth] = starts
+            end[left] = self.read(plan, rows.of(left), starts, None)
         return begins, end
 
 
@@ -272,15 +274,27 @@ def _steady(
 
 
 def within(counts: IntArray) -> IntArray:
-    """Returns 0, 1, 2 .. for each count, one after the other."""
+    """Returns the numbers from 0 up to each count, exclusive, one after the other."""
     before = np.cumsum(counts) - counts
     return np.arange(int(counts.sum())) - np.repeat(before, counts)
 
 
+def entries_of_codes(entries: IntArray, codes: IntArray) -> tuple[IntArray, IntArray]:
+    """Returns how many entries each of some codes has, and their positions, one after the other.
+
+    Args:
+        entries: the code of each entry, ascending.
+        codes: may occur several times.
+    """
+    begins = np.searchsorted(entries, codes)
+    counts = np.searchsorted(entries, codes, side="right") - begins
+    return counts, np.repeat(begins, counts) + within(counts)
+
+
 def add_sequence(
-    level: Level, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
+    level: LevelColumns, path: str, counts: IntArray, values: Numbers, *, is_bool: bool
 ) -> None:
-    """Adds what is kept of a sequence of numbers.
+    """Adds the lengths, the ranges and the short arrays of a sequence of numbers.
 
     Args:
         level: takes it.
@@ -291,14 +305,14 @@ def add_sequence(
     """
     if is_bool:
         values = (values != 0).view(np.uint8)  # a byte that is neither 0 nor 1 is true
-    ranged = counts * values.itemsize <= MAX_RANGED_BYTES
-    add_ranges(level.columns, path, counts, np.where(ranged, counts, 0), values)
-    few = counts <= MAX_NUMBERS
-    kept = np.repeat(few[ranged], counts[ranged])
-    numbers = values if kept.all() else values[kept]
-    owners = np.repeat(np.arange(counts.size), np.where(few, counts, 0))
+    is_ranged = counts * values.itemsize <= MAX_RANGED_BYTES
+    add_ranges(level.columns, path, counts, np.where(is_ranged, counts, 0), values)
+    is_short = counts <= MAX_NUMBERS
+    is_held = np.repeat(is_short[is_ranged], counts[is_ranged])
+    numbers = values if is_held.all() else values[is_held]
+    owners = np.repeat(np.arange(counts.size), np.where(is_short, counts, 0))
     level.elements[path] = Elements(owners, {"": numbers.view(np.bool_) if is_bool else numbers})
-    if not few.all():
+    if not is_short.all():
         level.left_out[path] = f"more than {MAX_NUMBERS} numbers in some messages"
 
 
@@ -322,13 +336,13 @@ def add_ranges(
     Those are NaN where there is none; `counts` of the `values` are of each.
     """
     columns[f"{path}.length"] = lengths.astype(np.uint32)
-    filled = counts > 0
-    begins = (np.cumsum(counts) - counts)[filled]
-    finite = np.isfinite(values)
-    for end, ufunc, none in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
-        found = np.full(counts.size, np.nan)
+    has_values = counts > 0
+    begins = (np.cumsum(counts) - counts)[has_values]
+    is_finite = np.isfinite(values)
+    for end, ufunc, neutral in (("least", np.minimum, np.inf), ("greatest", np.maximum, -np.inf)):
+        extremes = np.full(counts.size, np.nan)
         if values.size:
-            some = values if finite.all() else np.where(finite, values, none)
-            found[filled] = ufunc.reduceat(some, begins)
-            found[np.isinf(found)] = np.nan
-        columns[f"{path}.{end}"] = found
+            comparable = values if is_finite.all() else np.where(is_finite, values, neutral)
+            extremes[has_values] = ufunc.reduceat(comparable, begins)
+            extremes[np.isinf(extremes)] = np.nan
+        columns[f"{path}.{end}"] = extremes

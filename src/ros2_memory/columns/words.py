@@ -10,7 +10,7 @@ import numpy as np
 from ros2_memory.columns.scores import is_object
 from ros2_memory.columns.shown import UnknownShapeError, children, shape_of
 from ros2_memory.columns.table import Table, Texts
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
 
 if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
@@ -32,18 +32,24 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
             [(name, node)] = children(node)
     except (UnknownShapeError, ValueError):  # more than one part
         return None
-    if not isinstance(node, Leaf) or node.level is not ROWS or node.made is not Made.STORED:
+    if (
+        not isinstance(node, Leaf)
+        or node.level is not ROWS
+        or node.conversion is not Conversion.STORED
+    ):
         return None
     values = Values(table)
     if node.kind is Kind.TEXT:
-        found = values.texts(node)
+        texts = values.texts(node)
     elif node.kind in {Kind.BOOLEAN, Kind.INTEGER} and (column := values.numbers(node)) is not None:
-        known, codes = np.unique(column.values, return_inverse=True)
-        whole = [json.dumps(each if name is None else {name: each}) for each in known.tolist()]
+        distinct, codes = np.unique(column.values, return_inverse=True)
+        whole = [
+            json.dumps(value if name is None else {name: value}) for value in distinct.tolist()
+        ]
         return Texts(codes.astype(np.uint32), tuple(whole))
     else:
-        found = None
-    if found is None:
+        texts = None
+    if texts is None:
         return None
-    words = tuple(json.dumps(each if name is None else {name: each}) for each in found.words)
-    return Texts(found.codes, words)
+    words = tuple(json.dumps(value if name is None else {name: value}) for value in texts.words)
+    return Texts(texts.codes, words)

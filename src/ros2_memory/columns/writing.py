@@ -132,7 +132,7 @@ class LongBag:
             )
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
-        """Deletes what was written of it."""
+        """Deletes the parts of it that were written, where it is not stored whole."""
         rows = connection.execute("SELECT path FROM bag WHERE id = ?", (self._number,))
         delete_bags(connection, [path for (path,) in rows.fetchall()])
 
@@ -173,7 +173,7 @@ def thin_parts(
         (json.dumps(parts),),
     ):
         sizes[topic][part] = size
-    left = max(sum(sum(some.values()) for some in sizes.values()) + spare, at_least)
+    left = max(sum(sum(by_part.values()) for by_part in sizes.values()) + spare, at_least)
     dropped = 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
         left -= sum(sizes[topic].values())
@@ -195,17 +195,17 @@ def _drop_columns(connection: sqlite3.Connection, topic: int, part: int) -> bool
     paths = [path for (path,) in rows if path not in ALWAYS]
     if not paths:
         return False
-    among = (topic, part, json.dumps(paths))
+    listed = json.dumps(paths)
     connection.execute(
         f"UPDATE zone SET codec = '{DROPPED}' WHERE topic = ? AND part = ?"
         " AND path IN (SELECT value FROM json_each(?))",
-        among,
+        (topic, part, listed),
     )
     connection.execute(
         "DELETE FROM part_column WHERE part = ? AND path IN (SELECT value FROM json_each(?))",
-        among[1:],
+        (part, listed),
     )
-    connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (json.dumps(paths), part))
+    connection.execute("UPDATE part SET dropped = ? WHERE id = ?", (listed, part))
     # Who knows the part looks again.
     connection.execute("INSERT INTO deletion DEFAULT VALUES")
     return True
@@ -220,7 +220,7 @@ def _in_parts(table: Table) -> Iterator[Table]:
 
 
 def lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether other definitions may decode what these could not."""
+    """Returns whether a table has no columns: with other definitions it may have some."""
     return any("" in table.left_out for table in tables)
 
 
@@ -260,7 +260,9 @@ def insert_bags(
     for table, bag in decoded.tables:
         topic, layout_of[topic] = topic_of(connection, table, layouts)
         tables[topic].append((table, np.full(len(table), numbers[bag])))
-    packed = {topic: [packed_part(layout_of[topic], some)] for topic, some in tables.items()}
+    packed = {
+        topic: [packed_part(layout_of[topic], of_topic)] for topic, of_topic in tables.items()
+    }
     return insert_parts(connection, packed, whole=whole)
 
 
@@ -268,8 +270,8 @@ def insert_parts(
     connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
 ) -> list[int]:
     """Inserts parts, by the numbers of their topics; returns their ids."""
-    every = [(topic, part) for topic, some in parts.items() for part in some]
-    return [_insert_part(connection, topic, part, whole=whole) for topic, part in every]
+    numbered = [(topic, part) for topic, of_topic in parts.items() for part in of_topic]
+    return [_insert_part(connection, topic, part, whole=whole) for topic, part in numbered]
 
 
 def _insert_part(
@@ -281,16 +283,16 @@ def _insert_part(
         (topic, part.first, part.last, part.messages, json.dumps(part.bags), part.size, whole),
     )
     number = int(cursor.lastrowid or 0)
-    connection.executemany(
-        "INSERT INTO part_column VALUES (?, ?, ?, ?)",
-        [
-            (number, path, *((None, packed.data) if same == path else (same, None)))
-            for path, packed in part.columns.items()
-            # Numbers that are rounded to one take no bytes, but are no constant.
-            if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}
-            for same in [part.first_of.get(packed.data, path)]
-        ],
-    )
+    columns: list[tuple[int, str, str | None, bytes | None]] = []
+    for path, packed in part.columns.items():
+        # Numbers that are rounded to one take no bytes, but are no constant.
+        if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
+            first = part.first_of.get(packed.data, path)
+            is_first = first == path
+            columns.append(
+                (number, path, None if is_first else first, packed.data if is_first else None)
+            )
+    connection.executemany("INSERT INTO part_column VALUES (?, ?, ?, ?)", columns)
     connection.executemany(
         "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [
@@ -334,13 +336,14 @@ class Layouts:
     def of(self, table: Table) -> tuple[Layout, str]:
         """Returns the layout of a table, and its JSON."""
         key = (table.channel.schema, tuple(sorted(table.left_out.items())))
-        known = self._known.get(key)
-        if known is None or not known[0].fits(table):
+        layout, text = self._known.get(key, (None, ""))
+        if layout is None or not layout.fits(table):
             layout = Layout.of(table, table.definition)
-            known = self._known[key] = (layout, layout.to_json())
+            text = layout.to_json()
+            self._known[key] = (layout, text)
             if len(self._known) > _MOST_LAYOUTS:
                 del self._known[next(iter(self._known))]
-        return known
+        return layout, text
 
 
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:

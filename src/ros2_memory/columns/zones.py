@@ -48,9 +48,9 @@ class Zones:
     @classmethod
     def of(cls, parts: Sequence[int], zones: Sequence[Zone]) -> Zones:
         """Returns the zones of some parts, whose numbers ascend."""
-        known: dict[str, int] = {}
+        code_of: dict[str, int] = {}
         codes = [
-            _ANY if zone.words is None else known.setdefault(zone.words, len(known))
+            _ANY if zone.words is None else code_of.setdefault(zone.words, len(code_of))
             for zone in zones
         ]
         return cls(
@@ -58,7 +58,7 @@ class Zones:
             _bounds([zone.low for zone in zones], -math.inf),
             _bounds([zone.high for zone in zones], math.inf),
             np.array(codes, np.int64),
-            tuple(known),
+            tuple(code_of),
         )
 
     def among(self, parts: IntArray) -> Zones:
@@ -67,26 +67,26 @@ class Zones:
             nothing = np.full(parts.size, math.inf)
             return Zones(parts, -nothing, nothing, np.full(parts.size, _ANY))
         at = np.minimum(np.searchsorted(self.parts, parts), self.parts.size - 1)
-        known = self.parts[at] == parts
+        is_known = self.parts[at] == parts
         return Zones(
             parts,
-            np.where(known, self.low[at], -math.inf),
-            np.where(known, self.high[at], math.inf),
-            np.where(known, self.codes[at], _ANY),
+            np.where(is_known, self.low[at], -math.inf),
+            np.where(is_known, self.high[at], math.inf),
+            np.where(is_known, self.codes[at], _ANY),
             self.words,
         )
 
     def joined(self, newer: Zones) -> Zones:
         """Returns these and those of newer parts."""
-        known = {words: code for code, words in enumerate(self.words)}
-        new = [known.setdefault(words, len(known)) for words in newer.words]
-        recoded = np.array([*new, _ANY], np.int64)  # the last stands for -1, too
+        code_of = {words: code for code, words in enumerate(self.words)}
+        newer_codes = [code_of.setdefault(words, len(code_of)) for words in newer.words]
+        recoded = np.array([*newer_codes, _ANY], np.int64)  # the last stands for -1, too
         return Zones(
             np.concatenate((self.parts, newer.parts)),
             np.concatenate((self.low, newer.low)),
             np.concatenate((self.high, newer.high)),
             np.concatenate((self.codes, recoded[newer.codes])),
-            tuple(known),
+            tuple(code_of),
         )
 
     def divided(self, by: int) -> Zones:

@@ -19,7 +19,7 @@ from ros2_memory.analysis.motion.trajectory import (
     path_slice,
 )
 from ros2_memory.analysis.poses import Poses, joined_poses
-from ros2_memory.columns.fragments import FragmentKey, Kind, Sized
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -153,7 +153,7 @@ def slices_by_poses(
     view: View,
     topic: str,
     window: TimeWindow,
-    kind: Kind[T],
+    kind: FragmentKind[T],
     make: Callable[[PoseSlice], T],
     *,
     failures: list[UndecodableError],

@@ -21,7 +21,7 @@ from ros2_memory.analysis.conditions import (
     parse_condition,
     refusal_for,
 )
-from ros2_memory.columns.shown import Kept
+from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import (
@@ -244,7 +244,7 @@ class RowCondition:
         """Returns which parts may have a row that meets it, as known without reading a column."""
         return self._test.may_match(parts)
 
-    def truth(self, rows: Rows) -> Kept:
+    def truth(self, rows: Rows) -> TruthValues:
         """Returns which rows of a table meet the condition.
 
         Bags are read for the rows that count alone.
@@ -266,7 +266,7 @@ class RowCondition:
             if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
                 self._left_to_messages.add(channel.type)
                 break
-        return Kept(surely, perhaps)
+        return TruthValues(surely, perhaps)
 
 
 class CandidateRows:

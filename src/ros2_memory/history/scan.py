@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
-from ros2_memory.columns.fragments import FragmentKey, Joined, Kind, Sized, joining
-from ros2_memory.columns.scan import Asked, Scan, Stretch
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, Sized, joining
+from ros2_memory.columns.scan import Scan, ScanRequest, Stretch
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
@@ -47,7 +47,7 @@ def scan(
 
 
 class Wanted(TypedDict, total=False):
-    """What of a topic a scan is of; each is as in `Asked`."""
+    """What of a topic a scan is of; each is as in `ScanRequest`."""
 
     shared: Sequence[tuple[Ns, Ns]]
     may_match: Callable[[PartZones], bool | Mask]
@@ -92,14 +92,16 @@ def open_scan(
 
     wanted.setdefault("shared", () if copies else view.timeline.shared_times)
     relatches = not copies and view.stream.may_be_relatched([topic])
-    asked = Asked(topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted)
+    asked = ScanRequest(
+        topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted
+    )
     return Scan(view.memory.columns, asked)
 
 
 def joined_back(
     view: View,
     opened: Scan,
-    kind: Kind[T],
+    kind: FragmentKind[T],
     make: Callable[[Stretch], Iterable[tuple[Ns, T]]],
     key_of: Callable[[Stretch], FragmentKey | None] = Stretch.key,
     *,
@@ -142,13 +144,13 @@ def joined_back(
             joined = Joined(kind.join([one for _, one in made[::-1]]) if made else [])
             if before == (trouble(), view.notes.added):
                 known.put(key, joined)
-        for one in reversed(joined.found):
+        for one in reversed(joined.fragments):
             yield stretch.window.start, one
 
 
 def remembered(
     view: View,
-    kind: Kind[T],
+    kind: FragmentKind[T],
     key: FragmentKey | None,
     make: Callable[[], T],
     trouble: Callable[[], Hashable] = lambda: None,

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.columns.shown import Kept, nowhere
+from ros2_memory.columns.shown import TruthValues, nowhere
 from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -133,7 +133,7 @@ class Matching:
         tested = partial(self._tested, topic, rows, truth)
         return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
-    def _tested(self, topic: str, rows: Rows, truth: Kept) -> Tested:
+    def _tested(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
         """Tests the rows that count: by columns, and by messages where these leave it open."""
         counting = rows.mask()
         self.ruled_out |= not truth.perhaps[counting].all()

@@ -46,9 +46,9 @@ class FieldTable:
 def field_table_of(node: object) -> FieldTable | None:
     """Returns the fields of a message; None for a number, a list, a mapping and the like."""
     cls: type = type(node)
-    known = field_table_of_class(cls)
-    if known is not None or cls.__module__ in {"builtins", "numpy"}:
-        return known
+    table = field_table_of_class(cls)
+    if table is not None or cls.__module__ in {"builtins", "numpy"}:
+        return table
     names = {name: name for name in getattr(node, "__dict__", {}) if not name.startswith("_")}
     return FieldTable("", names) if names else None
 
@@ -86,8 +86,8 @@ def field_of(node: object, name: str) -> object:
     table = field_table_of(node)
     if table is None or name not in table.attributes:
         return ABSENT
-    found: object = getattr(node, table.attributes[name], ABSENT)
-    return found
+    value: object = getattr(node, table.attributes[name], ABSENT)
+    return value
 
 
 def names_of(node: object) -> tuple[str, ...]:
@@ -134,10 +134,10 @@ def _each(
 ) -> object:
     if isinstance(nodes, np.ndarray):
         return ABSENT if nodes.size else []  # numbers have no fields
-    found = [descend(node, segments, step) for node in nodes]
-    if found and all(node is ABSENT for node in found):
+    values = [descend(node, segments, step) for node in nodes]
+    if values and all(node is ABSENT for node in values):
         return ABSENT
-    return [None if node is ABSENT else node for node in found]
+    return [None if node is ABSENT else node for node in values]
 
 
 class Route:
@@ -156,11 +156,11 @@ class Route:
     def of(self, message: object) -> object:
         """Returns what is at the path, of whatever kind; ABSENT or null where there is nothing."""
         try:
-            found: object = self._fast(message)
+            value: object = self._fast(message)
         # JSON objects, and attributes that rosbags renamed.
         except AttributeError:
-            found = descend(message, self.segments)
-        return found
+            value = descend(message, self.segments)
+        return value
 
 
 ANGLES: Final = ("roll_deg", "pitch_deg", "yaw_deg")
@@ -204,9 +204,9 @@ def kind_of_class(cls: type) -> ValueKind:
 
 def kind_of_type(name: str, fields: Sequence[str]) -> ValueKind:
     """Returns how the extracted view shows messages of a type with these fields."""
-    kind, known = _KINDS.get(name, (ValueKind.PLAIN, ""))
+    kind, names = _KINDS.get(name, (ValueKind.PLAIN, ""))
     # A bag may contain a definition of its own under the name of a standard type.
-    return kind if known.split() == fields else ValueKind.PLAIN
+    return kind if names.split() == fields else ValueKind.PLAIN
 
 
 def view(node: object, name: str) -> object:
@@ -217,12 +217,12 @@ def view(node: object, name: str) -> object:
     if kind is ValueKind.QUATERNION:
         angles = euler(node)
         return (None if angles is None else angles[name]) if name in ANGLES else ABSENT
-    found = field_of(node, name)
+    value = field_of(node, name)
     if kind is ValueKind.VECTOR:
-        return Metric(found) if isinstance(found, float) else found
-    table = None if found is ABSENT else field_table_of(node)
+        return Metric(value) if isinstance(value, float) else value
+    table = None if value is ABSENT else field_table_of(node)
     summaries = _NONE if table is None else summaries_of(table)
-    return summaries[name](node, found) if name in summaries else found
+    return summaries[name](node, value) if name in summaries else value
 
 
 def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
@@ -271,22 +271,28 @@ def number(node: object) -> float | None:
 
 def triple(node: object) -> Vector3 | None:
     """Returns three numbers in an array or tuple; None for anything else."""
-    found = _numbers(node, 3)
-    return (found[0], found[1], found[2]) if found else None
+    numbers = _numbers(node, 3)
+    if not numbers:
+        return None
+    x, y, z = numbers
+    return x, y, z
 
 
 def quadruple(node: object) -> Quaternion | None:
     """Returns four numbers in an array or tuple; None for anything else."""
-    found = _numbers(node, 4)
-    return (found[0], found[1], found[2], found[3]) if found else None
+    numbers = _numbers(node, 4)
+    if not numbers:
+        return None
+    first, second, third, fourth = numbers
+    return first, second, third, fourth
 
 
 def _numbers(node: object, count: int) -> list[float]:
     """Returns the numbers of an array or tuple of this length; none where it holds others."""
     if not isinstance(node, list | tuple | np.ndarray) or len(node) != count:
         return []
-    found = [number(part) for part in node]
-    return [part for part in found if part is not None] if None not in found else []
+    numbers = [number(part) for part in node]
+    return [part for part in numbers if part is not None] if None not in numbers else []
 
 
 def rotation(node: object) -> Quaternion | None:
@@ -311,7 +317,7 @@ def euler(node: object) -> dict[str, Degrees] | None:
 
 
 def euler_of(numbers: Quaternion) -> dict[str, Degrees] | None:
-    """Returns the same of four numbers."""
+    """Returns roll, pitch and yaw (degrees) of x, y, z, w; None if these are no rotation."""
     turn = unit(numbers)
     if turn is None:
         return None
@@ -343,7 +349,7 @@ def _image(message: object, data: object) -> object:
 def _shape(message: object, *path: str) -> list[int]:
     """Returns height and width, as far as the message has them."""
     size = [descend(message, (*path, name)) for name in ("height", "width")]
-    return [each for each in size if isinstance(each, int)]
+    return [length for length in size if isinstance(length, int)]
 
 
 def channels_of(encoding: str) -> int | None:

@@ -51,9 +51,9 @@ class Detection(NamedTuple):
 
 def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
     """Returns the detections in an extracted value, in order; `frame_id` is the message's own."""
-    found: list[Detection] = []
-    _walked(value, frame_id, MAX_DEPTH, None, found)
-    return tuple(found)
+    detections: list[Detection] = []
+    _walked(value, frame_id, MAX_DEPTH, None, detections)
+    return tuple(detections)
 
 
 def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
@@ -67,38 +67,52 @@ def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
 
 
 def _walked(
-    value: JsonValue, frame: str, depth: int, least: float | None, found: list[Detection]
+    value: JsonValue, frame: str, depth: int, least: float | None, detections: list[Detection]
 ) -> JsonValue:
     """Appends the detections in a value; returns it without those of a score below `least`."""
     if depth == 0 or not isinstance(value, str | list | dict):
         return value
     if isinstance(value, str):
         parsed = _from_json(value)
-        kept = _walked(parsed, frame, depth - 1, least, found)
+        kept = _walked(parsed, frame, depth - 1, least, detections)
         return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
     if isinstance(value, list):
         parts = [
-            _walked(each, frame, depth - 1, least, found) if isinstance(each, dict) else each
-            for each in value
+            _walked(element, frame, depth - 1, least, detections)
+            if isinstance(element, dict)
+            else element
+            for element in value
         ]
         return value if all(map(is_, parts, value)) else parts
-    frame = _frame(value) or frame
+    return _walked_object(value, _frame(value) or frame, depth, least, detections)
+
+
+def _walked_object(
+    value: dict[str, JsonValue],
+    frame: str,
+    depth: int,
+    least: float | None,
+    detections: list[Detection],
+) -> JsonValue:
+    """Returns an object as `_walked` does; `frame` is the one that it is in."""
     label = _label(value)
     if label is not None:
-        found.append(Detection(label, _position(value), frame, _score(value)))
+        detections.append(Detection(label, _position(value), frame, _score(value)))
         return None if _is_below(value, least) else value
     best = _best_result(value.get("results"))
-    label = None if best is None else _label(_hypothesis(best))
-    if best is not None and label is not None:
+    best_label = None if best is None else _label(_hypothesis(best))
+    if best is not None and best_label is not None:
         position = _position(best) or _position(value)
-        found.append(Detection(label, position, frame, _score(_hypothesis(best))))
+        detections.append(Detection(best_label, position, frame, _score(_hypothesis(best))))
         return value if least is None else _without_hypotheses(value, best, least)
     fields: dict[str, JsonValue] = {}
     for name, inner in value.items():
         if name in LISTS_OF_LABELS and isinstance(inner, list):
-            found += [Detection(each) for each in inner if isinstance(each, str) and each]
+            detections += [
+                Detection(element) for element in inner if isinstance(element, str) and element
+            ]
         is_worth_it = _may_hold_detections(inner)
-        fields[name] = _walked(inner, frame, depth - 1, least, found) if is_worth_it else inner
+        fields[name] = _walked(inner, frame, depth - 1, least, detections) if is_worth_it else inner
     return value if all(map(is_, fields.values(), value.values())) else fields
 
 
@@ -121,8 +135,8 @@ def _without_hypotheses(
         return None
     results = value["results"]
     kept: list[JsonValue] = [
-        None if isinstance(each, dict) and _is_below(_hypothesis(each), least) else each
-        for each in (results if isinstance(results, list) else ())
+        None if isinstance(result, dict) and _is_below(_hypothesis(result), least) else result
+        for result in (results if isinstance(results, list) else ())
     ]
     return {**value, "results": kept} if None in kept else value
 
@@ -144,10 +158,12 @@ def _label(value: dict[str, JsonValue]) -> str | None:
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
     """Returns the hypothesis of the highest score; the first of several."""
-    among = (
-        [each for each in results if isinstance(each, dict)] if isinstance(results, list) else []
+    objects = (
+        [result for result in results if isinstance(result, dict)]
+        if isinstance(results, list)
+        else []
     )
-    return max(among, key=_rank, default=None)
+    return max(objects, key=_rank, default=None)
 
 
 def _rank(result: dict[str, JsonValue]) -> float:
@@ -177,12 +193,12 @@ def _frame(value: dict[str, JsonValue]) -> str:
 def _position(value: dict[str, JsonValue]) -> Vector3 | None:
     """Returns the first valid point; all zeros means that nobody filled it in."""
     for path in POSITIONS:
-        found: JsonValue = value
+        node: JsonValue = value
         for name in path:
-            found = found.get(name) if isinstance(found, dict) else None
-        if found is None:
+            node = node.get(name) if isinstance(node, dict) else None
+        if node is None:
             continue
-        point = xyz(found) if isinstance(found, dict) else triple(found)
+        point = xyz(node) if isinstance(node, dict) else triple(node)
         if point is not None and any(point) and all(map(math.isfinite, point)):
             return point
     return None

@@ -43,8 +43,8 @@ def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonVal
     word = str(value).strip().upper()
     number = names.get("WARN" if word == "WARNING" else word)
     if number is None:
-        known = ", ".join(f"{name} ({each})" for name, each in names.items())
-        raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {known}")
+        levels = ", ".join(f"{name} ({level})" for name, level in names.items())
+        raise InvalidArgumentsError(f"{value!r} is no level of {type_name}: these are {levels}")
     return number
 
 
@@ -71,15 +71,15 @@ def with_level_names(value: JsonValue, type_name: str | None = None) -> JsonValu
     Without its type they are known by the fields beside them.
     """
     if isinstance(value, list):
-        return [with_level_names(each, type_name) for each in value]
+        return [with_level_names(inner, type_name) for inner in value]
     if not isinstance(value, dict):
         return value
-    shown = {key: with_level_names(each, type_name) for key, each in value.items()}
+    shown = {key: with_level_names(inner, type_name) for key, inner in value.items()}
     number = value.get(FIELD)
     beside = next((names for keys, names in _BESIDE if keys <= value.keys()), None)
     names = beside if type_name is None else _BY_TYPE.get(type_name)
     if names is not None and isinstance(number, int) and not isinstance(number, bool):
-        name = next((each for each, known in names.items() if known == number), None)
+        name = next((inner for inner, level in names.items() if level == number), None)
         if name is not None:
             shown[FIELD] = f"{name} ({number})"
     return shown

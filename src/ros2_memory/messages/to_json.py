@@ -157,14 +157,14 @@ class _Shape(NamedTuple):
 
 
 @lru_cache(maxsize=4096)
-def _shape_of(cls: type) -> _Shape | None:
+def _shape_of_class(cls: type) -> _Shape | None:
     table = field_table_of_class(cls)
-    return None if table is None else _shape(kind_of_class(cls), table)
+    return None if table is None else _shape_of_table(kind_of_class(cls), table)
 
 
-def _shape(kind: ValueKind, table: FieldTable) -> _Shape:
+def _shape_of_table(kind: ValueKind, table: FieldTable) -> _Shape:
     summaries = summaries_of(table)
-    rows = ((name, each, summaries.get(name)) for name, each in table.attributes.items())
+    rows = ((name, attribute, summaries.get(name)) for name, attribute in table.attributes.items())
     return _Shape(kind, tuple(rows))
 
 
@@ -205,7 +205,7 @@ class ExactJson:
 
     def _container(self, node: object, path: str, depth: int) -> JsonValue:
         cls: type = type(node)
-        shape = _shape_of(cls)
+        shape = _shape_of_class(cls)
         if shape is not None:
             return self._message(node, shape, path, depth)
         if isinstance(node, np.ndarray):
@@ -218,14 +218,14 @@ class ExactJson:
 
     def _composed(self, node: object, path: str, depth: int) -> JsonValue:
         if isinstance(node, list | tuple):
-            return [self.value(one, path, depth) for one in self._elements(node, path)]
+            return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
             entries = self._entries(node, path)
             return {name: self.value(node, _join(path, name), depth) for name, node in entries}
         table = field_table_of(node)
         if table is None:
             return self._text(f"<{type(node).__name__}>", path)
-        return self._message(node, _shape(ValueKind.PLAIN, table), path, depth)
+        return self._message(node, _shape_of_table(ValueKind.PLAIN, table), path, depth)
 
     def _message(self, node: object, shape: _Shape, path: str, depth: int) -> JsonValue:
         kind = shape.kind
@@ -241,10 +241,10 @@ class ExactJson:
             return {"x": metric(x), "y": metric(y), "z": metric(z)}
         fields: dict[str, JsonValue] = {}
         for name, attribute, summarize in shape.fields:
-            found: object = getattr(node, attribute, ABSENT)
+            inner: object = getattr(node, attribute, ABSENT)
             if summarize is not None:
-                found = summarize(node, found)
-            fields[name] = self.value(found, f"{path}.{name}" if path else name, depth)
+                inner = summarize(node, inner)
+            fields[name] = self.value(inner, f"{path}.{name}" if path else name, depth)
         return fields
 
     def _rotation(self, node: object, path: str) -> JsonValue:
@@ -270,8 +270,8 @@ class ExactJson:
         if isinstance(scalar, np.floating):
             return self.write.real(float(scalar))
         plain = scalar.item()
-        known = isinstance(plain, bool | int | bytes)
-        return self.value(plain if known else str(plain), path, MAX_DEPTH - 1)
+        is_plain = isinstance(plain, bool | int | bytes)
+        return self.value(plain if is_plain else str(plain), path, MAX_DEPTH - 1)
 
     # What a reply shortens, and notes.
 
@@ -356,8 +356,8 @@ class ReplyJson(ExactJson):
 
     def note(self, kind: str, path: str, note: str, weight: int = 0, /) -> None:
         """Notes a loss at a path; of several of one kind there, the one of most weight is kept."""
-        known = self._notes.get((kind, path))
-        if known is None or known[0] < weight:
+        noted = self._notes.get((kind, path))
+        if noted is None or noted[0] < weight:
             self._notes[kind, path] = (weight, note)
 
 

@@ -185,11 +185,11 @@ class Definition:
         sections: dict[str, str] = {}
         waiting = [self]
         while waiting:
-            each = waiting.pop()
-            if each.type not in sections:
-                sections[each.type] = "".join(map(_msg_line, each.fields))
+            definition = waiting.pop()
+            if definition.type not in sections:
+                sections[definition.type] = "".join(map(_msg_line, definition.fields))
                 waiting += [
-                    field.kind for field in each.fields if isinstance(field.kind, Definition)
+                    field.kind for field in definition.fields if isinstance(field.kind, Definition)
                 ]
         nested = [
             f"{'=' * 80}\nMSG: {name.replace('/msg/', '/')}\n{lines}"
@@ -549,16 +549,16 @@ def summarize_channels(
     pauses: Pauses = (),
 ) -> BagSummary:
     """Returns the summary of a file; channels of one topic and type count as one."""
-    found: dict[tuple[str, str], ChannelTotal] = {}
-    for each in totals:
-        key = (each.channel.topic, each.channel.type)
-        other = found.get(key)
-        found[key] = each if other is None else _together(other, each)
-    silent = {channel.topic for channel in declared} - {topic for topic, _ in found}
+    by_topic: dict[tuple[str, str], ChannelTotal] = {}
+    for total in totals:
+        key = (total.channel.topic, total.channel.type)
+        other = by_topic.get(key)
+        by_topic[key] = total if other is None else _together(other, total)
+    silent = {channel.topic for channel in declared} - {topic for topic, _ in by_topic}
     headers: list[TopicHeader] = []
     numbers: list[int] = []
     # Encoded at once, without an object for each topic: an index makes thousands of summaries.
-    for (topic, type_name), (channel, *stated) in sorted(found.items(), key=itemgetter(0)):
+    for (topic, type_name), (channel, *stated) in sorted(by_topic.items(), key=itemgetter(0)):
         headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
     if pauses:
@@ -575,10 +575,10 @@ def summarize_channels(
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 
 
-def _together(one: ChannelTotal, other: ChannelTotal) -> ChannelTotal:
+def _together(total: ChannelTotal, other: ChannelTotal) -> ChannelTotal:
     """Returns two channels of one topic and type as one."""
-    channel = one.channel
+    channel = total.channel
     if other.channel.latched and not channel.latched:
         channel = replace(channel, latched=True)
-    first, last = min(one.first, other.first), max(one.last, other.last)
-    return ChannelTotal(channel, one.messages + other.messages, first, last)
+    first, last = min(total.first, other.first), max(total.last, other.last)
+    return ChannelTotal(channel, total.messages + other.messages, first, last)

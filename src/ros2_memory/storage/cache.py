@@ -30,9 +30,9 @@ class ByteLru(Generic[T]):
 
     def namespace(self) -> ByteLru[T]:
         """Returns a cache with keys of its own, within the capacity of this one."""
-        found = ByteLru[T](0)
-        found._all = self._all
-        return found
+        cache = ByteLru[T](0)
+        cache._all = self._all
+        return cache
 
     def get(self, key: Hashable) -> T | None:
         """Returns the value of the key, or None."""
@@ -45,18 +45,17 @@ class ByteLru(Generic[T]):
 
     def put(self, key: Hashable, value: T, size: int) -> None:
         """Caches `value`, which takes about `size` bytes, and drops the least recently used."""
-        every = self._all
-        with every.lock:
-            replaced = every.values.pop((self, key), None)
-            if replaced is not None:
-                every.bytes -= replaced[1]
-            if size > every.capacity:
+        entries = self._all
+        with entries.lock:
+            _, replaced = entries.values.pop((self, key), (None, 0))
+            entries.bytes -= replaced
+            if size > entries.capacity:
                 return
-            every.values[(self, key)] = (value, size)
-            every.bytes += size
-            while every.bytes > every.capacity:
-                _, (_, dropped) = every.values.popitem(last=False)
-                every.bytes -= dropped
+            entries.values[(self, key)] = (value, size)
+            entries.bytes += size
+            while entries.bytes > entries.capacity:
+                _, (_, dropped) = entries.values.popitem(last=False)
+                entries.bytes -= dropped
 
 
 @dataclass(slots=True)

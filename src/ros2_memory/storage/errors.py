@@ -132,7 +132,7 @@ def reason_of(error: Exception) -> str:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Returns whether the same bytes may be readable later."""
+    """Returns whether reading the same bytes again may succeed."""
     if isinstance(error, (OSError, MemoryError, UnreachableError)):
         return True
     return _sqlite_code(error) in _DISK_ERRORS

@@ -133,17 +133,17 @@ def _json(payload: bytes) -> object:
     return value
 
 
-def _deserialized(found: MessageType, payload: bytes) -> object:
+def _deserialized(message_type: MessageType, payload: bytes) -> object:
     """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
     # The recorder may not have found the text of an empty definition.
-    if not found.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
+    if not message_type.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
         raise UnreadableError(
             "the definition in the bag is empty and the message is not; put the package's .msg"
             " folder into reader.custom_msg_paths"
         )
-    if holds_too_many(found.fields, payload):
+    if holds_too_many(message_type.fields, payload):
         raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
-    return found.deserialize(payload)
+    return message_type.deserialize(payload)
 
 
 def _reason(record: Record, error: Exception) -> str:
@@ -215,13 +215,13 @@ class FileReader(BagReader):
     ) -> Iterator[Record]:
         """Yields the undecoded messages of `topics` inside the window, by log time."""
 
-        def found() -> Iterator[Record | LostError]:
+        def read() -> Iterator[Record | LostError]:
             with reading(path), self._open(path) as opened:
                 records = opened.bags.records
                 yield from records(opened.path, topics, window, newest_first=newest_first)
 
         # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-        return map(partial(raise_if_lost, path), found())
+        return map(partial(raise_if_lost, path), read())
 
     def batches(
         self,
@@ -233,11 +233,11 @@ class FileReader(BagReader):
     ) -> Iterator[Batch]:
         """Yields the messages of `topics` inside the window, many at once."""
 
-        def found() -> Iterator[Batch | LostError]:
+        def read() -> Iterator[Batch | LostError]:
             with reading(path), self._open(path) as opened:
                 yield from opened.bags.batches(opened.path, topics, window, bare)
 
-        return map(partial(raise_if_lost, path), found())
+        return map(partial(raise_if_lost, path), read())
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns every channel that is declared in the file."""
@@ -271,12 +271,12 @@ class FileReader(BagReader):
 
     def encode(self, channel: Channel, message: object) -> bytes:
         """Encodes a decoded message of a channel."""
-        found = self._type_of(channel)
+        message_type = self._type_of(channel)
         reason = f"messages encoded as {channel.encoding} are not written"
-        if channel.encoding != "cdr" or isinstance(found, str):
+        if channel.encoding != "cdr" or isinstance(message_type, str):
             raise UndecodableError(channel.topic, channel.type, reason)
         try:
-            return found.serialize(message)
+            return message_type.serialize(message)
         # rosbags raises whatever the generated code runs into, as for `decode`.
         except Exception as error:
             reason = f"the message is not encoded: {' '.join(str(error).split())[:160]}"
@@ -284,18 +284,18 @@ class FileReader(BagReader):
 
     def definition(self, channel: Channel) -> Definition | None:
         """Returns the fields of the channel's messages, or None."""
-        found = self._type_of(channel) if channel.encoding == "cdr" else ""
-        return None if isinstance(found, str) else found.fields
+        message_type = self._type_of(channel) if channel.encoding == "cdr" else ""
+        return None if isinstance(message_type, str) else message_type.fields
 
     def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
-        known = self._known.get(id(channel))
-        if known is not None:
-            return known[1]
+        _, cached = self._known.get(id(channel), (channel, None))
+        if cached is not None:
+            return cached
         decoder: Callable[[bytes], object] | str = _json
         if channel.encoding == "cdr":
-            found = self._type_of(channel)
-            found = found if isinstance(found, str) else found.compiled()
-            decoder = found if isinstance(found, str) else partial(_deserialized, found)
+            usable = self._type_of(channel)
+            usable = usable if isinstance(usable, str) else usable.compiled()
+            decoder = usable if isinstance(usable, str) else partial(_deserialized, usable)
         elif channel.encoding != "json":
             decoder = f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
         if len(self._known) >= _MAX_KNOWN:

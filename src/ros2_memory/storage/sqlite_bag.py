@@ -160,26 +160,27 @@ class SqliteBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
-            found: list[tuple[int, int, int, int, int, int]]
-            found = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
-            right = self._is_indexed_right(base, topics)
+            stored: list[tuple[int, int, int, int, int, int]]
+            stored = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
+            is_right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
-        if any(wrong for *_, wrong, _ in found):
+        if any(undecodable for *_, undecodable, _ in stored):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
-        rows = [row for row in found if not row[5]]
         totals = [
             ChannelTotal(topics.channels[number], count, first, last)
-            for number, count, first, last, *_ in rows
-            if number in topics.channels
+            for number, count, first, last, _, is_impossible in stored
+            if number in topics.channels and not is_impossible
         ]
-        orphans = sum(row[1] for row in rows) - sum(each.messages for each in totals)
-        notes = [] if right else [_WRONG_INDEX]
+        impossible = sum(count for _, count, _, _, _, is_impossible in stored if is_impossible)
+        counts = sum(count for _, count, *_ in stored)
+        orphans = counts - impossible - sum(total.messages for total in totals)
+        notes = [] if is_right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
-        if impossible := sum(row[1] for row in found if row[5]):
+        if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
         return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
@@ -203,13 +204,13 @@ class SqliteBags:
         """
         if window.empty:
             return
-        with self._opened(path) as (base, known):
-            wanted = known.named(topics)
-            right = self._is_indexed_right(base, known)
-            if not right:
+        with self._opened(path) as (base, declared):
+            wanted = declared.named(topics)
+            is_right = self._is_indexed_right(base, declared)
+            if not is_right:
                 yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
             for time, row, number in _ordered_rows(
-                base, wanted, window, newest_first=newest_first, indexed=right
+                base, wanted, window, newest_first=newest_first, indexed=is_right
             ):
                 yield self._record(base, wanted, time, row, number)
 
@@ -230,30 +231,30 @@ class SqliteBags:
         row: int,
         number: int,
     ) -> Record:
-        found = base.execute(_PAYLOAD, (row,)).fetchone()
-        if found is None or not isinstance(found[0], bytes):
+        stored, *indexed = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
+        if not isinstance(stored, bytes):
             raise UnreadableError("damaged: a message without a binary payload")
-        if found[1:] != (time, number):
+        if indexed != [time, number]:
             raise UnreadableError("damaged: a message is not the one that an index names")
         channel = wanted[number]
-        if len(found[0]) > LARGE_BYTES:
+        if len(stored) > LARGE_BYTES:
             self._large.acquire()
-        payload = uncompressed_payload(channel, found[0], self._limit)
+        payload = uncompressed_payload(channel, stored, self._limit)
         return Record(channel, time, time, payload)
 
-    def _is_indexed_right(self, base: sqlite3.Connection, known: _Topics) -> bool:
+    def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:
         """Returns whether the indexes of a file agree with its table; compares them once."""
-        right = self._proven.get(known.key)
-        if right is None:
-            every = partial(_ordered_rows, base, known.channels, TimeWindow.everything())
+        is_right = self._proven.get(topics.key)
+        if is_right is None:
+            ordered = partial(_ordered_rows, base, topics.channels, TimeWindow.everything())
             try:
-                both = zip_longest(every(indexed=True), every(indexed=False))
-                right = all(starmap(eq, both))
+                both = zip_longest(ordered(indexed=True), ordered(indexed=False))
+                is_right = all(starmap(eq, both))
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
-                right = False
-            self._proven.put(known.key, right, _PROOF_BYTES)
-        return right
+                is_right = False
+            self._proven.put(topics.key, is_right, _PROOF_BYTES)
+        return is_right
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -274,12 +275,12 @@ class SqliteBags:
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)
-                topics = _Topics(key, self._channels(base))
+                topics = _Topics(key, self._read_channels(base))
                 size = 1000 + sum(300 + c.memory_bytes for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
 
-    def _channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
+    def _read_channels(self, base: sqlite3.Connection) -> dict[int, Channel]:
         have = _columns(base, "topics")
         if not {"id", "name", "type"} <= have or not _columns(base, "messages") >= _MESSAGE_COLUMNS:
             raise UnreadableError("not a rosbag2 file: it lacks the tables topics and messages")
@@ -301,9 +302,7 @@ class SqliteBags:
                     str(value.get("serialization_format") or "cdr"),
                     schema,
                     offered_as_latched(str(value.get("offered_qos_profiles") or "")),
-                    tuple(
-                        (known, str(value[name])) for name, known in _METADATA if value.get(name)
-                    ),
+                    tuple((key, str(value[name])) for name, key in _METADATA if value.get(name)),
                 )
             )
         if len(channels) > MAX_CHANNELS:

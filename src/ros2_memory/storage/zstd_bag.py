@@ -70,7 +70,7 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
             raise UnreadableError("not a zstd file: it does not begin as one")
         whole = ends_whole(file)
     target = folder / path.stem
-    damage = _unpack(path, target, reserve)
+    damage = _decompress_into(path, target, reserve)
     if not target.stat().st_size:
         raise UnreadableError(f"nothing of it can be decompressed ({damage or 'it ends early'})")
     if damage:
@@ -78,7 +78,7 @@ def unpack(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Pa
     return target, "" if whole else "its compressed file ends early"
 
 
-def _unpack(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
+def _decompress_into(path: Path, target: Path, reserve: Callable[[int], None]) -> str:
     """Writes what can be decompressed; returns what is wrong with the rest, or an empty text."""
     with os.fdopen(open_regular(path), "rb") as source, target.open("wb") as out:
         reader = zstandard.ZstdDecompressor().stream_reader(source, read_across_frames=True)

@@ -19,7 +19,7 @@ import numpy as np
 from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS, Flags, Ints
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.columns.fragments import FragmentKey, Kind
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind
 from ros2_memory.columns.sights import packed
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -98,7 +98,7 @@ class SeenBytes(NamedTuple):
         return 200 + len(self.data)
 
 
-SIGHTS: Final[Kind[SeenBytes]] = Kind("sights", (SeenBytes,))
+SIGHTS: Final[FragmentKind[SeenBytes]] = FragmentKind("sights", (SeenBytes,))
 """What detectors saw in a stretch."""
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.columns import decode
-from ros2_memory.columns.walk import Level, NotWalkedError, walked
+from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
 
 if TYPE_CHECKING:
     from ros2_memory.columns.plan import Plan
@@ -19,7 +19,7 @@ def fallbacks(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The topics of batches that were decoded message by message."""
     topics: list[str] = []
 
-    def noting(plan: Plan, batch: Batch) -> Level:
+    def noting(plan: Plan, batch: Batch) -> LevelColumns:
         try:
             return walked(plan, batch)
         except NotWalkedError:

@@ -23,7 +23,7 @@ from ros2_memory.analysis.conditions import (
     leaves,
     positions,
 )
-from ros2_memory.columns.decode import _Kind, _table
+from ros2_memory.columns.decode import _decoded_batch, _Kind
 from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import pack
 from ros2_memory.columns.plan import plan_of
@@ -174,7 +174,7 @@ def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     assert definition is not None
     kind = _Kind(definition, plan_of(definition), "", is_hashed=False)
     found: Iterator[Batch] = batched(enumerate(records))
-    table = joined([_table(kind, batch, reader, skip=False) for batch in found])
+    table = joined([_decoded_batch(kind, batch, reader, skip=False) for batch in found])
     return Drawn(table, [reader.decode(record) for record in records])
 
 

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from ros2_memory.analysis.motion.robot_track import track_part
-from ros2_memory.columns.fragments import FragmentKey, Fragments, Kind, from_bytes, to_bytes
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, from_bytes, to_bytes
 from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.pack import compressed
 from ros2_memory.columns.scanner import Scanner
@@ -49,7 +49,7 @@ class Words(NamedTuple):
         return 100
 
 
-WORDS: Final[Kind[Words]] = Kind("words", (Words,))
+WORDS: Final[FragmentKind[Words]] = FragmentKind("words", (Words,))
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.columns.numbers import numbers
 from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Made, Values, seconds
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values, seconds
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
@@ -169,7 +169,7 @@ def turned(parts: list[Quaternion], error: float = 0.0) -> list[list[tuple[float
     values = Values(table)
     values.error = lambda leaf: error  # type: ignore[method-assign]
     found = []
-    for made in (Made.ROLL, Made.PITCH, Made.YAW):
+    for made in (Conversion.ROLL, Conversion.PITCH, Conversion.YAW):
         known = values.numbers(Leaf(ROWS, ("x", "y", "z", "w"), Kind.REAL, made))
         assert known is not None
         off = np.broadcast_to(known.error, known.values.shape)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import pytest
 
 from ros2_memory.columns import scan
-from ros2_memory.columns.fragments import Kind
+from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -49,7 +49,7 @@ class Words(NamedTuple):
         return 100
 
 
-WORDS: Final[Kind[Words]] = Kind("words", (Words,))
+WORDS: Final[FragmentKind[Words]] = FragmentKind("words", (Words,))
 
 
 @pytest.fixture(autouse=True, scope="module")

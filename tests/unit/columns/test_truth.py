@@ -29,7 +29,7 @@ from tests.unit.columns.drawn_tables import (
 )
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.shown import Kept
+    from ros2_memory.columns.shown import TruthValues
     from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()
@@ -49,7 +49,7 @@ PLAIN = (
 RANDOM = st.randoms(use_true_random=False)
 
 
-def compared(found: Kept, condition: Condition, values: list[JsonValue]) -> int:
+def compared(found: TruthValues, condition: Condition, values: list[JsonValue]) -> int:
     """Checks what is settled; returns how many rows are not."""
     expected = np.array([condition.matches(value) for value in values])
     assert not (found.surely & found.unsure).any()

@@ -72,7 +72,7 @@ from ros2_memory.storage.mcap.index import (
     chunk_data,
     index_from_summary,
 )
-from ros2_memory.storage.mcap.merge import Rows, SortedRun, merged
+from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
@@ -189,12 +189,12 @@ class McapBags:
                 yield from merged(runs, newest_first=newest_first)
             except _ContradictedError as error:
                 # Raised in place of a run: what was yielded lies before all that the run can hold.
-                believed, index = index, self._distrust(file, error)
-                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
+                right = self._distrust(file, error)
+                yield ContradictionError(right.contradiction, window.start, window.stop - 1)
                 left, passed = _split_window(window, error.chunk, newest_first=newest_first)
-                if overlooked := _overlooked(believed, index, _wanted(index, topics), passed):
+                if overlooked := _overlooked(index, right, _wanted(right, topics), passed):
                     yield LostError(str(error), *overlooked)
-                runs = self._runs(file, index, topics, left, newest_first=newest_first)
+                runs = self._runs(file, right, topics, left, newest_first=newest_first)
                 yield from merged(runs, newest_first=newest_first)
 
     def batches(
@@ -304,8 +304,8 @@ class McapBags:
         try:
             pairs = _pairs(file, chunk, wanted, data)
             if before is not None:
-                known = _pairs(file, before, wanted, data)
-                pairs = pairs.taken(~np.isin(pairs.offsets, known.offsets))
+                earlier = _pairs(file, before, wanted, data)
+                pairs = pairs.taken(~np.isin(pairs.offsets, earlier.offsets))
             content = ReadChunks([chunk], data, [len(data)])
             batches = batches_of(content, pairs, wanted, window, self._uncompressed)
         except (UnreadableError, ValueError, IndexError) as error:
@@ -337,7 +337,7 @@ class McapBags:
         def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
             return _fetch_from_chunk(last_used(chunk), wanted, self._uncompressed)(place, time)
 
-        def rows_of(chunk: Chunk) -> Rows[Record | LostError] | None:
+        def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
             # Of a chunk that cannot be read, only what is wanted by its index is lost.
             try:
@@ -348,9 +348,9 @@ class McapBags:
                 if lost is None:
                     return None
                 at = lost.last if newest_first else lost.first
-                return Rows([at], [0], lambda _place, _time: lost)
+                return RunRows([at], [0], lambda _place, _time: lost)
             columns = self._chunk_columns(file, chunk, wanted, data)
-            column = joined([each.between(window.start, window.stop) for each in columns])
+            column = joined([indexed.between(window.start, window.stop) for indexed in columns])
             if not column.times.size:
                 return None
             fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
@@ -404,7 +404,7 @@ class McapBags:
         except UnreadableError:
             first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
             return LostError(reason, first, last)
-        times = joined([each.between(window.start, window.stop) for each in columns]).times
+        times = joined([column.between(window.start, window.stop) for column in columns]).times
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
 
     def _chunk_columns(
@@ -435,12 +435,12 @@ class McapBags:
         else:
             try:
                 read = chunk_columns(file, chunk, missing)
-                for channel, found in read.items():
-                    require_indexed(data, channel, found)
+                for channel, fresh in read.items():
+                    require_indexed(data, channel, fresh)
             except (UnreadableError, ValueError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
-        for channel, found in read.items():
-            self._indexes.put((file.key, chunk.offset, channel), found, found.memory_bytes)
+        for channel, fresh in read.items():
+            self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
         return [*columns, *(read[channel] for channel in missing)]
 
     def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
@@ -484,9 +484,10 @@ class McapBags:
 
         A bag is chosen for a question by these times: a wrong one would hide its messages.
         """
-        ends = sorted({end for each in index.totals.values() for end in (each.first, each.last)})
-        ordered = index.chunks
-        looked_at = {each.offset for each in (*ordered[:1], *ordered[-1:], *_out_of_order(ordered))}
+        totals = index.totals.values()
+        ends = sorted({end for total in totals for end in (total.first, total.last)})
+        odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
+        looked_at = {chunk.offset for chunk in odd}
         left = _VERIFIED_BYTES
         try:
             for chunk in index.chunks:
@@ -554,7 +555,9 @@ def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Col
     """
     try:
         with as_unreadable():
-            agrees = all(declared.agrees(*each) for each in declarations_of(data, columns))
+            agrees = all(
+                declared.agrees(*declaration) for declaration in declarations_of(data, columns)
+            )
     except UnreadableError as error:
         raise _ContradictedError(reason_of(error)) from error
     if not agrees:
@@ -593,16 +596,16 @@ def _beside(index: McapIndex, window: TimeWindow) -> list[Chunk]:
     """
     chunks, start, last = index.chunks, window.start, window.stop - 1
     inside = [n for n, chunk in enumerate(chunks) if chunk.start <= last and chunk.end >= start]
-    found = {one + 1 for one, other in pairwise(inside) if other - one == _NEXT_BUT_ONE}
+    beside = {n + 1 for n, following in pairwise(inside) if following - n == _NEXT_BUT_ONE}
     for seam in index.seams:
         if seam.first <= last and seam.last >= start:
-            found.update((seam.nth, seam.nth + 1))
+            beside.update((seam.nth, seam.nth + 1))
     for at in (start, last):
         if not any(chunks[n].start <= at <= chunks[n].end for n in inside):
             before = [(chunk.end, n) for n, chunk in enumerate(chunks) if chunk.end < at]
             nth = max(before)[1] if before else -1
-            found.update((nth, nth + 1))
-    return [chunks[n] for n in sorted(found) if 0 <= n < len(chunks)]
+            beside.update((nth, nth + 1))
+    return [chunks[n] for n in sorted(beside) if 0 <= n < len(chunks)]
 
 
 def _split_window(
@@ -621,11 +624,11 @@ def _overlooked(
     believed: McapIndex, index: McapIndex, wanted: Collection[int], passed: TimeWindow
 ) -> tuple[Ns, Ns] | None:
     """Returns between which log times messages were missed, in a part read by wrong indexes."""
-    known = {chunk.offset: chunk for chunk in believed.chunks}
+    believed_at = {chunk.offset: chunk for chunk in believed.chunks}
     chunks = [
         chunk
         for chunk in _with_any(index, wanted, passed)
-        if not _describes(known.get(chunk.offset), chunk)
+        if not _describes(believed_at.get(chunk.offset), chunk)
     ]
     if not chunks:
         return None
@@ -637,8 +640,8 @@ def _describes(believed: Chunk | None, chunk: Chunk) -> bool:
     """Returns whether an index had all times and channels of a chunk."""
     if believed is None:
         return False
-    within = believed.start <= chunk.start and chunk.end <= believed.end
-    return within and chunk.channels <= believed.channels
+    is_within = believed.start <= chunk.start and chunk.end <= believed.end
+    return is_within and chunk.channels <= believed.channels
 
 
 def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
@@ -650,11 +653,11 @@ def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
 
 def _rows(
     column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
-) -> Rows[Record | LostError]:
+) -> RunRows[Record | LostError]:
     times, places = column
     if newest_first:
         times, places = times[::-1], places[::-1]
-    return Rows(times.tolist(), places.tolist(), fetch)
+    return RunRows(times.tolist(), places.tolist(), fetch)
 
 
 def _fetch_from_chunk(
@@ -685,9 +688,10 @@ def _fetch_loose(
 
     def fetch(place: int, time: Ns) -> Record:
         head = MESSAGE.unpack(file.read(place, MESSAGE.size))
-        channel = _channel(channels, head[2])
-        payload = file.read(place + MESSAGE.size, head[1] + RECORD.size - MESSAGE.size)
-        return _record(channel, time, head[5], payload, uncompressed)
+        _, length, number, _, _, published = head
+        channel = _channel(channels, number)
+        payload = file.read(place + MESSAGE.size, length + RECORD.size - MESSAGE.size)
+        return _record(channel, time, published, payload, uncompressed)
 
     return fetch
 

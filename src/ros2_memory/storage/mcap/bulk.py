@@ -156,6 +156,16 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
+def _require_as_indexed(pairs: Pairs, heads: np.ndarray[tuple[int], np.dtype[np.void]]) -> None:
+    """Compares the heads of message records with what the indexes say of them."""
+    if (
+        (heads["opcode"] != _MESSAGE_OPCODE).any()
+        or (heads["channel"] != pairs.channels).any()
+        or (heads["log_time"] != pairs.times).any()
+    ):
+        raise UnreadableError(NOT_THERE)
+
+
 def batches_of(
     content: ReadChunks,
     pairs: Pairs,
@@ -191,32 +201,27 @@ def batches_of(
         raise UnreadableError(NOT_THERE)
     heads = gathered(buffer, _MESSAGE, at)
     stops = at + RECORD.size + heads["length"]
-    if (
-        (heads["opcode"] != _MESSAGE_OPCODE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
-        or (stops > end).any()
-        or (stops < at + MESSAGE.size).any()
-    ):
+    _require_as_indexed(pairs, heads)
+    if (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
     in_file = np.sort(at)
     if (in_file[1:] == in_file[:-1]).any():
         raise UnreadableError(_TWICE)
     order = _in_window(pairs, window)
-    at, of = at[order], pairs.channels[order]
+    at, numbers = at[order], pairs.channels[order]
     steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]
     published = _published(heads["publish_time"][order], pairs.times[order])
     times, places = pairs.times[order], pairs.offsets[order] + steps
     starts = at + MESSAGE.size
     lengths = stops[order] - starts
     has_frames = bool(_are_frames(buffer, starts, lengths).any())
-    bounds = np.flatnonzero(of[1:] != of[:-1]) + 1
-    edges = [0, *bounds.tolist(), of.size] if of.size else []
-    found: list[Batch] = []
+    bounds = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    edges = [0, *bounds.tolist(), numbers.size] if numbers.size else []
+    batches: list[Batch] = []
     for first, last in pairwise(edges):
         rows = slice(first, last)
         batch = Batch(
-            channels[int(of[first])],
+            channels[int(numbers[first])],
             times[rows],
             published[rows],
             places[rows],
@@ -224,23 +229,23 @@ def batches_of(
             starts[rows],
             lengths[rows],
         )
-        found.append(batch)
+        batches.append(batch)
     if not has_frames:
-        return iter(found)
-    return chain.from_iterable(_decompressed(each, uncompressed) for each in found)
+        return iter(batches)
+    return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
 
 
 def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
     """Returns the positions of the messages inside a window, channel by channel."""
     order: IntArray = np.argsort(pairs.channels, kind="stable")
-    inside = (pairs.times >= window.start) & (pairs.times < window.stop)
-    return order if inside.all() else order[inside[order]]
+    is_inside = (pairs.times >= window.start) & (pairs.times < window.stop)
+    return order if is_inside.all() else order[is_inside[order]]
 
 
 def _published(stated: IntArray, logged: IntArray) -> IntArray:
     # An unsigned time past the signed range has become negative.
-    impossible = (stated < 0) | (stated == MAX_NS)
-    return np.where(impossible, logged, stated) if impossible.any() else stated
+    is_impossible = (stated < 0) | (stated == MAX_NS)
+    return np.where(is_impossible, logged, stated) if is_impossible.any() else stated
 
 
 def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
@@ -264,12 +269,12 @@ def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
 
 def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
     """Returns which payloads begin as zstd does."""
-    long = sizes >= len(FRAME_MAGIC)
-    if not long.all():
-        starts = starts[long]
-    found = np.zeros(long.size, np.bool_)
-    found[long] = gathered(buffer, _UINT32, starts) == _MAGIC
-    return found
+    is_long = sizes >= len(FRAME_MAGIC)
+    if not is_long.all():
+        starts = starts[is_long]
+    are_frames = np.zeros(is_long.size, np.bool_)
+    are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
+    return are_frames
 
 
 def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:
@@ -289,9 +294,10 @@ def bare_batches(
         pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
         steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
-        of, times, places = pairs.channels[order], pairs.times[order], pairs.offsets[order] + steps
-        for number in np.unique(of).tolist():
-            rows = of == number
-            none = np.zeros(int(rows.sum()), np.int64)
-            logged = times[rows]
-            yield Batch(channels[number], logged, logged, places[rows], b"", none, none)
+        numbers, times = pairs.channels[order], pairs.times[order]
+        places = pairs.offsets[order] + steps
+        for number in np.unique(numbers).tolist():
+            is_of_channel = numbers == number
+            none = np.zeros(int(is_of_channel.sum()), np.int64)
+            logged = times[is_of_channel]
+            yield Batch(channels[number], logged, logged, places[is_of_channel], b"", none, none)

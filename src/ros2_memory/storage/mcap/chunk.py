@@ -158,22 +158,24 @@ class Pairs(NamedTuple):
     def of(cls, numbers: array[int], times: array[int], offsets: array[int]) -> Pairs:
         """Returns messages in file order, without (unsigned) log times that no clock shows."""
         unsigned = np.array(times, np.uint64)
-        kept = unsigned < MAX_NS
-        places, channels = (np.array(each, np.int64)[kept] for each in (offsets, numbers))
-        return cls(channels, unsigned[kept].astype(np.int64), places, np.zeros_like(places))
+        is_possible = unsigned < MAX_NS
+        places, channels = (
+            np.array(column, np.int64)[is_possible] for column in (offsets, numbers)
+        )
+        return cls(channels, unsigned[is_possible].astype(np.int64), places, np.zeros_like(places))
 
     def taken(self, rows: Mask) -> Pairs:
         """Returns some of the messages."""
-        return Pairs(*(each[rows] for each in self))
+        return Pairs(*(column[rows] for column in self))
 
     def columns(self, wanted: Collection[int]) -> dict[int, Column]:
         """Returns the messages of the wanted channels, which are of one chunk."""
-        return {
-            number: Column.of(self.times[here], self.offsets[here])
-            for number in wanted
-            for here in [self.channels == number]
-            if here.any()
-        }
+        columns: dict[int, Column] = {}
+        for number in wanted:
+            is_wanted = self.channels == number
+            if is_wanted.any():
+                columns[number] = Column.of(self.times[is_wanted], self.offsets[is_wanted])
+        return columns
 
 
 def pairs_in(
@@ -215,23 +217,23 @@ def pairs_in(
     ):
         raise UnreadableError(_OTHER_INDEX)
     channels = heads["channel"].astype(np.int64)
-    kept = sizes > 0
+    is_kept = sizes > 0
     if wanted is not None:
-        kept &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
-    counts = sizes[kept] // _PAIR.itemsize
+        is_kept &= np.isin(channels, np.array(sorted(wanted), np.int64), kind="sort")
+    counts = sizes[is_kept] // _PAIR.itemsize
     total = int(counts.sum())
     before = np.cumsum(counts) - counts
-    pairs_at = np.repeat(at[kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
+    pairs_at = np.repeat(at[is_kept] + _INDEX.itemsize - before * _PAIR.itemsize, counts)
     pairs_at += np.arange(total) * _PAIR.itemsize
     pairs = gathered(region, _PAIR, pairs_at)
     times = np.ascontiguousarray(pairs["time"])
-    chunk_of = np.repeat(number[kept], counts)
+    chunk_of = np.repeat(number[is_kept], counts)
     starts = np.array([chunk.start for chunk in chunks])[chunk_of]
     stops = np.array([chunk.end for chunk in chunks])[chunk_of]
     if total and ((times < starts) | (times > stops) | (times < 0) | (times >= MAX_NS)).any():
         raise UnreadableError(OUTSIDE)
     return Pairs(
-        np.repeat(channels[kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
+        np.repeat(channels[is_kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
     )
 
 
@@ -255,7 +257,10 @@ def index_groups(
         size += chunk.index_length
         if size > LARGE_BYTES or nth == len(chunks) - 1:
             group = chunks[begin : nth + 1]
-            yield group, [file.read(each.offset + each.length, each.index_length) for each in group]
+            yield (
+                group,
+                [file.read(member.offset + member.length, member.index_length) for member in group],
+            )
             begin, size = nth + 1, 0
 
 
@@ -322,16 +327,16 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     ends = np.append(places, size)
     if bool((begins > ends).any()):
         raise UnreadableError(NOT_THERE)
-    found: list[tuple[int, bytes]] = []
-    between = begins < ends
-    for begin, end in zip(begins[between].tolist(), ends[between].tolist(), strict=True):
+    declarations: list[tuple[int, bytes]] = []
+    has_content = begins < ends
+    for begin, end in zip(begins[has_content].tolist(), ends[has_content].tolist(), strict=True):
         walked = walk_chunk(data[begin:end])
         if walked.messages:
             raise UnreadableError("damaged: a chunk holds messages that its indexes do not")
-        found += walked.declarations
-        if len(found) > MAX_CHUNK_DECLARATIONS:
+        declarations += walked.declarations
+        if len(declarations) > MAX_CHUNK_DECLARATIONS:
             raise UnreadableError(_MANY_DECLARED)
-    return found
+    return declarations
 
 
 @dataclass(slots=True)

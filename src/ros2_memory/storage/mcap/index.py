@@ -12,7 +12,7 @@ import struct
 import zlib
 from functools import lru_cache
 from itertools import pairwise
-from operator import itemgetter, le
+from operator import attrgetter, le
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -160,7 +160,7 @@ def _chunk(section: bytes, at: int, end: int) -> Chunk:
 @lru_cache(1024)
 def _numbers(low: bytes, high: bytes) -> frozenset[int]:
     """Returns the channel numbers with these low and high bytes: one set for all equal ones."""
-    return frozenset(one | other << 8 for one, other in zip(low, high, strict=True))
+    return frozenset(first | second << 8 for first, second in zip(low, high, strict=True))
 
 
 @lru_cache(32)
@@ -276,18 +276,16 @@ class Contents:
         Returns:
             The first and the last log time of each chunk with messages, of which there is one.
         """
-        of = pairs.chunks
-        parts = np.append(0, np.flatnonzero(of[1:] != of[:-1]) + 1)
+        parts = _begins_of_groups(pairs.chunks)
         starts = np.minimum.reduceat(pairs.times, parts)
         ends = np.maximum.reduceat(pairs.times, parts)
         # Of a short chunk its bounds will do.
         is_long = ends - starts > SHORTEST_PAUSE_NS
-        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=of.size))]
+        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=pairs.times.size))]
         self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
         order = np.argsort(pairs.channels, kind="stable")
-        numbers, of, times = pairs.channels[order], of[order], pairs.times[order]
-        is_other = (numbers[1:] != numbers[:-1]) | (of[1:] != of[:-1])
-        parts = np.append(0, np.flatnonzero(is_other) + 1)
+        numbers, times = pairs.channels[order], pairs.times[order]
+        parts = _begins_of_groups(numbers, pairs.chunks[order])
         rows = zip(
             numbers[parts].tolist(),
             np.diff(parts, append=numbers.size).tolist(),
@@ -296,20 +294,20 @@ class Contents:
             strict=True,
         )
         for number, count, first, last in rows:
-            known = self.totals.get(number)
-            if known is not None:
-                self.back = max(self.back, known.last - first)
-            self._add(number, Extent(count, first, last))
+            total = self.totals.get(number)
+            if total is not None:
+                self.back = max(self.back, total.last - first)
+            self._count(number, Extent(count, first, last))
         return starts, ends
 
     def join(self, other: Contents) -> None:
         """Adds other messages of the file, whose order relative to these is unknown."""
         for number, extent in other.totals.items():
-            self._add(number, extent)
+            self._count(number, extent)
         self.back = max(self.back, other.back)
         self._held += other._held
 
-    def _add(self, number: int, extent: Extent) -> None:
+    def _count(self, number: int, extent: Extent) -> None:
         total = self.totals.setdefault(number, extent)
         if total is not extent:
             total.count += extent.count
@@ -323,6 +321,12 @@ class Contents:
         return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
 
 
+def _begins_of_groups(*columns: IntArray) -> IntArray:
+    """Returns the positions of the rows that differ from the row before; the first is one."""
+    is_other = np.logical_or.reduce([column[1:] != column[:-1] for column in columns])
+    return np.append(0, np.flatnonzero(is_other) + 1)
+
+
 def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     """Returns `McapIndex.seams`.
 
@@ -332,14 +336,14 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     many of them was written in another order, and they say nothing.
     """
     # Plain lists: for some thirty chunks arrays take twice as long.
-    apart = [abs(other[2] - one[3]) for one, other in pairwise(chunks)]
+    apart = [abs(following.start - chunk.end) for chunk, following in pairwise(chunks)]
     usual = _SEAM_TIMES * sorted(apart)[len(apart) // 2] if apart else 0
     seams: list[Seam] = []
     for nth in [nth for nth, gap in enumerate(apart) if gap > usual]:
-        one, other = chunks[nth], chunks[nth + 1]
-        if apart[nth] * _SEAM_SHARE > one.end - one.start + other.end - other.start:
+        before, after = chunks[nth], chunks[nth + 1]
+        if apart[nth] * _SEAM_SHARE > before.end - before.start + after.end - after.start:
             near = chunks[max(nth + 1 - _SEAM_CHUNKS, 0) : nth + 1 + _SEAM_CHUNKS]
-            first, last = min([each.start for each in near]), max([each.end for each in near])
+            first, last = min([chunk.start for chunk in near]), max([chunk.end for chunk in near])
             seams.append(Seam(nth, first, last))
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
 
@@ -370,32 +374,32 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         UnreadableError: a message index is not what the summary section says.
     """
     try:
-        index, stated = _index_from_summary(file)
+        index, stated = _index_without_totals(file)
     except (DoubtError, OSError):
         raise
     except Exception as error:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
     if not index.chunks:
         return index
-    found = Contents()
+    contents = Contents()
     with as_unreadable():
         for group, regions in index_groups(file, index.chunks):
-            firsts, lasts = found.add(pairs_in(group, regions))
+            firsts, lasts = contents.add(pairs_in(group, regions))
             stated_times = [(chunk.start, chunk.end) for chunk in group]
             if [*zip(firsts.tolist(), lasts.tolist(), strict=True)] != stated_times:
                 raise UnreadableError(OUTSIDE)
-    if found.totals.keys() != stated.channel_message_counts.keys():
+    if contents.totals.keys() != stated.channel_message_counts.keys():
         raise DoubtError
     return index._replace(
-        totals=found.totals,
-        notes=disagreements(stated, found.totals),
-        set_back=beyond_disorder(found.back),
-        pauses=found.pauses,
+        totals=contents.totals,
+        notes=disagreements(stated, contents.totals),
+        set_back=beyond_disorder(contents.back),
+        pauses=contents.pauses,
         seams=_seams(index.chunks),
     )
 
 
-def _index_from_summary(file: OpenFile) -> tuple[McapIndex, Statistics]:
+def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
     """Returns the index without what its messages amount to, and what the file states of that."""
     start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
@@ -406,8 +410,8 @@ def _index_from_summary(file: OpenFile) -> tuple[McapIndex, Statistics]:
     filled = [chunk for chunk in chunks if chunk.channels]
     if counts and len(filled) < len(chunks):  # some have no message indexes
         raise DoubtError
-    known = frozenset(channels)
-    if not all(map(known.issuperset, {chunk.channels for chunk in filled})):
+    declared_channels = frozenset(channels)
+    if not all(map(declared_channels.issuperset, {chunk.channels for chunk in filled})):
         raise DoubtError("its chunk indexes name channels that it does not declare")
     if chunks:
         _require_chunks_as_indexed(file, start, chunks)
@@ -427,14 +431,16 @@ def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]
         DoubtError: a chunk is not where its index has it, or not of these times; or there is a
             chunk or a message that no index knows.
     """
-    ordered = sorted(chunks, key=itemgetter(0))
+    ordered = sorted(chunks, key=attrgetter("offset"))
     if ordered[-1].offset >= file.size:
         raise DoubtError(_OTHER_CHUNKS)
-    begins = [chunk[0] for chunk in ordered]
-    heads = [_stating(_CHUNK, chunk[1] - _HEAD_BYTES, chunk[2], chunk[3]) for chunk in ordered]
+    begins = [chunk.offset for chunk in ordered]
+    heads = [
+        _stating(_CHUNK, chunk.length - _HEAD_BYTES, chunk.start, chunk.end) for chunk in ordered
+    ]
     if file.read_each(begins, _STATED_BYTES) != heads:
         raise DoubtError(_OTHER_CHUNKS)
-    ends = [MAGIC_SIZE, *[chunk[0] + chunk[1] + chunk[6] for chunk in ordered]]
+    ends = [MAGIC_SIZE, *[chunk.offset + chunk.length + chunk.index_length for chunk in ordered]]
     begins.append(end)
     for at, following in zip(ends, begins, strict=True):
         if at != following:
@@ -477,11 +483,11 @@ def _agrees(stated: Statistics, chunks: Sequence[Chunk], filled: Sequence[Chunk]
 
 def disagreements(stated: Statistics, totals: Mapping[int, Extent]) -> tuple[str, ...]:
     """Returns a note if the messages contradict the statistics; else nothing."""
-    every = totals.values()
+    extents = totals.values()
     counts = {channel: total.count for channel, total in totals.items()}
-    count = sum([total.count for total in every])
-    first = min([total.first for total in every], default=stated.message_start_time)
-    last = max([total.last for total in every], default=stated.message_end_time)
+    count = sum([total.count for total in extents])
+    first = min([total.first for total in extents], default=stated.message_start_time)
+    last = max([total.last for total in extents], default=stated.message_end_time)
     claimed = (stated.message_count, stated.message_start_time, stated.message_end_time)
     if stated.channel_message_counts == counts and claimed == (count, first, last):
         return ()

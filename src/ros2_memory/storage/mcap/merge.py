@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-class Rows(NamedTuple, Generic[T]):
+class RunRows(NamedTuple, Generic[T]):
     """The messages of one run in output order: log times, offsets, and how to fetch one by both.
 
     For newest first the times are descending, and equal ones are in reverse file order.
@@ -38,7 +38,7 @@ class SortedRun(NamedTuple, Generic[T]):
     first: Ns
     last: Ns
     rank: int
-    rows: Callable[[], Rows[T] | None]
+    rows: Callable[[], RunRows[T] | None]
 
 
 def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
@@ -53,7 +53,7 @@ def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
         ((-run.last if newest_first else run.first, sign * run.rank, run) for run in runs),
         reverse=True,
     )
-    heap: list[tuple[Ns, int, int, Rows[T], list[Ns]]] = []
+    heap: list[tuple[Ns, int, int, RunRows[T], list[Ns]]] = []
     while waiting or heap:
         while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
             _, rank, run = waiting.pop()

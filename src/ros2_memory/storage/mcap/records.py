@@ -141,9 +141,10 @@ class Declarations:
 
     def _differing(self, other: Declarations) -> bool:
         return any(
-            self._schemas.get(number, each) != each for number, each in other._schemas.items()
+            self._schemas.get(number, schema) != schema for number, schema in other._schemas.items()
         ) or any(
-            self._channels.get(number, each) != each for number, each in other._channels.items()
+            self._channels.get(number, channel) != channel
+            for number, channel in other._channels.items()
         )
 
     @property
@@ -163,9 +164,10 @@ class Declarations:
         if len(self._channels) > MAX_CHANNELS:
             raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
         names = sum(
-            len(each.topic) + len(each.message_encoding) for each in self._channels.values()
+            len(channel.topic) + len(channel.message_encoding)
+            for channel in self._channels.values()
         )
-        types = sum(len(each.name) for each in self._schemas.values())
+        types = sum(len(schema.name) for schema in self._schemas.values())
         if names + types > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
         return {
@@ -208,8 +210,8 @@ def is_finished(file: OpenFile) -> bool:
 
 
 def _ends_as_mcap(file: OpenFile) -> bool:
-    whole = file.size >= 2 * MAGIC_SIZE
-    return whole and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
+    is_long_enough = file.size >= 2 * MAGIC_SIZE
+    return is_long_enough and file.read(file.size - MAGIC_SIZE, MAGIC_SIZE) == MAGIC
 
 
 def starts_as_mcap(file: OpenFile) -> bool:

@@ -74,15 +74,15 @@ class Salvage:
         Raises:
             UnreadableError: the file is not MCAP, or ends within its magic.
         """
-        read_to, data_ended = MAGIC_SIZE, False
+        read_to, has_ended = MAGIC_SIZE, False
         for record in file_records(self._file):
-            data_ended = data_ended or record.opcode == Opcode.DATA_END
+            has_ended = has_ended or record.opcode == Opcode.DATA_END
             within = self._chunk if record.opcode == Opcode.CHUNK else self._whole
             yield from filter(None, starmap(decode_record, within(record)))
             read_to = min(record.end, self._file.size)
             if progress is not None:
                 progress(read_to)
-        if not data_ended:
+        if not has_ended:
             self.lost_bytes += self._file.size - read_to
 
     def _whole(self, record: FileRecord) -> Iterator[tuple[int, bytes]]:
@@ -90,10 +90,10 @@ class Salvage:
             return
         size = record.end - record.body_at
         if record.opcode == Opcode.MESSAGE:
-            readable = record.end - record.offset <= self._max_chunk_bytes
+            is_readable = record.end - record.offset <= self._max_chunk_bytes
         else:
-            readable = size <= MAX_SECTION_BYTES
-        if readable:
+            is_readable = size <= MAX_SECTION_BYTES
+        if is_readable:
             yield record.opcode, self._file.read(record.body_at, size)
         else:
             self.lost_bytes += size
@@ -153,9 +153,9 @@ class ContentDigest:
         if isinstance(record, mcap_records.Message):
             return self._message(record)
         if isinstance(record, mcap_records.Schema):
-            known = record.id == 0 or record.id in self._schemas
+            is_known = record.id == 0 or record.id in self._schemas
             self._schemas.setdefault(record.id, record)
-            return not known
+            return not is_known
         if isinstance(record, mcap_records.Channel):
             return self._channel(record)
         if not isinstance(record, mcap_records.Header):
@@ -245,11 +245,11 @@ def _before_messages(file: OpenFile) -> Iterator[McapRecord]:
 
 
 def _custom_data_in(text: str) -> dict[str, str] | None:
-    found = _CUSTOM_DATA.search(text)
-    if found is None or not _NEXT_KEY.match(text, found.end()):
+    match = _CUSTOM_DATA.search(text)
+    if match is None or not _NEXT_KEY.match(text, match.end()):
         return None
     try:
-        content: object = yaml.safe_load(found[0])
+        content: object = yaml.safe_load(match[0])
     except (yaml.YAMLError, RecursionError, ValueError):
         return None
     if not isinstance(content, dict):

@@ -74,7 +74,7 @@ class _Scan:
     in_chunks: Declarations = field(default_factory=Declarations)
     redeclared: bool = False
     chunks: list[Chunk] = field(default_factory=list)
-    found: Contents = field(default_factory=Contents)
+    contents: Contents = field(default_factory=Contents)
     # Of messages outside chunks: channels, log times and offsets.
     loose: tuple[array[int], array[int], array[int]] = field(
         default_factory=lambda: (array("H"), array("Q"), array("q"))
@@ -96,8 +96,8 @@ class _Scan:
             elif record.opcode == Opcode.CHUNK:
                 self._add_chunk(record)
             elif record.opcode in _DECLARED:
-                known = self.repeated if self.data_ended else self.declared
-                self._declare(record.opcode, record.body(self.file), known)
+                declarations = self.repeated if self.data_ended else self.declared
+                self._declare(record.opcode, record.body(self.file), declarations)
         except UnreadableError as error:
             self.damaged.append(str(error))
         self.read_to = record.end
@@ -106,17 +106,17 @@ class _Scan:
         if record.end - record.offset > self.max_bytes:
             raise UnreadableError(too_large("a message", self.max_bytes))
         _, _, channel, _, log_time, _ = MESSAGE.unpack(record.head)
-        for known, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
-            known.append(value)
+        for column, value in zip(self.loose, (channel, log_time, record.offset), strict=True):
+            column.append(value)
         self.messages += 1
 
-    def _declare(self, opcode: int, body: bytes, known: Declarations) -> None:
+    def _declare(self, opcode: int, body: bytes, declarations: Declarations) -> None:
         with as_unreadable():
             if opcode == Opcode.STATISTICS:
                 self.stated = statistics(body)
                 return
-            self.redeclared = self.redeclared or not known.agrees(opcode, body)
-            known.add(opcode, body)
+            self.redeclared = self.redeclared or not declarations.agrees(opcode, body)
+            declarations.add(opcode, body)
 
     def _add_chunk(self, record: FileRecord) -> None:
         opened = self.opener.open(record)
@@ -151,24 +151,25 @@ class _Scan:
         self.messages += content.messages
         pairs = content.pairs
         if pairs.times.size:
-            [first], [last] = (each.tolist() for each in self.found.add(pairs))
+            firsts, lasts = self.contents.add(pairs)
+            first, last = int(firsts[0]), int(lasts[0])
             numbers = frozenset(pairs.channels.tolist())
             self.chunks.append(Chunk(offset, end - offset, first, last, numbers, usable=usable))
 
     def index(self, note: str) -> McapIndex:
-        """Returns what was found; `note` comes before the notes on it."""
+        """Returns the index of the messages found; `note` comes before its other notes."""
         complete = self.data_ended and closing_of(self.file) is Closing.CLOSED
         loose = Pairs.of(*self.loose)
         if loose.times.size:
             beside = Contents()
             beside.add(loose._replace(chunks=np.arange(loose.times.size)))
-            self.found.join(beside)
+            self.contents.join(beside)
         declarations = self.repeated
         differing = declarations.update(self.declared)
         differing = declarations.update(self.in_chunks) or differing
         channels = declarations.channels()
         totals = {
-            channel: total for channel, total in self.found.totals.items() if channel in channels
+            channel: total for channel, total in self.contents.totals.items() if channel in channels
         }
         notes = self._notes(totals, complete=complete)
         if note:
@@ -185,13 +186,13 @@ class _Scan:
             loose.columns({*loose.channels.tolist()}),
             complete=complete,
             notes=tuple(notes),
-            set_back=beyond_disorder(self.found.back),
-            pauses=self.found.pauses,
+            set_back=beyond_disorder(self.contents.back),
+            pauses=self.contents.pauses,
         )
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
         notes = [] if complete else [self._end_note()]
-        timed = sum(total.count for total in self.found.totals.values())
+        timed = sum(total.count for total in self.contents.totals.values())
         if orphans := timed - sum(total.count for total in totals.values()):
             notes.append(f"left out: {counted(orphans, 'message')} of no declared channel")
         if self.damaged:

@@ -118,7 +118,7 @@ class McapWriter(BagWriter):
                         copy.put(record)
                     elif isinstance(record, mcap_records.Message):
                         raise UnreadableError("damaged: a message without a channel or a time")
-                was = sum(each.count for each in self._bags().summarize(source).topics)
+                was = sum(topic.count for topic in self._bags().summarize(source).topics)
                 if salvage.lost_bytes or was != digest.messages + taken.total():
                     raise UnreadableError("damaged: not all of its messages can be read")
             copy.finish()
@@ -134,11 +134,11 @@ class McapWriter(BagWriter):
         after = self._bags().summarize(target)
         if not after.complete or after.notes:
             raise UnreadableError(f"what was written is not whole ({'; '.join(after.notes)})")
-        again = ContentDigest()
+        written = ContentDigest()
         with OpenFile(target) as file:
             for record in Salvage(file, self._max_chunk_mb << 20).records():
-                again.add(record)
-        if again.digests != digest.digests:
+                written.add(record)
+        if written.digests != digest.digests:
             raise UnreadableError("what was written is not what could be read")
         return after
 
