@@ -114,11 +114,11 @@ class BagDirReader(BagReader):
         """
 
         def opened() -> Iterator[Iterator[Record]]:
-            found = self._located(path)
-            rule = self._rule(found, topics, window)
+            located = self._located(path)
+            rule = self._rule(located, topics, window)
             if rule is not None and rule.hides_all:
                 return
-            records = self._reader.records(found, topics, window, newest_first=newest_first)
+            records = self._reader.records(located, topics, window, newest_first=newest_first)
             yield records if rule is None else filter(rule.counts, records)
 
         # A generator would end at the first error; after a damaged chunk the adapter's iterator
@@ -140,13 +140,13 @@ class BagDirReader(BagReader):
         """
 
         def opened() -> Iterator[Iterator[Batch]]:
-            found = self._located(path)
-            rule = self._rule(found, topics, window)
+            located = self._located(path)
+            rule = self._rule(located, topics, window)
             if rule is None:
-                yield self._reader.batches(found, topics, window, bare=bare)
+                yield self._reader.batches(located, topics, window, bare=bare)
             elif not rule.hides_all:
                 # Which messages count is known by their publish times and payloads.
-                batches = self._reader.batches(found, topics, window)
+                batches = self._reader.batches(located, topics, window)
                 yield map(partial(_counted_in, rule), batches)
 
         return chain.from_iterable(opened())
@@ -211,9 +211,9 @@ class BagDirReader(BagReader):
             links = [recorded]
             with suppress(OSError):
                 links += (
-                    each / name for each in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
+                    folder / name for folder in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
                 )
-            path = next((each for each in links if os.path.lexists(each)), path)
+            path = next((link for link in links if os.path.lexists(link)), path)
         return self._confined(path)
 
     def _rule(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:

@@ -135,10 +135,10 @@ def correct(recording: Path, reader: BagReader) -> bool:
     if not files or not (text or is_named_by_rosbag2(recording)):
         return False
     contents: dict[str, Contents] = {}
-    for each in files:
-        contents[each.name] = Contents(reader.summarize(each), reader.channels(each))
-        if not contents[each.name].summary.complete:
-            raise ValueError(f"{each.name} is not whole")
+    for file in files:
+        contents[file.name] = Contents(reader.summarize(file), reader.channels(file))
+        if not contents[file.name].summary.complete:
+            raise ValueError(f"{file.name} is not whole")
     written = describing(text, contents)
     if written != text:
         write_durably(path, written)
@@ -149,15 +149,15 @@ def is_named_by_rosbag2(recording: Path) -> bool:
     """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
     prefix = f"{recording.name}_"
     return all(
-        each.suffix == ".mcap"
-        and each.stem.startswith(prefix)
-        and each.stem.removeprefix(prefix).isdecimal()
-        for each in _plain_bags(recording)
+        path.suffix == ".mcap"
+        and path.stem.startswith(prefix)
+        and path.stem.removeprefix(prefix).isdecimal()
+        for path in _plain_bags(recording)
     )
 
 
 def _plain_bags(recording: Path) -> list[Path]:
-    return [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
+    return [path for path in recording.iterdir() if bag_kind(path.name) in _PLAIN]
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
@@ -310,27 +310,27 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     names = {bare_name(name): counts for name, counts in gone.items()}
     files = _mappings(info, "files")
     paths = _list(info, "relative_file_paths")
-    deleted = [each for each in files if bare_name(each.get("path")) in names]
-    left = [each for each in files if bare_name(each.get("path")) not in names]
-    left_paths = [each for each in paths if bare_name(each) not in names]
+    deleted = [file for file in files if bare_name(file.get("path")) in names]
+    left = [file for file in files if bare_name(file.get("path")) not in names]
+    left_paths = [path for path in paths if bare_name(path) not in names]
     if len(left_paths) == len(paths) and not deleted:
         return None
     if not left or len(left) != len(left_paths):
         raise ValueError("it does not list the files that are left")
     lost = Counter[str]()
     is_equal = True
-    for each in deleted:
-        counts = names[bare_name(each.get("path"))]
-        is_equal &= sum(counts.values()) == integer(each, "message_count")
+    for file in deleted:
+        counts = names[bare_name(file.get("path"))]
+        is_equal &= sum(counts.values()) == integer(file, "message_count")
         lost.update(counts)
     topics = _mappings(info, "topics_with_message_count")
-    for each in topics:
-        name = _described(each).get("name")
-        each["message_count"] = integer(each, "message_count") - lost.pop(str(name), 0)
-    total = sum(integer(each, "message_count") for each in left)
-    if not is_equal or lost or total != sum(integer(each, "message_count") for each in topics):
+    for topic in topics:
+        name = _described(topic).get("name")
+        topic["message_count"] = integer(topic, "message_count") - lost.pop(str(name), 0)
+    total = sum(integer(file, "message_count") for file in left)
+    if not is_equal or lost or total != sum(integer(topic, "message_count") for topic in topics):
         raise ValueError("its numbers are not those of the files")
-    spans = [_span_of(each) for each in left]
+    spans = [_span_of(file) for file in left]
     info["message_count"] = total
     info.update(_span(min(start for start, _ in spans), max(end for _, end in spans)))
     info["relative_file_paths"], info["files"] = left_paths, left
@@ -354,19 +354,19 @@ def recounted(text: str, left: Mapping[str, Counts]) -> str:
         files = _mappings(info, "files")
         topics = _mappings(info, "topics_with_message_count")
         counts, others = Counter[str](), 0
-        for each in files:
-            count = integer(each, "message_count")
+        for file in files:
+            count = integer(file, "message_count")
             # None, where rosbag2 wrote it before the first message.
-            known = left.get(bare_name(each.get("path"))) if count else {}
-            if known is None:
+            counts_of_file = left.get(bare_name(file.get("path"))) if count else {}
+            if counts_of_file is None:
                 others += count
             else:
-                counts.update(known)
-                each["message_count"] = min(count, sum(known.values()))
-        for each in topics:
-            name = str(_described(each).get("name"))
-            each["message_count"] = min(integer(each, "message_count"), counts[name] + others)
-        info["message_count"] = sum(integer(each, "message_count") for each in files)
+                counts.update(counts_of_file)
+                file["message_count"] = min(count, sum(counts_of_file.values()))
+        for topic in topics:
+            name = str(_described(topic).get("name"))
+            topic["message_count"] = min(integer(topic, "message_count"), counts[name] + others)
+        info["message_count"] = sum(integer(file, "message_count") for file in files)
     except ValueError:
         return text
     return _dumped(content)
@@ -423,7 +423,7 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
 
 def _mappings(fields: dict[object, object], key: str) -> list[dict[object, object]]:
     """Returns the items of the list under a key, each of which must hold keys."""
-    return [_mapping(each, key.partition("_")[0]) for each in _list(fields, key)]
+    return [_mapping(item, key.partition("_")[0]) for item in _list(fields, key)]
 
 
 def _described(topic: dict[object, object]) -> dict[object, object]:

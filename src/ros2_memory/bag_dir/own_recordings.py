@@ -124,7 +124,7 @@ class ListRow:
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
-        others = {each.removesuffix(COMPRESSED) for each in files if not self.holds(each)}
+        others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
         return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
 
     def counted(self, files: Container[str]) -> int:
@@ -487,7 +487,7 @@ class OwnRecordings:
         content = _Content(lines=len(lines))
         content.add(row for row in rows if row.recording and not row.bag_dir_id)
         content.add(self._unwritten.values())
-        content.bag_dir_id = next((each.bag_dir_id for each in rows[::-1] if each.bag_dir_id), "")
+        content.bag_dir_id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
         self._list, self._stamp = content, stamp
         damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
         if damaged > self._reported_damaged:

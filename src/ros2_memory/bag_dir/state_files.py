@@ -255,8 +255,10 @@ def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
         files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
         spans.setdefault(row.recording, []).extend(row.spans)
     return {
-        name: Deleted(name, (*known,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),))
-        for name, known in files.items()
+        name: Deleted(
+            name, (*names_of_files,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),)
+        )
+        for name, names_of_files in files.items()
     }
 
 
@@ -267,8 +269,8 @@ def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
 
 def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
-    every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
-    return tuple(united(every, _TOUCHING_NS))
+    spans = (span for row in read_deleted(bag_dir).values() for span in row.spans)
+    return tuple(united(spans, _TOUCHING_NS))
 
 
 # superseded.json
@@ -414,7 +416,7 @@ def append_receipts(bag_dir: Path, receipts: Iterable[Receipt]) -> None:
     rows = SHIPPED.rows(bag_dir)
     if len(rows) > _SPARE_RECEIPTS:
         newest = {receipt.bag: receipt for receipt in rows}
-        present = [each for path, each in newest.items() if (bag_dir / path).exists()]
+        present = [receipt for path, receipt in newest.items() if (bag_dir / path).exists()]
         if len(rows) > _SPARE_RECEIPTS + 2 * len(present):
             SHIPPED.replace(bag_dir, present)
 
@@ -472,12 +474,12 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
         OSError: the file cannot be read.
         ValueError: a line is damaged, or the file too large: what was deleted is unknown.
     """
-    found: dict[Forgetting, None] = {}
+    forgettings: dict[Forgetting, None] = {}
     for number, row in FORGOTTEN.all_rows(bag_dir):
         if not (row.topics or row.bags):
             raise ValueError(f"line {number}: it names no topics and no bags")
-        found[row] = None
-    return [*found]
+        forgettings[row] = None
+    return [*forgettings]
 
 
 # erasing.json
@@ -657,8 +659,8 @@ def read_gate(bag_dir: Path) -> Gate:
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
     """Returns the stretches that were excluded between two log times."""
     state = read_gate(bag_dir).state
-    known = () if state is None else state.excluded
-    return [each for each in known if each.start < stop and start < each.stop]
+    stretches = () if state is None else state.excluded
+    return [stretch for stretch in stretches if stretch.start < stop and start < stretch.stop]
 
 
 # triggers.json

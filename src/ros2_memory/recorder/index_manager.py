@@ -197,10 +197,10 @@ class IndexManager:
         self, before: Snapshot | None, after: Snapshot, change: TableChange, begun: Ns
     ) -> None:
         removed, added, _ = change
-        known = set() if before is None else set(before.damaged)
-        for each in after.damaged:
-            if each not in known:
-                self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
+        reported_before = set() if before is None else set(before.damaged)
+        for aside in after.damaged:
+            if aside not in reported_before:
+                self._log.warning("bag_damaged", path=str(aside.path), reason=aside.reason)
         # A file that grows and answers is read again with every query: not worth a line each time.
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
         changed = before is None or _figures(before) != _figures(after)

@@ -253,7 +253,7 @@ class RecordingSession:
             self.state = SessionState.RECORDING
 
     def _is_new(self, line: Line) -> bool:
-        without_numbers = "".join(each for each in line.text if not each.isdigit())
+        without_numbers = "".join(char for char in line.text if not char.isdigit())
         key = (line.topic, without_numbers)
         if key in self._reported or len(self._reported) >= MAX_DISTINCT:
             return False

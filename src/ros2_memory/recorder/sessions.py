@@ -142,7 +142,7 @@ class RecordingSessions:
     @property
     def bytes_written(self) -> int:
         """The bytes that all recordings wrote since the start."""
-        return self._ended_bytes + sum(each.splits.bytes_written for each in self.running)
+        return self._ended_bytes + sum(session.splits.bytes_written for session in self.running)
 
     def begin(self, now: ClockReading) -> None:
         """Starts a recording if none is running.
@@ -428,7 +428,7 @@ class RecordingSessions:
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""
         session.state = SessionState.ENDED
-        self.running = tuple(each for each in self.running if each is not session)
+        self.running = tuple(other for other in self.running if other is not session)
         self._observe(session, now)
         completed = self._completed.pop(session.name, None)
         if completed is not None:

@@ -210,7 +210,7 @@ class Supervisor:
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
-        recordings = [each.name for each in self._sessions.running if each.splits.exists]
+        recordings = [session.name for session in self._sessions.running if session.splits.exists]
         was_away, is_away = self._disk.away, self._disk.is_away(recordings)
         self._reception.may_write = not is_away
         if is_away and not was_away:
@@ -355,7 +355,7 @@ class Supervisor:
         self._silence.began(now.monotonic_s, SETTLE_S)
 
     def _note_recorded(self, now: ClockReading) -> None:
-        names = [each.name for each in self._sessions.running if each.has_recorded]
+        names = [session.name for session in self._sessions.running if session.has_recorded]
         self._housekeeper.note_recorded(
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )

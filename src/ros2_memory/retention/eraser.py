@@ -103,7 +103,7 @@ class Survey(NamedTuple):
     @property
     def counts(self) -> Counter[str]:
         """The messages that go, by topic."""
-        return sum((each.counts for each in self.holders), Counter[str]())
+        return sum((holder.counts for holder in self.holders), Counter[str]())
 
 
 class Kept(NamedTuple):
@@ -144,11 +144,11 @@ class Eraser:
 
     def topics(self) -> frozenset[str]:
         """Returns the topics of all bags that can be read; of those that do not count too."""
-        found: set[str] = set()
+        topics: set[str] = set()
         for paths in self._files().values():
             with suppress(BagError):
-                found.update(each.topic for each in self._reader.channels(paths[0]))
-        return frozenset(found)
+                topics.update(channel.topic for channel in self._reader.channels(paths[0]))
+        return frozenset(topics)
 
     def survey(self, erasure: Erasure) -> Survey:
         """Returns which bags hold messages that go; changes nothing."""
@@ -339,7 +339,7 @@ class Eraser:
         """Returns the topics of which a sidecar lists messages of a file."""
         handover = read_handover(path.parent).handover
         lists = (handover.also_counts, handover.counts_elsewhere)
-        return {topic for each in lists for topic in each.get(path.name, ())}
+        return {topic for message_list in lists for topic in message_list.get(path.name, ())}
 
     def _erase_in(
         self,

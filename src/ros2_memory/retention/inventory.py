@@ -93,13 +93,16 @@ class ForeignBags:
 
         segments = snapshot.timeline.segments
         bags = {
-            bag.file: bag.size for each in segments for bag in each.bags if is_foreign(bag.file)
+            bag.file: bag.size
+            for segment in segments
+            for bag in segment.bags
+            if is_foreign(bag.file)
         }
         asides = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-        beside = [each for each in asides if not each.answers and is_foreign(str(each.path))]
+        beside = [aside for aside in asides if not aside.answers and is_foreign(str(aside.path))]
         bag_bytes = sum(bags.values())
         return Foreign(
-            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(each.path) for each in beside)
+            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(aside.path) for aside in beside)
         )
 
     def _judge(self, folder: str, recording: frozenset[str]) -> Callable[[str], bool]:
@@ -187,17 +190,17 @@ class Inventory:
             if self._own is not None and recording not in judges:
                 judges[recording] = self._own.judge_of(recording)
             name, is_named = path[len(recording) + 1 :], recording in named
-            own = self._own is None or judges[recording](name)
+            is_own = self._own is None or judges[recording](name)
             is_saved = path in known.saved
             # One is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
             is_closed = state in _CLOSED and not is_carried(path)
             may_go = is_closed or (state in _LEFT_OPEN and not is_named)
             may_go = may_go and not is_thinned(path)
-            if not (own or is_saved or is_new):
+            if not (is_own or is_saved or is_new):
                 mixed.add(recording)
                 foreign_bytes += sum(file.size for file in bag.files)
-            elif own and may_go and not is_saved and path not in remaining:
+            elif is_own and may_go and not is_saved and path not in remaining:
                 bags.append(bag)
             else:
                 occupied.add(recording)
@@ -206,9 +209,9 @@ class Inventory:
         self._forget(known)
         occupied |= mixed & {bag.recording for bag in bags}
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
-        sidecars = {each: self._folder(each, known.now).size for each in emptied}
+        sidecars = {recording: self._folder(recording, known.now).size for recording in emptied}
         occupied.update(bag.recording for bag in bags)
-        others += sum(self._folder(each, known.now).size for each in occupied - emptied)
+        others += sum(self._folder(recording, known.now).size for recording in occupied - emptied)
         saved = self._saved(known)
         return RetentionStock(
             bags,
@@ -306,14 +309,14 @@ class Inventory:
 
 def state_bytes_in(bag_dir: Path) -> int:
     """Returns the size of what is stored beside the bags, columns and logs, in bytes."""
-    own = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
+    paths = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
     with suppress(OSError):
-        own += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
+        paths += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
     for folder in OWN_FOLDERS:
         with suppress(OSError):
-            own += (bag_dir / folder).iterdir()
+            paths += (bag_dir / folder).iterdir()
     # Deleting bags makes that list longer.
-    return sum(size_of(each) for each in own if each != bag_dir / DELETED_FILE)
+    return sum(size_of(path) for path in paths if path != bag_dir / DELETED_FILE)
 
 
 def _file(device: int, stamp: Stamp) -> StoredFile:

@@ -79,7 +79,7 @@ class Origin(NamedTuple):
 def with_origin(record: Record, origin: Origin) -> Record:
     """Returns the message with its origin in place of any that its channel names."""
     channel = record.channel
-    rest = tuple(each for each in channel.metadata if each[0] not in {_RECORDINGS, _OFTEN})
+    rest = tuple(entry for entry in channel.metadata if entry[0] not in {_RECORDINGS, _OFTEN})
     new = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
     return record._replace(channel=replace(channel, metadata=(*rest, *new)))
 
@@ -137,22 +137,22 @@ def worth_carrying(
         repeated: late messages in kept bags, and their earliest log time there.
     """
     # Of the copies of a message the earliest comes last, and remains.
-    earliest = {each.identity: each for each in sorted(messages, reverse=True)}
+    earliest = {message.identity: message for message in sorted(messages, reverse=True)}
     missing = sorted(
-        each
-        for identity, each in earliest.items()
-        if repeated.get(identity, MAX_NS) > each.log_time
+        message
+        for identity, message in earliest.items()
+        if repeated.get(identity, MAX_NS) > message.log_time
     )
-    needed = {each for each in missing if each.identity in repeated}
+    needed = {message for message in missing if message.identity in repeated}
     by_subject: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
-    for each in missing:
-        for subject in each.subjects:
-            by_subject[subject].append(each)
-    for (_, frame), held in by_subject.items():
-        needed.add(held[-1])
+    for message in missing:
+        for subject in message.subjects:
+            by_subject[subject].append(message)
+    for (_, frame), of_subject in by_subject.items():
+        needed.add(of_subject[-1])
         # A static transform is valid before it was received, too.
-        since = MIN_NS if frame else held[0].log_time
-        for message, following in pairwise(held):
+        since = MIN_NS if frame else of_subject[0].log_time
+        for message, following in pairwise(of_subject):
             if message not in needed and recorded_in(since, following.log_time):
                 needed.add(message)
             since = following.log_time
@@ -272,7 +272,7 @@ class Carrier:
             newest = self._reader.newest(path, topic, TimeWindow.everything())
         except BagError:
             readable = self._records(path, (topic,))
-            newest = max(readable, key=lambda each: each.log_time, default=None)
+            newest = max(readable, key=lambda record: record.log_time, default=None)
         if newest is not None:
             yield newest
 
@@ -333,7 +333,7 @@ class Carrier:
         except UndecodableError:
             return ()
         transforms: Iterable[object] = getattr(message, "transforms", ())
-        return tuple({str(getattr(each, "child_frame_id", "")) for each in transforms})
+        return tuple({str(getattr(transform, "child_frame_id", "")) for transform in transforms})
 
     def _repeated(
         self, snapshot: Snapshot, topics: Iterable[str], to_delete: Collection[Path]
@@ -398,18 +398,18 @@ def _merged_origin(
     wanted: Latched, origins: Mapping[Latched, Origin | None], remaining: Collection[str]
 ) -> Origin | None:
     """Merges the origins of a message and its copies, of recordings that still have bags."""
-    own = origins[wanted]
-    if own is None:
+    origin_of_wanted = origins[wanted]
+    if origin_of_wanted is None:
         return None
     copies = [
         recording
-        for each, origin in origins.items()
-        if each.identity == wanted.identity and origin is not None
+        for message, origin in origins.items()
+        if message.identity == wanted.identity and origin is not None
         for recording in origin.recordings
         if recording in remaining
     ]
-    first, *others = own.recordings
-    return own._replace(recordings=(first, *sorted({*others, *copies} - {first})))
+    first, *others = origin_of_wanted.recordings
+    return origin_of_wanted._replace(recordings=(first, *sorted({*others, *copies} - {first})))
 
 
 def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:

@@ -232,14 +232,14 @@ def left_in(
 
 def open_files() -> frozenset[tuple[int, int]]:
     """Returns device and inode of every open file that /proc shows."""
-    found: set[tuple[int, int]] = set()
+    inodes: set[tuple[int, int]] = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError), os.scandir(process / "fd") as descriptors:
-            for each in descriptors:
+            for descriptor in descriptors:
                 with suppress(OSError):
-                    status = each.stat()
-                    found.add((status.st_dev, status.st_ino))
-    return frozenset(found)
+                    status = descriptor.stat()
+                    inodes.add((status.st_dev, status.st_ino))
+    return frozenset(inodes)
 
 
 def _status(path: Path) -> os.stat_result:

@@ -97,7 +97,7 @@ def needed_bags(
         open_files: when what is still being written may have been recorded; None if unknown.
         now: the present time.
     """
-    waits = now < window.stop or any(_may_overlap(each, window) for each in open_files)
+    waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
     ready = []
     for bag in bags:
         is_derived = is_carried(bag.file) or is_thinned(bag.file)
@@ -450,7 +450,7 @@ def _gone(name: str) -> str:
 
 def _of_number(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    by_number = {each.moment.request.number: each for each in stored.values()}
+    by_number = {moment.moment.request.number: moment for moment in stored.values()}
     return by_number.get(request.number)
 
 

@@ -208,10 +208,10 @@ class Cut:
         self, stretches: Sequence[Excluded], before: Sequence[Excluded], latched: Collection[str]
     ) -> None:
         self._latched = frozenset(latched)
-        self._all = united((each.start, each.stop) for each in stretches)
+        self._all = united((stretch.start, stretch.stop) for stretch in stretches)
         known = (*before, *stretches)
-        self._known = united((each.start, each.stop) for each in known)
-        self._held = united((each.start, each.stop) for each in known if each.held)
+        self._known = united((stretch.start, stretch.stop) for stretch in known)
+        self._held = united((stretch.start, stretch.stop) for stretch in known if stretch.held)
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
         """Returns whether a message is deleted."""
@@ -242,15 +242,17 @@ def add_excluded(
     """
     low, high = start - OUT_OF_ORDER_NS, end + OUT_OF_ORDER_NS + 1
     parts = [
-        Excluded(max(each.start, low), min(each.stop, high), each.held)
-        for each in stretches
-        if each.start <= end and start < each.stop
+        Excluded(max(stretch.start, low), min(stretch.stop, high), stretch.held)
+        for stretch in stretches
+        if stretch.start <= end and start < stretch.stop
     ]
     joined: list[Excluded] = []
     for held in (True, False):
-        spans = [(each.start, each.stop) for each in (*known, *parts) if each.held is held]
+        spans = [
+            (stretch.start, stretch.stop) for stretch in (*known, *parts) if stretch.held is held
+        ]
         joined += (Excluded(*span, held=held) for span in united(spans))
-    return sorted(joined, key=lambda each: (each.start, each.stop))
+    return sorted(joined, key=lambda stretch: (stretch.start, stretch.stop))
 
 
 def _published(log_time: Ns, publish_time: Ns) -> Ns:

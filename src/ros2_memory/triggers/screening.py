@@ -124,7 +124,7 @@ class Screening:
         self._extractor = extractor
         self._writer = writer
         self._split = ns_from_unix(split_duration_s)
-        self._margin = max((each.margin for each in rules), default=0)
+        self._margin = max((rule.margin for rule in rules), default=0)
         self._lock = threading.Lock()
         self._state: ScreenState | None = None
         self._problems: dict[str, str] = {}
@@ -155,7 +155,7 @@ class Screening:
             OSError: likewise.
         """
         with self._lock:
-            names = [name for name, each in self._loaded().recordings.items() if not each.done]
+            names = [name for name, screen in self._loaded().recordings.items() if not screen.done]
         written = frozenset(live)
         return lambda: self._step(names, written)
 
@@ -181,7 +181,7 @@ class Screening:
 
         Not those that decide: each recording needs their value.
         """
-        return self._excluded_latched.difference(each.topic for each in self._rules)
+        return self._excluded_latched.difference(rule.topic for rule in self._rules)
 
     def _step(self, names: Sequence[str], live: Collection[str]) -> None:
         """Reads closed files, and releases those that can be released.
@@ -241,7 +241,7 @@ class Screening:
         With it whether a useless rule left none of them unread.
         """
         paths = self._files(name)
-        present = {each.name for each in paths}
+        present = {path_.name for path_ in paths}
         screen.files = {file: step for file, step in screen.files.items() if file in present}
         found: list[tuple[Path, BagSummary]] = []
         for path in paths:
@@ -265,7 +265,7 @@ class Screening:
                 self._problems.pop(f"{name}/{path.name}", None)
             except _UselessRuleError as error:
                 waiting = paths[paths.index(path) :]
-                self._problems |= {f"{name}/{each.name}": str(error) for each in waiting}
+                self._problems |= {f"{name}/{path_.name}": str(error) for path_ in waiting}
                 self._retry_s[path] = now_s + RETRY_S
                 return found, False
             except BagError as error:
@@ -279,7 +279,7 @@ class Screening:
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
         try:
-            paths = [each for each in (self._bag_dir / name).iterdir() if bag_kind(each.name)]
+            paths = [path for path in (self._bag_dir / name).iterdir() if bag_kind(path.name)]
         except (FileNotFoundError, NotADirectoryError):
             return []
         return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
@@ -309,7 +309,7 @@ class Screening:
                 raise _UselessRuleError(refusal)
         screen.heard = known
         # Latched messages may be written again with the times that they had.
-        start = min((each.first for each in summary.topics if not each.latched), default=MAX_NS)
+        start = min((topic.first for topic in summary.topics if not topic.latched), default=MAX_NS)
         is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
         if is_back or summary.schema.set_back:
             screen.unclear.append((summary.start, summary.end + 1))
@@ -373,22 +373,22 @@ class Screening:
 
     def _stretches(self, state: ScreenState, live: Collection[str]) -> list[Excluded]:
         """Returns what is excluded of the time of recordings that are not done, or were last."""
-        found: list[Excluded] = []
+        stretches: list[Excluded] = []
         for rule in self._rules:
             recordings = [
                 RecordingConditions(
-                    each.start,
-                    None if name in live else each.end,
-                    each.heard.get(rule.name, ()),
-                    each.unclear,
+                    screen.start,
+                    None if name in live else screen.end,
+                    screen.heard.get(rule.name, ()),
+                    screen.unclear,
                     name,
                     read_handover(self._bag_dir / name).handover.previous,
                 )
-                for name, each in state.recordings.items()
-                if each.start is not None
+                for name, screen in state.recordings.items()
+                if screen.start is not None
             ]
-            found += excluded_intervals(rule, recordings)
-        return found
+            stretches += excluded_intervals(rule, recordings)
+        return stretches
 
     def _cut(
         self,
@@ -403,10 +403,12 @@ class Screening:
             EpisodicError: it cannot be rewritten.
             OSError: likewise, or it has gone.
         """
-        latched = {each.topic for each in summary.topics if each.latched}
+        latched = {topic.topic for topic in summary.topics if topic.latched}
         cut = Cut(stretches, before, latched)
         topics = {
-            each.topic for each in summary.topics if cut.touches(each.topic, each.first, each.last)
+            topic.topic
+            for topic in summary.topics
+            if cut.touches(topic.topic, topic.first, topic.last)
         }
         gone = Counter[str]()
         newest: dict[str, tuple[Ns, bool]] = {}
@@ -443,8 +445,8 @@ class Screening:
 
     def _end(self, name: str, state: ScreenState) -> None:
         """Marks an ended recording as done once nothing of it is held back."""
-        screen, files = state.recordings[name], [each.name for each in self._files(name)]
-        if any(screen.files.get(each) is not FileStep.RELEASED for each in files):
+        screen, files = state.recordings[name], [file.name for file in self._files(name)]
+        if any(screen.files.get(file) is not FileStep.RELEASED for file in files):
             return
         if state.excluded and (self._bag_dir / name / METADATA_FILE).exists():
             try:
@@ -487,9 +489,9 @@ class Screening:
         with self._lock:
             recordings = dict(self._loaded().recordings)
             recordings.update({name: deepcopy(state.recordings[name]) for name in names})
-            done = [name for name, each in recordings.items() if each.done]
-            telling = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
-            for name in {*done} - {*telling}:
+            done = [name for name, screen in recordings.items() if screen.done]
+            informative = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
+            for name in {*done} - {*informative}:
                 del recordings[name]
             self._write(recordings, list(state.excluded))
 

@@ -75,7 +75,7 @@ def chains_to_search(
     for name, bags in closed.items():
         start = searched.get(name, MIN_NS)
         window = TimeWindow(start, max(start, min(limits[name], ends[name] + 1)))
-        touched = tuple(each for each in bags if window.overlaps(each.start, each.end))
+        touched = tuple(bag for bag in bags if window.overlaps(bag.start, bag.end))
         if window.empty or not touched:
             continue
         part = SearchPart(name, window, touched)
@@ -235,11 +235,11 @@ class SplitSearch:
         return matches
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
-        known = self._watching.get(topic)
-        if known is None:
-            known = tuple(each for each in self._rules if each.selects([topic]))
-            self._watching[topic] = known
-        return known
+        rules = self._watching.get(topic)
+        if rules is None:
+            rules = tuple(rule for rule in self._rules if rule.selects([topic]))
+            self._watching[topic] = rules
+        return rules
 
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.
@@ -263,8 +263,8 @@ class SplitSearch:
             records = self._reader.records(bag.path, read, part.window) if read else ()
             yield from heapq.merge(
                 (
-                    _Event(each.log_time, each.channel.topic, part.recording, each)
-                    for each in records
+                    _Event(record.log_time, record.channel.topic, part.recording, record)
+                    for record in records
                 ),
                 (_Event(time, topic, part.recording, None) for time, topic in sorted(times)),
                 key=lambda event: event.time,
@@ -290,21 +290,21 @@ def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
     # so where the log clock is simulated.
     latest = event.time + SILENCE_NS
     is_dated = record.publish_time <= latest
-    others = [
-        each
-        for name, each in mark.published.items()
-        if name != event.recording and not (is_dated and each > latest)
+    published_elsewhere = [
+        published
+        for name, published in mark.published.items()
+        if name != event.recording and not (is_dated and published > latest)
     ]
     begun = mark.begun.setdefault(event.recording, event.time)
     if record.publish_time in {0, record.log_time}:
         is_repeat = event.recording not in mark.published and payload == mark.payload
     else:
         is_late = record.publish_time < record.log_time - SILENCE_NS
-        is_repeat = (bool(others) and record.publish_time <= max(others)) or (
-            is_late and event.time - begun < _BURST_NS
-        )
-    known = mark.published.pop(event.recording, record.publish_time)
-    mark.published[event.recording] = max(known, record.publish_time)
+        is_repeat = (
+            bool(published_elsewhere) and record.publish_time <= max(published_elsewhere)
+        ) or (is_late and event.time - begun < _BURST_NS)
+    latest_here = mark.published.pop(event.recording, record.publish_time)
+    mark.published[event.recording] = max(latest_here, record.publish_time)
     while len(mark.published) > _MARKED_RECORDINGS:
         oldest = next(iter(mark.published))
         del mark.published[oldest]

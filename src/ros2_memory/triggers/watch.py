@@ -84,7 +84,7 @@ class Triggers:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
-        self._rules = {each.name: each for each in rules}
+        self._rules = {rule.name: rule for rule in rules}
         self._search = search
         self._moments = moments
         self._own = own
@@ -159,7 +159,7 @@ class Triggers:
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: those not searched, and some time before."""
         state = self._loaded(snapshot)
-        before = max((each.before for each in self._rules.values()), default=0)
+        before = max((rule.before for rule in self._rules.values()), default=0)
         reached = next(reversed(state.searched.values()), None)
         since = MIN_NS if reached is None else reached - before
         return frozenset(
@@ -225,12 +225,18 @@ class Triggers:
 
         With them the recordings that are being written.
         """
-        active = (self._own.name_of(each.path.parent) for each in snapshot.active)
+        active = (self._own.name_of(aside.path.parent) for aside in snapshot.active)
         live = frozenset((*read_heartbeat(self._bag_dir).recordings, *active))
         names = [*self._own.names()]
-        at = {name: number for number, name in enumerate(names)}
-        known = [at[name] for name in (state.before, *state.searched) if name in at]
-        first = at[state.before] + 1 if state.before in at else min(known, default=0)
+        positions = {name: number for number, name in enumerate(names)}
+        known_positions = [
+            positions[name] for name in (state.before, *state.searched) if name in positions
+        ]
+        first = (
+            positions[state.before] + 1
+            if state.before in positions
+            else min(known_positions, default=0)
+        )
         folders = {str(self._bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
@@ -259,7 +265,7 @@ class Triggers:
             newest.matches += 1
             newest.stored = False
             return
-        record.begun = [each for each in record.begun if abs(firing.at - each) < HOUR_NS]
+        record.begun = [begun for begun in record.begun if abs(firing.at - begun) < HOUR_NS]
         if len(record.begun) >= rule.max_per_hour:
             reason = (
                 f"it fires more often than it may begin moments (max_per_hour: "
@@ -303,7 +309,7 @@ class Triggers:
                     record.moments += is_new
                     moment.known = True
             kept.append(moment)
-        record.newest = [each for each in kept[:-1] if not each.stored] + kept[-1:]
+        record.newest = [moment for moment in kept[:-1] if not moment.stored] + kept[-1:]
 
     def _refuse(self, name: str, record: RuleRecord, reason: str) -> None:
         record.refused += 1

@@ -199,13 +199,13 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
         raise RecorderError(str(error)) from error
     except BagError:
         return CutClock.PUBLISH
-    equal = bool(records) and all(each.publish_time in {0, each.log_time} for each in records)
+    equal = bool(records) and all(record.publish_time in {0, record.log_time} for record in records)
     return CutClock.LOG if equal else CutClock.PUBLISH
 
 
 def _unlatched(bag: Path, reader: BagReader) -> Iterator[Record]:
     """Yields messages of topics that are not latched: latched ones may be published long before."""
-    topics = [each.topic for each in reader.summarize(bag).topics if not each.latched]
+    topics = [topic.topic for topic in reader.summarize(bag).topics if not topic.latched]
     return reader.records(bag, topics, TimeWindow.everything())
 
 
@@ -246,7 +246,10 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     if after.compared is not False or after.previous != old.name:
         return True
     gate = read_gate(old.parent)
-    running = {*running, *(each.name for each in (old, new) if gate.holds_some(each.name))}
+    running = {
+        *running,
+        *(recording.name for recording in (old, new) if gate.holds_some(recording.name)),
+    }
     is_void = after.state is Counting.VOID
     if after.state is Counting.PENDING or (new if is_void else old).name in running:
         return False
@@ -386,7 +389,7 @@ def bags_of(
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
-    found: dict[str, BagSummary] = {}
+    summaries: dict[str, BagSummary] = {}
     gate = read_gate(recording.parent) if only_closed else OPEN_GATE
     for path in _bag_files(recording, reader):
         try:
@@ -400,8 +403,8 @@ def bags_of(
         except BagError:
             continue
         if not summary.empty:
-            found[path.name] = summary
-    return found
+            summaries[path.name] = summary
+    return summaries
 
 
 def _bag_files(recording: Path, reader: BagReader) -> list[Path]:

@@ -429,10 +429,12 @@ class MemoryDays:
             return None
 
     def _names_people(self, message: object, type_name: str) -> bool:
-        shown = self._extractor.exact(message, type_name)
+        extracted = self._extractor.exact(message, type_name)
         texts = [value for _, value in _fields(message) if isinstance(value, str)]
-        seen = [each.label for value in (shown, *texts) for each in detections_of(value)]
-        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), seen), *_labels(message)]))
+        labels = [
+            detection.label for value in (extracted, *texts) for detection in detections_of(value)
+        ]
+        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), labels), *_labels(message)]))
 
     def _is_hidden(self, field: str, text: str) -> bool:
         """Returns whether a text in such a field is of people.

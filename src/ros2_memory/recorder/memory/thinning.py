@@ -68,13 +68,15 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
     if isinstance(message, np.ndarray) and message.dtype.kind == "f":
         return _rounded(message, step_of(path, definition)).astype(message.dtype)
     if isinstance(message, list):
-        return [rounded(one, definition, path) for one in message]
+        return [rounded(field_, definition, path) for field_ in message]
     if not is_dataclass(message) or isinstance(message, type):
         return message
     values = {
-        one.name: rounded(getattr(message, one.name), definition, f"{path}.{one.name}".lstrip("."))
-        for one in fields(message)
-        if not one.name.startswith("__")
+        field_.name: rounded(
+            getattr(message, field_.name), definition, f"{path}.{field_.name}".lstrip(".")
+        )
+        for field_ in fields(message)
+        if not field_.name.startswith("__")
     }
     return replace(message, **values)
 
@@ -242,24 +244,34 @@ class TopicThinning:
 
     def _labels(self, table: Table) -> list[set[Name]]:
         """Returns the labels of the detections in each message, also in JSON, with their number."""
-        found = self.detections.of(table)
+        in_table = self.detections.of(table)
         labels: list[list[str]] = [[] for _ in range(len(table))]
-        if found is not None:
-            seen = found.detections
-            for row, label in zip(seen.rows.tolist(), seen.labels.values(), strict=True):
+        if in_table is not None:
+            detections = in_table.detections
+            for row, label in zip(
+                detections.rows.tolist(), detections.labels.values(), strict=True
+            ):
                 labels[row].append(label)
         for column in table.columns.values():
             if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
                 for row, text in enumerate(column.values()):
-                    labels[row] += [each.label for each in detections_of(text)]
+                    labels[row] += [detection.label for detection in detections_of(text)]
         return [
-            {(label, nth) for label, count in Counter(those).items() for nth in range(count)}
-            for those in labels
+            {
+                (label, repeat)
+                for label, count in Counter(of_message).items()
+                for repeat in range(count)
+            }
+            for of_message in labels
         ]
 
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
-        extremes = [one[1] for both in self._extremes.values() for one in both]
+        extremes = [
+            extreme[1]
+            for extremes_of_column in self._extremes.values()
+            for extreme in extremes_of_column
+        ]
         return np.unique(np.concatenate([*self._stays, np.array(extremes, np.int64)]))
 
     def _add_changes(
@@ -274,16 +286,16 @@ class TopicThinning:
         self._values[path] = values[-1], int(times[-1])
 
     def _add_extremes(self, path: str, numbers: Points, times: IntArray) -> None:
-        for part in np.unique(times // EXTREMES_NS).tolist():
-            inside = np.flatnonzero((times // EXTREMES_NS == part) & np.isfinite(numbers))
-            if not inside.size:
+        for slot in np.unique(times // EXTREMES_NS).tolist():
+            rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
+            if not rows.size:
                 continue
-            found = [(float(numbers[nth]), int(times[nth])) for nth in inside.tolist()]
-            least, greatest = min(found), max(found, key=itemgetter(0))
-            before = self._extremes.get((path, part), (least, greatest))
+            samples = [(float(numbers[row]), int(times[row])) for row in rows.tolist()]
+            least, greatest = min(samples), max(samples, key=itemgetter(0))
+            known = self._extremes.get((path, slot), (least, greatest))
             # Of equal ones the earliest.
-            most = max(before[1], greatest, key=itemgetter(0))
-            self._extremes[path, part] = min(before[0], least), most
+            most = max(known[1], greatest, key=itemgetter(0))
+            self._extremes[path, slot] = min(known[0], least), most
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
@@ -356,7 +368,7 @@ def _is_discrete(column: Column) -> TypeGuard[Numbers]:
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
     """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
-    found: dict[str, Points] = {}
+    poses: dict[str, Points] = {}
     for path in columns:
         around, _, name = path.removesuffix(".x").rpartition(".")
         if not path.endswith(".x") or name not in _POINTS:
@@ -364,21 +376,24 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
         turn = _TURNS[_POINTS.index(name)]
         names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
         names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
-        found |= _stacked(path[:-2], [columns[each] for each in names if each in columns])
+        poses |= _stacked(
+            path[:-2],
+            [columns[name_of_column] for name_of_column in names if name_of_column in columns],
+        )
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
-        found |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
+        poses |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
     if {"latitude", "longitude"} <= columns.keys():
         degrees = _stacked("latitude", [columns["latitude"], columns["longitude"]])
-        found |= {path: points * _DEGREE_M for path, points in degrees.items()}
-    return found
+        poses |= {path: points * _DEGREE_M for path, points in degrees.items()}
+    return poses
 
 
 def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
     """Returns columns of numbers as rows, by a path; nothing where one is of texts."""
-    numbers = [one for one in columns if not isinstance(one, Texts)]
+    numbers = [column for column in columns if not isinstance(column, Texts)]
     if len(numbers) < len(columns):
         return {}
-    return {path: np.stack([np.asarray(one, np.float64) for one in numbers], axis=1)}
+    return {path: np.stack([np.asarray(column, np.float64) for column in numbers], axis=1)}
 
 
 _MOST_PAUSES: Final = 32
