@@ -12,6 +12,7 @@ import posixpath
 import re
 from collections import Counter
 from contextlib import suppress
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import yaml
@@ -65,7 +66,7 @@ class Listing(NamedTuple):
 def parse_listing(text: str) -> Listing:
     """Returns what a metadata.yaml lists; nothing if it is not one."""
     names: list[str] = []
-    totals: list[tuple[int, int]] = []
+    totals: list[tuple[int, int | None]] = []
     messages: dict[str, int] = {}
     path: str | None = None
     count: int | None = None
@@ -80,20 +81,20 @@ def parse_listing(text: str) -> Listing:
             path = count = None
             key = key[2:].lstrip(" ")
         if key.startswith("path:"):
-            found = _PATH_KEY.match(key)
-            path = found[1] if found and path is None else path
-        elif key.startswith("message_count:"):
-            found = _COUNT_KEY.match(key)
-            if found:
-                count = int(found[1]) if count is None else count
-                if not is_item:  # indented least: that of the whole recording
-                    totals.append((len(line) - len(key), int(found[1])))
+            path_key = _PATH_KEY.match(key)
+            path = path_key[1] if path_key and path is None else path
+        elif key.startswith("message_count:") and (count_key := _COUNT_KEY.match(key)):
+            number = int(count_key[1])
+            count = number if count is None else count
+            if not is_item:
+                totals.append((len(line) - len(key), number))
         if "." in line:
-            found = _BAG_NAME.match(line)
-            if found and bag_kind(found[1]):
-                names.append(posixpath.basename(found[1]))
-    total = min(totals, key=lambda each: each[0], default=None)
-    return Listing(tuple(names), messages, None if total is None else total[1])
+            bag_name = _BAG_NAME.match(line)
+            if bag_name and bag_kind(bag_name[1]):
+                names.append(posixpath.basename(bag_name[1]))
+    # That of the whole recording is indented least.
+    _, total = min(totals, key=itemgetter(0), default=(0, None))
+    return Listing(tuple(names), messages, total)
 
 
 def read_listing(path: Path | str, directory: int | None = None) -> Listing:
@@ -170,17 +171,29 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     Raises:
         ValueError: the old one is no metadata.yaml of a known form.
     """
-    channels = [channel for each in files.values() for channel in each.channels]
+    channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
     info = _information(content)
     kind = _STORAGES.get(str(info.get("storage_identifier")))
     if info.get("compression_mode") == "FILE" or any(bag_kind(name) != kind for name in files):
-        found = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
-        raise ValueError(f"it is not of plain {' and '.join(found)} files")
+        kinds = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
+        raise ValueError(f"it is not of plain {' and '.join(kinds)} files")
     version = integer(info, "version")
     if version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which lists no messages of files")
-    paths = {bare_name(each): str(each) for each in _list(info, "relative_file_paths")}
+    counts = Counter[tuple[str, str]]()
+    for summary, _ in files.values():
+        for topic in summary.topics:
+            counts[topic.topic, topic.type] += topic.count
+    info["message_count"] = counts.total()
+    _describe_files(info, files)
+    _describe_topics(info, channels, counts, version)
+    return _dumped(content)
+
+
+def _describe_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
+    """Sets times, paths and the description of each file, in order of time."""
+    paths = {bare_name(path): str(path) for path in _list(info, "relative_file_paths")}
     spans = {
         name: (summary.start, summary.end)
         for name, (summary, _) in files.items()
@@ -189,11 +202,6 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     first = min((start for start, _ in spans.values()), default=0)
     last = max((end for _, end in spans.values()), default=first)
     order = sorted(files, key=lambda name: (spans.get(name, (last, last)), name))
-    counts = Counter[tuple[str, str]]()
-    for summary, _ in files.values():
-        for topic in summary.topics:
-            counts[topic.topic, topic.type] += topic.count
-    info["message_count"] = counts.total()
     info.update(_span(first, last))
     info["relative_file_paths"] = [paths.get(name, name) for name in order]
     info["files"] = [
@@ -204,13 +212,22 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
         }
         for name in order
     ]
+
+
+def _describe_topics(
+    info: dict[object, object],
+    channels: Sequence[Channel],
+    counts: Counter[tuple[str, str]],
+    version: int,
+) -> None:
+    """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
     topics = _mappings(info, "topics_with_message_count")
     listed = set()
-    for each in topics:
-        topic_metadata = _described(each)
+    for topic in topics:
+        topic_metadata = _described(topic)
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
-        each["message_count"] = counts[key]
+        topic["message_count"] = counts[key]
         offered = [_offered(channel, version) for channel in channels if _key(channel) == key]
         # rosbags returns no message of a channel whose profiles differ from these.
         if offered and topic_metadata.get("offered_qos_profiles") not in offered:
@@ -222,7 +239,6 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
             new = _topic_metadata(channel, version)
             topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
-    return _dumped(content)
 
 
 def _new_information(channels: Sequence[Channel]) -> dict[str, object]:

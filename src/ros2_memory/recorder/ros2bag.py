@@ -181,7 +181,7 @@ class Ros2BagRecorder(Recorder):
                 f"{error.filename} cannot be written: {error.strerror}; the recorder must be able "
                 "to write into recording.bag_dir"
             ) from error
-        _prune(self._bag_dir / ROS_LOG_DIR)
+        _delete_old_logs(self._bag_dir / ROS_LOG_DIR)
         argv = record_argv(
             ros2=self._ros.ros2,
             directory=directory,
@@ -201,7 +201,7 @@ class Ros2BagRecorder(Recorder):
         return Child.start(argv, self._ros.env, keep_open=self._keep_open)
 
 
-def _prune(log_dir: Path) -> None:
+def _delete_old_logs(log_dir: Path) -> None:
     """Deletes all but the newest logs of `ros2`, whose lines the event log has as well."""
     with suppress(OSError):
         if log_dir.is_symlink():

@@ -29,6 +29,7 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from itertools import accumulate, pairwise
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
@@ -114,6 +115,11 @@ class Latched(NamedTuple):
     log_time: Ns
     identity: MessageIdentity
     subjects: tuple[tuple[str, str], ...]
+
+    @property
+    def copy(self) -> tuple[Ns, MessageIdentity]:
+        """What shows which copy of the message it is."""
+        return self.log_time, self.identity
 
 
 def latched_message(record: Record, frames: Collection[str]) -> Latched:
@@ -226,17 +232,17 @@ class Carrier:
             for record in self._records(self.path, topics)
         }
         origins = dict(carried)
-        remaining = {self._folder(each) for each in {bag.recording for bag in kept}}
+        remaining = {self._folder(recording) for recording in {bag.recording for bag in kept}}
         for bag in with_messages:
-            origins.update(self._read(snapshot, bag, topics))
+            origins.update(self._latched_in(snapshot, bag, topics))
         wanted = worth_carrying(
             origins, _recorded_in(kept), self._repeated(snapshot, topics, to_delete)
         )
-        chosen = {each[:2]: _merged_origin(each, origins, remaining) for each in wanted}
-        if chosen == {each[:2]: origin for each, origin in carried.items()}:
+        chosen = {message.copy: _merged_origin(message, origins, remaining) for message in wanted}
+        if chosen == {message.copy: origin for message, origin in carried.items()}:
             return None
         sources = [self.path, *(bag.path for bag in with_messages)]
-        fetched = sorted(self._fetched(sources, topics, chosen), key=lambda each: each.log_time)
+        fetched = sorted(self._fetch(sources, topics, chosen), key=attrgetter("log_time"))
         if len(fetched) < len(chosen):
             raise BagError(str(self.path), "a latched message could not be read a second time")
         self._write(fetched)
@@ -250,7 +256,7 @@ class Carrier:
             if topic in self._static_topics or snapshot.timeline.is_transient_state(topic)
         )
 
-    def _read(
+    def _latched_in(
         self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
     ) -> Iterator[tuple[Latched, Origin]]:
         """Yields the messages of these topics; of a damaged bag, those that can be read.
@@ -308,7 +314,7 @@ class Carrier:
             else:
                 _log.warning("latched_not_read", path=str(path), reason=record.reason)
 
-    def _fetched(
+    def _fetch(
         self,
         sources: Iterable[Path],
         topics: Collection[str],
@@ -343,7 +349,7 @@ class Carrier:
         They come first in a recording, when its recorder has just subscribed.
         """
         repeated: dict[MessageIdentity, Ns] = {}
-        found: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
+        late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
         for topic in topics:
             seen: set[Path] = set()
             for bag in snapshot.bags:
@@ -354,10 +360,10 @@ class Carrier:
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
                 known = self._late.get(key)
-                found[key] = self._late_in(bag.path, topic) if known is None else known
-                for identity, logged in found[key].items():
+                late[key] = self._late_in(bag.path, topic) if known is None else known
+                for identity, logged in late[key].items():
                     repeated[identity] = min(logged, repeated.get(identity, logged))
-        self._late = found
+        self._late = late
         return repeated
 
     def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:

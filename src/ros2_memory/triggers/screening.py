@@ -157,7 +157,7 @@ class Screening:
         with self._lock:
             names = [name for name, screen in self._loaded().recordings.items() if not screen.done]
         written = frozenset(live)
-        return lambda: self._step(names, written)
+        return lambda: self._run_step(names, written)
 
     def failing_rules(self) -> tuple[str, ...]:
         """Describes each rule that cannot be evaluated at present, and why."""
@@ -165,12 +165,12 @@ class Screening:
 
     def problem(self) -> str | None:
         """Describes the splits that a fault or a useless rule holds back, or None."""
-        known = [*self._problems.items()]
-        if not known:
+        problems = [*self._problems.items()]
+        if not problems:
             refused = "; ".join(self.failing_rules())
             return f"recording.exclude_when does not work: {refused}" if refused else None
-        name, reason = known[-1]
-        held = counted(len(known), "split is", "splits are")
+        name, reason = problems[-1]
+        held = counted(len(problems), "split is", "splits are")
         return (
             f"{held} not served, because recording.exclude_when could not be applied: "
             f"{name}: {reason}"
@@ -183,7 +183,7 @@ class Screening:
         """
         return self._excluded_latched.difference(rule.topic for rule in self._rules)
 
-    def _step(self, names: Sequence[str], live: Collection[str]) -> None:
+    def _run_step(self, names: Sequence[str], live: Collection[str]) -> None:
         """Reads closed files, and releases those that can be released.
 
         Raises:
@@ -194,13 +194,7 @@ class Screening:
         with self._lock:
             before = self._loaded()
             state = deepcopy(before)
-        closed: dict[str, list[tuple[Path, BagSummary]]] = {}
-        is_held = False
-        for name in names:
-            files, is_whole = self._read(name, state.recordings[name], live)
-            is_held |= not is_whole
-            # What a condition was in a recording that is held back may matter to later ones.
-            closed[name] = [] if is_held else files
+        closed = self._read_closed(names, state, live)
         self._problems = {
             name: reason
             for name, reason in self._problems.items()
@@ -216,24 +210,43 @@ class Screening:
         stretches = self._stretches(state, live) if ready else []
         for path, summary in ready[:MOST_AT_ONCE]:
             try:
-                self._cut(path, summary, stretches, state.excluded)
+                self._cut_split(path, summary, stretches, state.excluded)
             except (EpisodicError, OSError) as error:
                 self._report(path, error)
                 self._retry_s[path] = now_s + RETRY_S
-                continue
-            state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
-            if not summary.empty:
-                state.excluded = add_excluded(
-                    state.excluded, stretches, summary.start, summary.end
-                )[-MOST_EXCLUDED:]
-            self._problems.pop(f"{path.parent.name}/{path.name}", None)
-            self._retry_s.pop(path, None)
+            else:
+                self._release(path, summary, stretches, state)
         for name in names:
             if name not in live:
-                self._end(name, state)
+                self._finish_recording(name, state)
         self._commit(before, state, names)
 
-    def _read(
+    def _read_closed(
+        self, names: Sequence[str], state: ScreenState, live: Collection[str]
+    ) -> dict[str, list[tuple[Path, BagSummary]]]:
+        """Reads new closed files of recordings; returns those not released yet, by recording."""
+        closed: dict[str, list[tuple[Path, BagSummary]]] = {}
+        is_held = False
+        for name in names:
+            files, is_whole = self._read_recording(name, state.recordings[name], live)
+            is_held |= not is_whole
+            # What a condition was in a recording that is held back may matter to later ones.
+            closed[name] = [] if is_held else files
+        return closed
+
+    def _release(
+        self, path: Path, summary: BagSummary, stretches: Sequence[Excluded], state: ScreenState
+    ) -> None:
+        """Notes in the state that a split is released, and what of its time was excluded."""
+        recording = path.parent.name
+        state.recordings[recording].files[path.name] = FileStep.RELEASED
+        if not summary.empty:
+            excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
+            state.excluded = excluded[-MOST_EXCLUDED:]
+        self._problems.pop(f"{recording}/{path.name}", None)
+        self._retry_s.pop(path, None)
+
+    def _read_recording(
         self, name: str, screen: RecordingScreen, live: Collection[str]
     ) -> tuple[list[tuple[Path, BagSummary]], bool]:
         """Reads the closed files of a recording that were not; returns those not released yet.
@@ -241,16 +254,16 @@ class Screening:
         With it whether a useless rule left none of them unread.
         """
         paths = self._files(name)
-        present = {path_.name for path_ in paths}
+        present = {path.name for path in paths}
         screen.files = {file: step for file, step in screen.files.items() if file in present}
-        found: list[tuple[Path, BagSummary]] = []
+        unreleased: list[tuple[Path, BagSummary]] = []
         for path in paths:
             step = screen.files.get(path.name)
             if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
                 continue
             now_s = self._monotonic()
             if step is None and self._retry_s.get(path, now_s) > now_s:
-                return found, False
+                return unreleased, False
             try:
                 if step is None and self._reader.closing(path) is not Closing.CLOSED:
                     if name in live:
@@ -259,22 +272,22 @@ class Screening:
                     continue
                 summary = self._reader.summarize(path)
                 if step is None:
-                    self._hear(path, summary, screen)
-                found.append((path, summary))
+                    self._add_conditions(path, summary, screen)
+                unreleased.append((path, summary))
                 screen.files[path.name] = FileStep.READ
                 self._problems.pop(f"{name}/{path.name}", None)
             except _UselessRuleError as error:
                 waiting = paths[paths.index(path) :]
-                self._problems |= {f"{name}/{path_.name}": str(error) for path_ in waiting}
+                self._problems |= {f"{name}/{left.name}": str(error) for left in waiting}
                 self._retry_s[path] = now_s + RETRY_S
-                return found, False
+                return unreleased, False
             except BagError as error:
                 if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
                     raise
                 _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
                 self._report(path, error)
-        return found, True
+        return unreleased, True
 
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
@@ -284,7 +297,7 @@ class Screening:
             return []
         return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
 
-    def _hear(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
+    def _add_conditions(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
         """Adds what a file shows to the state.
 
         Raises:
@@ -296,9 +309,9 @@ class Screening:
             raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return
-        known = deepcopy(screen.heard)
+        heard_by_rule = deepcopy(screen.heard)
         for rule in self._rules:
-            heard = known.setdefault(rule.name, [])
+            heard = heard_by_rule.setdefault(rule.name, [])
             refusal: str | None = None
             for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
                 holds, refused = self._test(rule, record)
@@ -307,11 +320,11 @@ class Screening:
                 add_message(heard, record.log_time, holds, latched=latched, stale=rule.stale)
             if refusal and rule.excludes_unknown and rule.name not in self._evaluated:
                 raise _UselessRuleError(refusal)
-        screen.heard = known
+        screen.heard = heard_by_rule
         # Latched messages may be written again with the times that they had.
         start = min((topic.first for topic in summary.topics if not topic.latched), default=MAX_NS)
-        is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
-        if is_back or summary.schema.set_back:
+        was_set_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
+        if was_set_back or summary.schema.set_back:
             screen.unclear.append((summary.start, summary.end + 1))
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
         screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
@@ -323,8 +336,8 @@ class Screening:
         """
         type_name, condition = record.channel.type, rule.condition
         if condition.field is not None:
-            own = self._extractor.own_path(condition.field, type_name)
-            condition = replace(condition, field=own)
+            path = self._extractor.own_path(condition.field, type_name)
+            condition = replace(condition, field=path)
         try:
             value = self._extractor.exact(self._reader.decode(record), type_name)
         except UndecodableError as error:
@@ -390,7 +403,7 @@ class Screening:
             stretches += excluded_intervals(rule, recordings)
         return stretches
 
-    def _cut(
+    def _cut_split(
         self,
         path: Path,
         summary: BagSummary,
@@ -411,39 +424,43 @@ class Screening:
             if cut.touches(topic.topic, topic.first, topic.last)
         }
         gone = Counter[str]()
-        newest: dict[str, tuple[Ns, bool]] = {}
-        for each in self._reader.records(path, sorted(topics), TimeWindow.everything()):
-            topic, published = each.channel.topic, each.publish_time
-            if cut.takes(topic, each.log_time, published):
+        newest: dict[str, tuple[Ns, bool]] = {}  # when it was published, and if it is excluded
+        for record in self._reader.records(path, sorted(topics), TimeWindow.everything()):
+            topic, logged, published = record.channel.topic, record.log_time, record.publish_time
+            if cut.takes(topic, logged, published):
                 gone[topic] += 1
             if topic in latched:
-                shown = (published or each.log_time, cut.takes_always(each.log_time, published))
-                newest[topic] = max(shown, newest.get(topic, shown))
-        if gone and split_number(path.parent.name, path.name) is None:
-            raise BagError(str(path), "it is not named as a split of its recording")
+                latched_record = (published or logged, cut.takes_always(logged, published))
+                newest[topic] = max(latched_record, newest.get(topic, latched_record))
         if gone:
-            with path.open("rb") as old:
-                left = left_in(path.parent, self._reader, {path: gone})
-                with rewritten(
-                    self._bag_dir,
-                    path,
-                    os.fstat(old.fileno()),
-                    self._writer,
-                    takes=cut.takes,
-                    expected=gone,
-                    left_of=left,
-                ):
-                    pass
-            _log.info(
-                "messages_excluded",
-                recording=path.parent.name,
-                file=path.name,
-                messages=gone.total(),
-            )
+            self._rewrite_without(path, gone, cut)
         returning = {topic for topic, (_, is_excluded) in newest.items() if is_excluded}
         self._excluded_latched = (self._excluded_latched - newest.keys()) | returning
 
-    def _end(self, name: str, state: ScreenState) -> None:
+    def _rewrite_without(self, path: Path, gone: Counter[str], cut: Cut) -> None:
+        """Rewrites a split without so many messages of each topic; raises as `_cut_split` does."""
+        if split_number(path.parent.name, path.name) is None:
+            raise BagError(str(path), "it is not named as a split of its recording")
+        with path.open("rb") as old:
+            left = left_in(path.parent, self._reader, {path: gone})
+            with rewritten(
+                self._bag_dir,
+                path,
+                os.fstat(old.fileno()),
+                self._writer,
+                takes=cut.takes,
+                expected=gone,
+                left_of=left,
+            ):
+                pass
+        _log.info(
+            "messages_excluded",
+            recording=path.parent.name,
+            file=path.name,
+            messages=gone.total(),
+        )
+
+    def _finish_recording(self, name: str, state: ScreenState) -> None:
         """Marks an ended recording as done once nothing of it is held back."""
         screen, files = state.recordings[name], [file.name for file in self._files(name)]
         if any(screen.files.get(file) is not FileStep.RELEASED for file in files):
@@ -515,5 +532,6 @@ def _doubt(screen: RecordingScreen) -> None:
     """Notes a file that cannot be read: the state of the conditions after it is unknown, too."""
     for heard in screen.heard.values():
         if heard and not heard[-1].holds:
-            at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
-            heard.append(ConditionInterval(at, at, None))
+            last = heard[-1].last
+            begun = max(last, (screen.end or last) + 1)
+            heard.append(ConditionInterval(begun, begun, None))

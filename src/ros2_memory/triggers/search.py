@@ -98,11 +98,15 @@ def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns
         split_ns: how long one bag is.
     """
     begun = {name: named_start(name) if end is None else end for name, end in live.items()}
-    known = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
+    reached = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
     near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
     return {
         name: min(
-            (until for other, until in known.items() if other == name or abs(until - end) <= near),
+            (
+                until
+                for other, until in reached.items()
+                if other == name or abs(until - end) <= near
+            ),
             default=MAX_NS,
         )
         for name, end in ends.items()
@@ -181,14 +185,14 @@ class SplitSearch:
                 stopped = event.time
                 break
             previous = event.time
-            fired += self._take(event, state)
+            fired += self._firings_at(event, state)
         until = max(part.window.stop for part in chain.parts)
-        known = until if stopped is None else min(stopped, until)
+        searched = until if stopped is None else min(stopped, until)
         for rule in self._rules:
-            fired += rule.reach(state.rules[rule.name].runs, known)
+            fired += rule.reach(state.rules[rule.name].runs, searched)
         return fired, stopped
 
-    def _take(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
+    def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
         record, rules = event.record, self._rules_of(event.topic)
         latched = record is not None and record.channel.latched
         if record is not None and latched:
@@ -222,24 +226,23 @@ class SplitSearch:
 
         Notes why messages cannot make the rule fire; whether any could, once for each topic.
         """
-        known = state.rules[rule.name]
+        record = state.rules[rule.name]
         if isinstance(value, UndecodableError):
-            known.problem = f"not all could be searched: {value}"
+            record.problem = f"not all could be searched: {value}"
             return None
         matches = condition.matches(value)
         if (rule.name, topic) not in self._tested:
             self._tested.add((rule.name, topic))
             if not matches and condition.can_be_refused:
                 refusal = refusal_for(condition, value)
-                known.problem = None if refusal is None else f"{topic}: {refusal}"
+                record.problem = None if refusal is None else f"{topic}: {refusal}"
         return matches
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
-        rules = self._watching.get(topic)
-        if rules is None:
-            rules = tuple(rule for rule in self._rules if rule.selects([topic]))
-            self._watching[topic] = rules
-        return rules
+        if topic not in self._watching:
+            rules = (rule for rule in self._rules if rule.selects([topic]))
+            self._watching[topic] = tuple(rules)
+        return self._watching[topic]
 
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.

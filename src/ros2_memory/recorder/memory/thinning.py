@@ -68,15 +68,15 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
     if isinstance(message, np.ndarray) and message.dtype.kind == "f":
         return _rounded(message, step_of(path, definition)).astype(message.dtype)
     if isinstance(message, list):
-        return [rounded(field_, definition, path) for field_ in message]
+        return [rounded(member, definition, path) for member in message]
     if not is_dataclass(message) or isinstance(message, type):
         return message
     values = {
-        field_.name: rounded(
-            getattr(message, field_.name), definition, f"{path}.{field_.name}".lstrip(".")
+        member.name: rounded(
+            getattr(message, member.name), definition, f"{path}.{member.name}".lstrip(".")
         )
-        for field_ in fields(message)
-        if not field_.name.startswith("__")
+        for member in fields(message)
+        if not member.name.startswith("__")
     }
     return replace(message, **values)
 
@@ -313,10 +313,10 @@ class TopicThinning:
             return
         rows: list[tuple[object, ...]] = [()] * times.size
         for owner, *values in zip(
-            inner.owners.tolist(), *(c.tolist() for c in states), strict=True
+            inner.owners.tolist(), *(column.tolist() for column in states), strict=True
         ):
             rows[owner] = (*rows[owner], *values)
-        codes = {value: nth for nth, value in enumerate(dict.fromkeys(rows))}
+        codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
         self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
 
     def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
@@ -327,9 +327,9 @@ class TopicThinning:
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
             named[row].add((frame, 0))
         for code, frame in enumerate(column.words):
-            own = np.flatnonzero(column.codes == code)
-            poses = {key: rows[own] for key, rows in _poses(inner.columns).items()}
-            self._add_moves(frame, times[inner.owners[own]], poses)
+            rows = np.flatnonzero(column.codes == code)
+            poses = {path: points[rows] for path, points in _poses(inner.columns).items()}
+            self._add_moves(frame, times[inner.owners[rows]], poses)
 
 
 def is_sampled(table: Table) -> bool:
@@ -406,23 +406,29 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
     def is_in(at: Ns) -> bool:
         return any(bag.start <= at <= bag.end for bag in bags)
 
-    silences = {each[:2]: each for each in known.silences}
-    silences |= {each[:2]: (*each,) for each in snapshot.silences if is_in(each.start)}
+    topic_and_start = itemgetter(0, 1)
+    silences = {topic_and_start(silence): silence for silence in known.silences}
+    silences |= {
+        (silence.topic, silence.start): (*silence,)
+        for silence in snapshot.silences
+        if is_in(silence.start)
+    }
     steps = [
         (fault.bag.start, fault.by)
         for fault in snapshot.dating.faults
-        if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
+        if fault.kind is FaultyClock.SET_BACK
+        if fault.by >= SHORTEST_STEP_NS and is_in(fault.bag.start)
     ]
-    pauses = [(pause.start, pause.end) for pause in snapshot.suspects]
+    pauses = [(pause.start, pause.end) for pause in snapshot.suspects if is_in(pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
     since = bags[0].start if known.since is None else known.since
     if since > snapshot.scanned_at:  # by a clock that was ahead
         since = min(since, bags[0].start)
     return Thinned(
         since,
-        tuple(sorted(silences.values(), key=lambda each: each[1])),
-        (*_few_a_day([*known.pauses, *(pause for pause in pauses if is_in(pause[0]))]),),
-        tuple(sorted({*known.set_back, *(step for step in steps if is_in(step[0]))})),
+        tuple(sorted(silences.values(), key=itemgetter(1))),
+        (*_few_a_day([*known.pauses, *pauses]),),
+        tuple(sorted({*known.set_back, *steps})),
         tuple(sorted({*known.left_open, *left_open})),
     )
 
@@ -430,11 +436,11 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
 def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
     """Yields pauses in order of time, each once: the first `_MOST_PAUSES` of a day."""
     counts = Counter[str]()
-    for pause in sorted(dict.fromkeys(pauses)):
-        day = utc_day(pause[0])
+    for start, end in sorted({*pauses}):
+        day = utc_day(start)
         counts[day] += 1
         if counts[day] <= _MOST_PAUSES:
-            yield pause
+            yield start, end
 
 
 def beside(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:

@@ -206,24 +206,31 @@ class LossCounter:
         return losses
 
 
-def reader_of(schema: Schema) -> tuple[Kind, Callable[[bytes], int]] | None:
-    """Returns what shows holes in messages of this type; None where nothing does.
+class ValueReader(NamedTuple):
+    """What shows holes in messages of a type: a counter, or stamps (ns).
 
-    The returned function takes a payload, and raises `struct.error` for one that does not fit.
+    `value_of` takes a payload, and raises `struct.error` for one that does not fit.
     """
+
+    kind: Kind
+    value_of: Callable[[bytes], int]
+
+
+def reader_of(schema: Schema) -> ValueReader | None:
+    """Returns what shows holes in messages of this type; None where nothing does."""
     if schema.encoding != "ros2msg":
         return None
     fields = _fields(schema.text.decode(errors="replace"))
     before: list[str] = []
     for kind, name in fields:
         if name in _COUNTERS and kind in _UNSIGNED:
-            return "counter", partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+            value_of = partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+            return ValueReader("counter", value_of)
         if kind not in {"string", *_SIZES, *_HEADERS, *_TIMES}:
             break
         before.append(kind)
-    if fields and fields[0][0] in _HEADERS:
-        return "stamps", _stamp
-    return None
+    first_type, _ = fields[0] if fields else ("", "")
+    return ValueReader("stamps", _stamp) if first_type in _HEADERS else None
 
 
 def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
@@ -446,12 +453,12 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         OSError: it is not there.
     """
     offers: dict[str, list[str]] = {}
-    readers: dict[str, tuple[Kind, Callable[[bytes], int]]] = {}
+    readers: dict[str, ValueReader] = {}
     for channel in reader.channels(path):
         texts = offers.setdefault(channel.topic, [])
         texts += [text for name, text in channel.metadata if name == "offered_qos_profiles"]
-        if found := reader_of(channel.schema):
-            readers[channel.topic] = found
+        if value_reader := reader_of(channel.schema):
+            readers[channel.topic] = value_reader
     window = TimeWindow.everything()
     is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
     if not is_whole and not (summary := reader.summarize(path)).empty:
@@ -468,7 +475,7 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         arrivals[topic] = arrivals[topic].joined(arrival) if topic in arrivals else arrival
         if topic in readers:
             try:
-                position = Position(readers[topic][1](record.payload), logged)
+                position = Position(readers[topic].value_of(record.payload), logged)
             except struct.error:
                 del readers[topic]
             else:
@@ -479,8 +486,8 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         if (offered := offered_by_all(offers[topic])) is not None
     }
     progress = {
-        topic: Progress(readers[topic][0], found)
-        for topic, found in positions.items()
+        topic: Progress(readers[topic].kind, of_topic)
+        for topic, of_topic in positions.items()
         if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
     return SplitMeasure(flows, progress, arrivals)

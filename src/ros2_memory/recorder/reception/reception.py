@@ -70,7 +70,7 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     # One message of each, and shares of what is then left.
     left, topics = queue_bytes - sum(flow.message_bytes for flow in flows.values()), len(wanted)
-    for topic in sorted(wanted, key=lambda flow: wanted[flow] * flows[flow].message_bytes):
+    for topic in sorted(wanted, key=lambda name: wanted[name] * flows[name].message_bytes):
         size = flows[topic].message_bytes
         more = min(wanted[topic] - 1, max(0, left) // topics // size)
         depths[topic] = 1 + more
@@ -204,12 +204,12 @@ class Reception:
     def cut_short(self) -> frozenset[str]:
         """The topics whose queues hold less than two seconds, for want of memory."""
         with self._lock:
-            return self._plan().cut_short
+            return self._plan_queues().cut_short
 
     def overrides(self, recording: str) -> str:
         """Returns the QoS overrides for a recording that is about to start."""
         with self._lock:
-            plan = self._plan()
+            plan = self._plan_queues()
             self._recordings[recording] = _Recording(plan)
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
@@ -245,16 +245,17 @@ class Reception:
 
     def flush(self) -> None:
         """Counts what no further split can fill; called when nothing is recorded any more."""
-        self._background.add(_TASK, lambda: self._count(self._losses.flush))
+        self._background.add(_TASK, lambda: self._report_losses(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
 
         def reported() -> list[Loss]:
-            known = self._recordings.get(recording)
-            return self._losses.reported(topic, *((0, 0) if known is None else known.span), count)
+            state = self._recordings.get(recording)
+            start, stop = (0, 0) if state is None else state.span
+            return self._losses.reported(topic, start, stop, count)
 
-        self._background.add(_TASK, lambda: self._count(reported))
+        self._background.add(_TASK, lambda: self._report_losses(reported))
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are known to be missing of the last hour."""
@@ -266,7 +267,7 @@ class Reception:
         with self._lock:
             return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
 
-    def _count(self, take: Callable[[], list[Loss]]) -> None:
+    def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
             losses = take()
         by_topic: dict[str, int] = {}
@@ -321,7 +322,7 @@ class Reception:
                 return Rotation("asking_again", sentence, refused, is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
                 return None
-            active, planned = state.plan, self._plan()
+            active, planned = state.plan, self._plan_queues()
             shallow = frozenset(
                 topic
                 for topic, flow in self._planned_for().items()
@@ -348,7 +349,7 @@ class Reception:
             if not (topic in self._latched and flow.offered.latched)
         }
 
-    def _plan(self) -> QueuePlan:
+    def _plan_queues(self) -> QueuePlan:
         return plan_queues(self._planned_for(), self._queue_bytes)
 
     def _measure(self, recording: str, path: Path) -> None:
@@ -361,22 +362,23 @@ class Reception:
                 self._losses.unclear()
             return
         with self._lock:
-            before = self._plan().cut_short
+            before = self._plan_queues().cut_short
             state = self._recordings.get(recording)
             for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
                 if state is None or topic not in state.refused:
-                    before_flow = self._flows.get(topic)
-                    self._flows[topic] = flow if before_flow is None else before_flow.joined(flow)
+                    old_flow = self._flows.get(topic)
+                    self._flows[topic] = flow if old_flow is None else old_flow.joined(flow)
                     self._asked_anew.discard(topic)
-            short = self._plan().cut_short - before
+            short = self._plan_queues().cut_short - before
             self._losses.unclear(split.arrivals.keys() - split.progress.keys())
             if recording:
                 self._arrivals.measured(split)
             if state is not None and split.arrivals:
-                state.span = state.span[0] or split.start, split.end
+                first, _ = state.span
+                state.span = first or split.start, split.end
         if recording:
-            self._count(lambda: self._losses.measured(recording, split.progress))
+            self._report_losses(lambda: self._losses.measured(recording, split.progress))
         for topic in sorted(short):
             _log.warning(
                 "queue_cut_short",
