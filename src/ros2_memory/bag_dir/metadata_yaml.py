@@ -228,12 +228,13 @@ def _describe_topics(
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
         topic["message_count"] = counts[key]
-        offered = [_offered(channel, version) for channel in channels if _key(channel) == key]
+        of_topic = (channel for channel in channels if (channel.topic, channel.type) == key)
+        offered = [_offered(channel, version) for channel in of_topic]
         # rosbags returns no message of a channel whose profiles differ from these.
         if offered and topic_metadata.get("offered_qos_profiles") not in offered:
             topic_metadata["offered_qos_profiles"] = offered[0]
     for channel in channels:
-        key = _key(channel)
+        key = channel.topic, channel.type
         if key not in listed:
             listed.add(key)
             new = _topic_metadata(channel, version)
@@ -274,10 +275,6 @@ def _topic_metadata(channel: Channel, version: int) -> dict[str, object]:
         type_hash = dict(channel.metadata).get("topic_type_hash", "")
         topic_metadata["type_description_hash"] = type_hash
     return topic_metadata
-
-
-def _key(channel: Channel) -> tuple[str, str]:
-    return channel.topic, channel.type
 
 
 def _offered(channel: Channel, version: int) -> object:

@@ -526,12 +526,7 @@ class OwnRecordings:
                     # Another program may have appended meanwhile.
                     self._stamp = None
                     self._read_if_changed()
-                content = _Content(self.bag_dir_id or before.bag_dir_id or uuid.uuid4().hex)
-                for name, entry in (*before.entries.items(), *self._list.entries.items()):
-                    if entry.identity or name not in content.entries:
-                        content.entries[name] = entry
-                for name in self._missing_on_disk(content.entries):
-                    del content.entries[name]
+                content = self._merged_with(before)
                 content.add(rows)
                 folder = self._path.parent
                 if not folder.is_dir():
@@ -546,6 +541,16 @@ class OwnRecordings:
             raise
         self._max_lines = 2 * len(content.entries) + _SPARE_LINES
         self._list, self._stamp = content, None
+
+    def _merged_with(self, before: _Content) -> _Content:
+        """Returns the entries of the list, now and before, whose recordings have not gone."""
+        content = _Content(self.bag_dir_id or before.bag_dir_id or uuid.uuid4().hex)
+        for name, entry in (*before.entries.items(), *self._list.entries.items()):
+            if entry.identity or name not in content.entries:
+                content.entries[name] = entry
+        for name in self._missing_on_disk(content.entries):
+            del content.entries[name]
+        return content
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:

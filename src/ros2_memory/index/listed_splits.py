@@ -151,11 +151,7 @@ def describe_absent(absent: Sequence[Absent]) -> Iterator[str]:
         if files := sum(len(recording.files) for recording in missing):
             parts.append(counted(files, "missing file", "missing files"))
         if messages := sum(recording.messages for recording in missing):
-            noun, plural = (
-                "message that no file here contains",
-                "messages that no file here contains",
-            )
-            parts.append(counted(messages, noun, plural))
+            parts.append(f"{counted(messages, 'message')} that no file here contains")
         yield f"metadata.yaml of {_names(missing)} lists {' and '.join(parts)}"
     unreadable = [recording for recording in absent if recording.unreadable]
     if unreadable:

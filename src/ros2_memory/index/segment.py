@@ -286,8 +286,8 @@ class Segment:
         if window is not None:
             is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
             column = TopicColumn(*(values[is_inside] for values in column))
-        times = zip(column.firsts.tolist(), column.lasts.tolist(), strict=True)
-        for row, (first, last) in zip(column.bags.tolist(), times, strict=True):
+        bags, firsts, lasts, _ = (values.tolist() for values in column)
+        for row, first, last in zip(bags, firsts, lasts, strict=True):
             yield TopicExtent(self.bags[row], first, last)
 
     def column(self, topic: str) -> TopicColumn | None:

@@ -130,12 +130,12 @@ class Snapshot:
     @cached_property
     def _presences(self) -> dict[str, Presence]:
         """When bags hold each topic; not of logs, whose lines come when something happens."""
-        found: dict[str, list[Presence]] = {}
+        by_topic: dict[str, list[Presence]] = {}
         for part in filter(None, (segment.unthinned for segment in self._dated_segments)):
             for topic, presence in part.presences.items():
-                found.setdefault(topic, []).append(presence)
+                by_topic.setdefault(topic, []).append(presence)
         is_log = self.timeline.is_log
-        return {topic: joined(parts) for topic, parts in found.items() if not is_log(topic)}
+        return {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
 
     @cached_property
     def silences(self) -> tuple[Silence, ...]:

@@ -439,15 +439,13 @@ class Housekeeping(Housekeeper):
                     os.unlink(name, dir_fd=opened)
             for name in names:
                 path = directory / name
-                if name.endswith(_MCAP) and not left_by_repair(name) and self._is_own(path):
+                is_bag = name.endswith(_MCAP) and not left_by_repair(name)
+                if is_bag and (not self._keeps_foreign or self._own.owns_bag(path)):
                     self._repair_file(path)
             # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
-
-    def _is_own(self, path: Path) -> bool:
-        return not self._keeps_foreign or self._own.owns_bag(path)
 
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
         """Repairs files that the index found unfinished and nothing writes; returns how many."""

@@ -432,10 +432,10 @@ class RecordingSessions:
         session.state = SessionState.ENDED
         self.running = tuple(other for other in self.running if other is not session)
         self._observe_session(session, now)
-        completed = self._completed.pop(session.name, None)
-        if completed is not None:
+        handover = self._completed.pop(session.name, None)
+        if handover is not None:
             with self._reporting_failures(session):
-                completed.add_late_splits()
+                handover.add_late_splits()
         self._update_list(session)
         self._events.ended(session.name)
         splits = session.splits

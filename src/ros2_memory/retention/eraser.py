@@ -59,6 +59,7 @@ from ros2_memory.retention.repair import (
     left_in,
     open_files,
     opened_folder,
+    reason_of,
     replace_file,
     rewritten,
 )
@@ -161,7 +162,7 @@ class Eraser:
             except (BagError, OSError) as error:
                 if not any(map(self._may_change, paths)):
                     continue
-                judged = f"its contents are unknown: {_reason_of(error)}"
+                judged = f"its contents are unknown: {reason_of(error)}"
             if isinstance(judged, str):
                 kept.append(f"{self._relative(paths[0])}: {judged}")
             elif judged is not None:
@@ -231,7 +232,7 @@ class Eraser:
                     again = any(map(self._may_change, self._paths_by_inode().get(holder.inode, ())))
                     (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
-                kept.append(f"{self._relative(holder.paths[0])}: {_reason_of(error)}")
+                kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
         files = [self._bag_dir / name for name in erasure.files]
         notes = [*self._correct_metadata({path.parent for path in files})]
         try:
@@ -243,7 +244,7 @@ class Eraser:
             if not kept:
                 ERASING.remove(self._bag_dir)
         except (EpisodicError, OSError) as error:
-            kept.append(_reason_of(error))
+            kept.append(reason_of(error))
         return Kept((*kept, *linked), tuple(notes))
 
     def _delete_left_over(self, bags: Sequence[Path]) -> None:
@@ -473,9 +474,3 @@ def _recorder_refuses(reason: str) -> str:
         f"only the recorder may change it while it runs: {reason}; stop the recorder, and forget "
         "again"
     )
-
-
-def _reason_of(error: Exception) -> str:
-    if isinstance(error, BagError):
-        return error.reason
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

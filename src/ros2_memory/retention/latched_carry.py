@@ -30,7 +30,7 @@ from contextlib import suppress
 from dataclasses import replace
 from itertools import accumulate, pairwise
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import structlog
 
@@ -103,6 +103,10 @@ class MessageIdentity(NamedTuple):
     topic: str
     publish_time: Ns
     payload: bytes
+
+
+_LateMessages: TypeAlias = "dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]]"
+"""By bag, its mtime and topic: the late messages that it begins with, and their log times."""
 
 
 class Latched(NamedTuple):
@@ -193,7 +197,7 @@ class Carrier:
         self._static_topics = frozenset(static_topics)
         self._own = own
         self._failing = FailingFiles(monotonic)
-        self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
+        self._late: _LateMessages = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
         """Returns those of the bags that contain messages of a latched topic."""
@@ -222,11 +226,7 @@ class Carrier:
             return None
         topics = self.topics(snapshot)
         gone = {str(path) for path in {*to_delete} - {*saved}}
-        kept = [
-            bag
-            for bag in snapshot.bags
-            if bag.file not in gone and not is_carried(bag.file) and not is_thinned(bag.file)
-        ]
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and _is_recorded(bag)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
@@ -349,13 +349,13 @@ class Carrier:
         They come first in a recording, when its recorder has just subscribed.
         """
         repeated: dict[MessageIdentity, Ns] = {}
-        late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
+        late: _LateMessages = {}
         for topic in topics:
             seen: set[Path] = set()
             for bag in snapshot.bags:
                 if topic not in bag.summary.schema.positions or bag.recording in seen:
                     continue
-                if bag.path in to_delete or is_carried(bag.file) or is_thinned(bag.file):
+                if bag.path in to_delete or not _is_recorded(bag):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
@@ -394,6 +394,10 @@ class Carrier:
         flush(folder)
         flush(folder.parent)
         self._own.hold(folder, [CARRY_FILE])
+
+
+def _is_recorded(bag: BagFile) -> bool:
+    return not (is_carried(bag.file) or is_thinned(bag.file))
 
 
 def _is_tf(type_name: str) -> bool:

@@ -251,10 +251,9 @@ def _plan_and_free_bytes(
             going.add(bag.path)
             left.delete(bag)
     deleted = tuple(bag for bag in order if bag.path in going)
-    plan = DeletionPlan(deleted, total, fits=left.fits(limits), aged=aged & going)
-    if newest is not None:
-        plan = plan._replace(newest=newest.path)
-    return plan, left.free
+    kept = "" if newest is None else newest.path
+    fits = left.fits(limits)
+    return DeletionPlan(deleted, total, fits, aged=aged & going, newest=kept), left.free
 
 
 def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
@@ -314,7 +313,8 @@ class _Remaining:
         freed = [(file.size, file.disk) for file in self._freed_by(bag)]
         self._bags_in[bag.recording] -= 1
         if not self._bags_in[bag.recording]:
-            freed.append((self._sidecars.get(bag.recording, 0),) * 2)
+            size = self._sidecars.get(bag.recording, 0)
+            freed.append((size, size))
         for size, disk in freed:
             self.total -= size
             if self.free is not None:

@@ -253,3 +253,10 @@ def _status(path: Path) -> os.stat_result:
     if not stat.S_ISREG(status.st_mode):
         raise BagError(str(path), "not a regular file")
     return status
+
+
+def reason_of(error: Exception) -> str:
+    """Returns what a sentence says of an error: its reason, without the path where it has one."""
+    if isinstance(error, BagError):
+        return error.reason
+    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from copy import deepcopy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import structlog
 
@@ -52,7 +52,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import left_in, rewritten
+from ros2_memory.retention.repair import left_in, reason_of, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
@@ -82,6 +82,9 @@ REMIND_S: Final = 600.0
 """How long until a rule that still cannot be evaluated is logged again."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+_ClosedFiles: TypeAlias = "list[tuple[Path, BagSummary]]"
 
 
 class _UselessRuleError(EpisodicError):
@@ -194,7 +197,13 @@ class Screening:
         with self._lock:
             before = self._loaded()
             state = deepcopy(before)
-        closed = self._read_closed(names, state, live)
+        closed: dict[str, _ClosedFiles] = {}
+        is_held = False
+        for name in names:
+            files, is_whole = self._read_recording(name, state.recordings[name], live)
+            is_held |= not is_whole
+            # What a condition was in a recording that is held back may matter to later ones.
+            closed[name] = [] if is_held else files
         self._problems = {
             name: reason
             for name, reason in self._problems.items()
@@ -221,19 +230,6 @@ class Screening:
                 self._finish_recording(name, state)
         self._commit(before, state, names)
 
-    def _read_closed(
-        self, names: Sequence[str], state: ScreenState, live: Collection[str]
-    ) -> dict[str, list[tuple[Path, BagSummary]]]:
-        """Reads new closed files of recordings; returns those not released yet, by recording."""
-        closed: dict[str, list[tuple[Path, BagSummary]]] = {}
-        is_held = False
-        for name in names:
-            files, is_whole = self._read_recording(name, state.recordings[name], live)
-            is_held |= not is_whole
-            # What a condition was in a recording that is held back may matter to later ones.
-            closed[name] = [] if is_held else files
-        return closed
-
     def _release(
         self, path: Path, summary: BagSummary, stretches: Sequence[Excluded], state: ScreenState
     ) -> None:
@@ -248,7 +244,7 @@ class Screening:
 
     def _read_recording(
         self, name: str, screen: RecordingScreen, live: Collection[str]
-    ) -> tuple[list[tuple[Path, BagSummary]], bool]:
+    ) -> tuple[_ClosedFiles, bool]:
         """Reads the closed files of a recording that were not; returns those not released yet.
 
         With it whether a useless rule left none of them unread.
@@ -256,7 +252,7 @@ class Screening:
         paths = self._files(name)
         present = {path.name for path in paths}
         screen.files = {file: step for file, step in screen.files.items() if file in present}
-        unreleased: list[tuple[Path, BagSummary]] = []
+        unreleased: _ClosedFiles = []
         for path in paths:
             step = screen.files.get(path.name)
             if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
@@ -370,9 +366,9 @@ class Screening:
     def _ready(
         self,
         state: ScreenState,
-        closed: dict[str, list[tuple[Path, BagSummary]]],
+        closed: dict[str, _ClosedFiles],
         live: Collection[str],
-    ) -> list[tuple[Path, BagSummary]]:
+    ) -> _ClosedFiles:
         """Returns the splits that no later message can affect."""
         ends = {name: state.recordings[name].end or 0 for name in closed}
         written = {name: state.recordings[name].end for name in live if name in state.recordings}
@@ -520,9 +516,7 @@ class Screening:
     def _report(self, path: Path, error: Exception) -> None:
         """Notes why a split is held back, and logs it once."""
         name = f"{path.parent.name}/{path.name}"
-        reason = error.reason if isinstance(error, BagError) else str(error)
-        if isinstance(error, OSError):
-            reason = error.strerror or str(error)
+        reason = reason_of(error)
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
         self._problems[name] = reason

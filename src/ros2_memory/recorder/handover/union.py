@@ -250,6 +250,14 @@ class _AgainstCut(NamedTuple):
         listed = self.also_counts if counts_here else self.counts_elsewhere
         listed.update((file, *message) for file, counts in copies if counts is not counts_here)
 
+    def added_to(self, handover: Handover) -> Handover:
+        """Returns the sidecar of the recording with what is to be listed."""
+        return replace(
+            handover,
+            also_counts=_merged(handover.also_counts, self.also_counts),
+            counts_elsewhere=_merged(handover.counts_elsewhere, self.counts_elsewhere),
+        )
+
 
 def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
     """Lists in the sidecars of two recordings what counts against the cut between them."""
@@ -275,7 +283,7 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    _write_lists(old_side, new_side, _against_the_cut(old_side, new_side, reader))
+    _write_lists(old_side, new_side, *_against_the_cut(old_side, new_side, reader))
     return True
 
 
@@ -343,19 +351,12 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
             yield record
 
 
-def _write_lists(old: _Side, new: _Side, lists: tuple[_AgainstCut, _AgainstCut]) -> None:
+def _write_lists(old: _Side, new: _Side, of_old: _AgainstCut, of_new: _AgainstCut) -> None:
     """Writes the sidecars that change, that of the new recording in any case."""
     before, after = old.handover, new.handover
-    messages = sum(len(listed) for of_side in lists for listed in of_side)
+    messages = sum(map(len, (*of_old, *of_new)))
     if messages <= MOST_LISTED:
-        before, after = (
-            replace(
-                handover,
-                also_counts=_merged(handover.also_counts, of_side.also_counts),
-                counts_elsewhere=_merged(handover.counts_elsewhere, of_side.counts_elsewhere),
-            )
-            for handover, of_side in zip((before, after), lists, strict=True)
-        )
+        before, after = of_old.added_to(before), of_new.added_to(after)
     else:
         # Without a cut all of both count.
         if before.end is not None and before.next == new.recording.name:

@@ -188,7 +188,7 @@ class MemoryDays:
             return
         thinned = self._read_thinned()
         shown = shown_by(thinned, snapshot, bags)
-        chosen = self._choose(snapshot, bags, shown.pauses)
+        chosen = self._choose(snapshot, bags, shown)
         if shown != thinned:
             THINNED.write(self._folder.parent, shown)
         # Whole bags, also across midnight: a bag is in one day, or in none.
@@ -275,14 +275,14 @@ class MemoryDays:
                 numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
         stays = {key: {*thinning.times().tolist()} for key, thinning in numbers.items()}
 
-        def left() -> Iterator[Record]:
+        def thinned() -> Iterator[Record]:
             for record in self._merged_by_hour(path, ()):
                 channel = record.channel
                 if record.log_time in stays.get((channel.topic, channel.type), [record.log_time]):
                     metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
                     yield record._replace(channel=replace(channel, metadata=(*metadata,)))
 
-        self._write_beside(path, left()).replace(path)
+        self._write_beside(path, thinned()).replace(path)
         flush(self._folder)
 
     def clear(self) -> None:
@@ -332,10 +332,8 @@ class MemoryDays:
             _log.warning("memory_not_read", path=THINNED_FILE, reason=str(error))
             return Thinned()
 
-    def _choose(
-        self, snapshot: Snapshot, bags: Sequence[BagFile], pauses: Sequence[tuple[Ns, Ns]]
-    ) -> _Staying:
-        """Returns which messages of some bags stay; of a table those beside `pauses`, too."""
+    def _choose(self, snapshot: Snapshot, bags: Sequence[BagFile], shown: Thinned) -> _Staying:
+        """Returns which messages of some bags stay, also beside the pauses that these show."""
         chosen = _Staying()
         thinned: dict[tuple[str, str], TopicThinning] = {}
         detections = DetectionColumns(self._extractor)
@@ -356,7 +354,7 @@ class MemoryDays:
                 chosen.times[topic, kind].update(table.log_times.tolist())
             elif len(table):
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
-                chosen.times[topic, kind].update(beside(pauses, table.log_times).tolist())
+                chosen.times[topic, kind].update(beside(shown.pauses, table.log_times).tolist())
         for key, thinning in thinned.items():
             chosen.times[key].update(thinning.times().tolist())
         return chosen

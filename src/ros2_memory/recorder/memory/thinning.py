@@ -292,10 +292,10 @@ class TopicThinning:
                 continue
             samples = [(float(numbers[row]), int(times[row])) for row in rows.tolist()]
             least, greatest = min(samples), max(samples, key=itemgetter(0))
-            known = self._extremes.get((path, slot), (least, greatest))
+            least_before, most_before = self._extremes.get((path, slot), (least, greatest))
             # Of equal ones the earliest.
-            most = max(known[1], greatest, key=itemgetter(0))
-            self._extremes[path, slot] = min(known[0], least), most
+            most = max(most_before, greatest, key=itemgetter(0))
+            self._extremes[path, slot] = min(least_before, least), most
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
