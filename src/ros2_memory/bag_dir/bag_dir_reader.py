@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+    from ros2_memory.core.timebase import Ns
 
 _MAX_CACHED_SIDECARS: Final = 4096
 _NO_SIDECAR: Final = HandoverReading(Handover(), None)
@@ -85,7 +86,7 @@ class BagDirReader(BagReader):
             BagError: as the adapter, or the path leads out of the bag directory.
         """
         summary = self._reader.summarize(self._confined(path))
-        handover, problem = self._handover(path)
+        handover, problem = self._sidecar_of(path)
         if problem is not None:
             summary = summary.replaced(notes=(*summary.notes, problem))
         rule = handover.rule(path.name)
@@ -93,7 +94,7 @@ class BagDirReader(BagReader):
             return summary
         if rule.hides_all:
             return summary.replaced(topics=())
-        topics = (self._counted(path, topic, rule) for topic in summary.topics)
+        topics = (self._counted_summary(path, topic, rule) for topic in summary.topics)
         return summary.replaced(
             topics=tuple(topic for topic in topics if topic is not None),
             notes=(*summary.notes, *handover.notes),
@@ -114,11 +115,11 @@ class BagDirReader(BagReader):
         """
 
         def opened() -> Iterator[Iterator[Record]]:
-            found = self._located(path)
-            rule = self._rule(found, topics, window)
+            located = self._located(path)
+            rule = self._rule_of(located, topics, window)
             if rule is not None and rule.hides_all:
                 return
-            records = self._reader.records(found, topics, window, newest_first=newest_first)
+            records = self._reader.records(located, topics, window, newest_first=newest_first)
             yield records if rule is None else filter(rule.counts, records)
 
         # A generator would end at the first error; after a damaged chunk the adapter's iterator
@@ -140,14 +141,14 @@ class BagDirReader(BagReader):
         """
 
         def opened() -> Iterator[Iterator[Batch]]:
-            found = self._located(path)
-            rule = self._rule(found, topics, window)
+            located = self._located(path)
+            rule = self._rule_of(located, topics, window)
             if rule is None:
-                yield self._reader.batches(found, topics, window, bare=bare)
+                yield self._reader.batches(located, topics, window, bare=bare)
             elif not rule.hides_all:
                 # Which messages count is known by their publish times and payloads.
-                batches = self._reader.batches(found, topics, window)
-                yield map(partial(_counted_in, rule), batches)
+                batches = self._reader.batches(located, topics, window)
+                yield map(partial(_counted_batch, rule), batches)
 
         return chain.from_iterable(opened())
 
@@ -211,20 +212,20 @@ class BagDirReader(BagReader):
             links = [recorded]
             with suppress(OSError):
                 links += (
-                    each / name for each in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
+                    folder / name for folder in sorted((self._bag_dir / MOMENTS_FOLDER).iterdir())
                 )
-            path = next((each for each in links if os.path.lexists(each)), path)
+            path = next((link for link in links if os.path.lexists(link)), path)
         return self._confined(path)
 
-    def _rule(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:
+    def _rule_of(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:
         """Returns which messages of the topics in a window count; None where all do."""
-        reading = self._handover(path)
+        reading = self._sidecar_of(path)
         if reading is _NO_SIDECAR:
             return None
         rule = reading.handover.rule(path.name)
         return rule if rule is not None and rule.touches(window, topics) else None
 
-    def _handover(self, path: Path) -> HandoverReading:
+    def _sidecar_of(self, path: Path) -> HandoverReading:
         """Returns the sidecar of a file's recording, parsed again only when it has changed.
 
         Raises:
@@ -237,9 +238,9 @@ class BagDirReader(BagReader):
         try:
             status = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
             stamp = (status.st_mtime_ns, status.st_size, status.st_ino)
-            known = self._sidecars.get(sidecar)
-            if known is not None and known[0] == stamp:
-                return known[1]
+            stamp_before, reading = self._sidecars.get(sidecar, (None, _NO_SIDECAR))
+            if stamp_before == stamp:
+                return reading
             reading = sure_handover(path.parent)
         except (FileNotFoundError, NotADirectoryError):
             return _NO_SIDECAR
@@ -254,7 +255,9 @@ class BagDirReader(BagReader):
         self._sidecars[sidecar] = (stamp, reading)
         return reading
 
-    def _counted(self, path: Path, topic: TopicSummary, rule: FileRule) -> TopicSummary | None:
+    def _counted_summary(
+        self, path: Path, topic: TopicSummary, rule: FileRule
+    ) -> TopicSummary | None:
         """Returns the topic without the messages that count elsewhere; None if none is left."""
         span = TimeWindow(topic.first, topic.last + 1)
         if (topic.latched and not rule.hides_latched) or not rule.touches(span, [topic.topic]):
@@ -262,8 +265,12 @@ class BagDirReader(BagReader):
         # Excluded messages lie in few chunks: only these are read, but for listed ones.
         windows = [span]
         if topic.topic not in rule.elsewhere:
-            cut = [span.intersect(TimeWindow(*each[2:])) for each in rule.exclusions]
-            windows = [TimeWindow(*each) for each in united((one.start, one.stop) for one in cut)]
+            excluded = [
+                span.intersect(TimeWindow(exclusion.log_from, exclusion.log_until))
+                for exclusion in rule.exclusions
+            ]
+            spans = united((window.start, window.stop) for window in excluded)
+            windows = [TimeWindow(start, stop) for start, stop in spans]
         lost = sum(
             record.channel.type == topic.type and not rule.counts(record)
             for window in windows
@@ -271,19 +278,21 @@ class BagDirReader(BagReader):
         )
         if not lost:
             return topic
-        first, last = (
-            next((each.log_time for each in found if each.channel.type == topic.type), None)
-            for found in (
-                self.records(path, [topic.topic], span),
-                self.records(path, [topic.topic], span, newest_first=True),
-            )
-        )
+        first = self._end_of(path, topic, newest_first=False)
+        last = self._end_of(path, topic, newest_first=True)
         if first is None or last is None:
             return None
         return replace(topic, count=topic.count - lost, first=first, last=last)
 
+    def _end_of(self, path: Path, topic: TopicSummary, *, newest_first: bool) -> Ns | None:
+        """Returns the first log time of what counts of a topic, or the last; None without any."""
+        span = TimeWindow(topic.first, topic.last + 1)
+        records = self.records(path, [topic.topic], span, newest_first=newest_first)
+        of_type = (record.log_time for record in records if record.channel.type == topic.type)
+        return next(of_type, None)
 
-def _counted_in(rule: FileRule, batch: Batch) -> Batch:
+
+def _counted_batch(rule: FileRule, batch: Batch) -> Batch:
     """Returns the messages of a batch that count."""
     counts = [rule.counts(batch.record(nth)) for nth in range(batch.sizes.size)]
     return batch if all(counts) else batch.taken(np.array(counts, np.bool_))

@@ -212,7 +212,8 @@ class FileRule(NamedTuple):
         """Returns whether a message of the file counts."""
         channel = record.channel
         excluded = (self.hides_latched or not channel.latched) and any(
-            each.excludes(record.publish_time, record.log_time) for each in self.exclusions
+            exclusion.excludes(record.publish_time, record.log_time)
+            for exclusion in self.exclusions
         )
         listed = (self.also if excluded else self.elsewhere).get(channel.topic)
         if not listed:
@@ -221,9 +222,9 @@ class FileRule(NamedTuple):
 
     def touches(self, window: TimeWindow, topics: Collection[str]) -> bool:
         """Returns whether some message of the topics with log time in a window may not count."""
-        return any(each in self.elsewhere for each in topics) or any(
-            each.log_from < window.stop and window.start < each.log_until
-            for each in self.exclusions
+        return any(topic in self.elsewhere for topic in topics) or any(
+            exclusion.log_from < window.stop and window.start < exclusion.log_until
+            for exclusion in self.exclusions
         )
 
 

@@ -152,8 +152,8 @@ class JsonLog(Generic[_T]):
     def text(self, rows: Iterable[_T]) -> str:
         """Returns rows as lines."""
         dumped = (self._adapter.dump_python(row, exclude_defaults=self._is_brief) for row in rows)
-        begun = (json.dumps(fields).removesuffix("}").encode() for fields in dumped)
-        return "".join(f"{_with_check(each).decode()}\n" for each in begun)
+        lines = (json.dumps(fields).removesuffix("}").encode() for fields in dumped)
+        return "".join(f"{_with_check(line).decode()}\n" for line in lines)
 
     def append(self, bag_dir: Path, rows: Iterable[_T]) -> int:
         """Appends rows durably; returns how many bytes the file has then.

@@ -12,6 +12,7 @@ import posixpath
 import re
 from collections import Counter
 from contextlib import suppress
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import yaml
@@ -65,7 +66,7 @@ class Listing(NamedTuple):
 def parse_listing(text: str) -> Listing:
     """Returns what a metadata.yaml lists; nothing if it is not one."""
     names: list[str] = []
-    totals: list[tuple[int, int]] = []
+    totals: list[tuple[int, int | None]] = []
     messages: dict[str, int] = {}
     path: str | None = None
     count: int | None = None
@@ -80,20 +81,20 @@ def parse_listing(text: str) -> Listing:
             path = count = None
             key = key[2:].lstrip(" ")
         if key.startswith("path:"):
-            found = _PATH_KEY.match(key)
-            path = found[1] if found and path is None else path
-        elif key.startswith("message_count:"):
-            found = _COUNT_KEY.match(key)
-            if found:
-                count = int(found[1]) if count is None else count
-                if not is_item:  # indented least: that of the whole recording
-                    totals.append((len(line) - len(key), int(found[1])))
+            path_key = _PATH_KEY.match(key)
+            path = path_key[1] if path_key and path is None else path
+        elif key.startswith("message_count:") and (count_key := _COUNT_KEY.match(key)):
+            number = int(count_key[1])
+            count = number if count is None else count
+            if not is_item:
+                totals.append((len(line) - len(key), number))
         if "." in line:
-            found = _BAG_NAME.match(line)
-            if found and bag_kind(found[1]):
-                names.append(posixpath.basename(found[1]))
-    total = min(totals, key=lambda each: each[0], default=None)
-    return Listing(tuple(names), messages, None if total is None else total[1])
+            bag_name = _BAG_NAME.match(line)
+            if bag_name and bag_kind(bag_name[1]):
+                names.append(posixpath.basename(bag_name[1]))
+    # That of the whole recording is indented least.
+    _, total = min(totals, key=itemgetter(0), default=(0, None))
+    return Listing(tuple(names), messages, total)
 
 
 def read_listing(path: Path | str, directory: int | None = None) -> Listing:
@@ -135,10 +136,10 @@ def correct(recording: Path, reader: BagReader) -> bool:
     if not files or not (text or is_named_by_rosbag2(recording)):
         return False
     contents: dict[str, Contents] = {}
-    for each in files:
-        contents[each.name] = Contents(reader.summarize(each), reader.channels(each))
-        if not contents[each.name].summary.complete:
-            raise ValueError(f"{each.name} is not whole")
+    for file in files:
+        contents[file.name] = Contents(reader.summarize(file), reader.channels(file))
+        if not contents[file.name].summary.complete:
+            raise ValueError(f"{file.name} is not whole")
     written = describing(text, contents)
     if written != text:
         write_durably(path, written)
@@ -149,15 +150,15 @@ def is_named_by_rosbag2(recording: Path) -> bool:
     """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
     prefix = f"{recording.name}_"
     return all(
-        each.suffix == ".mcap"
-        and each.stem.startswith(prefix)
-        and each.stem.removeprefix(prefix).isdecimal()
-        for each in _plain_bags(recording)
+        path.suffix == ".mcap"
+        and path.stem.startswith(prefix)
+        and path.stem.removeprefix(prefix).isdecimal()
+        for path in _plain_bags(recording)
     )
 
 
 def _plain_bags(recording: Path) -> list[Path]:
-    return [each for each in recording.iterdir() if bag_kind(each.name) in _PLAIN]
+    return [path for path in recording.iterdir() if bag_kind(path.name) in _PLAIN]
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
@@ -170,17 +171,29 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     Raises:
         ValueError: the old one is no metadata.yaml of a known form.
     """
-    channels = [channel for each in files.values() for channel in each.channels]
+    channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
     info = _information(content)
     kind = _STORAGES.get(str(info.get("storage_identifier")))
     if info.get("compression_mode") == "FILE" or any(bag_kind(name) != kind for name in files):
-        found = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
-        raise ValueError(f"it is not of plain {' and '.join(found)} files")
+        kinds = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
+        raise ValueError(f"it is not of plain {' and '.join(kinds)} files")
     version = integer(info, "version")
     if version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which lists no messages of files")
-    paths = {bare_name(each): str(each) for each in _list(info, "relative_file_paths")}
+    counts = Counter[tuple[str, str]]()
+    for summary, _ in files.values():
+        for topic in summary.topics:
+            counts[topic.topic, topic.type] += topic.count
+    info["message_count"] = counts.total()
+    _describe_files(info, files)
+    _describe_topics(info, channels, counts, version)
+    return _dumped(content)
+
+
+def _describe_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
+    """Sets times, paths and the description of each file, in order of time."""
+    paths = {bare_name(path): str(path) for path in _list(info, "relative_file_paths")}
     spans = {
         name: (summary.start, summary.end)
         for name, (summary, _) in files.items()
@@ -189,11 +202,6 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     first = min((start for start, _ in spans.values()), default=0)
     last = max((end for _, end in spans.values()), default=first)
     order = sorted(files, key=lambda name: (spans.get(name, (last, last)), name))
-    counts = Counter[tuple[str, str]]()
-    for summary, _ in files.values():
-        for topic in summary.topics:
-            counts[topic.topic, topic.type] += topic.count
-    info["message_count"] = counts.total()
     info.update(_span(first, last))
     info["relative_file_paths"] = [paths.get(name, name) for name in order]
     info["files"] = [
@@ -204,25 +212,34 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
         }
         for name in order
     ]
+
+
+def _describe_topics(
+    info: dict[object, object],
+    channels: Sequence[Channel],
+    counts: Counter[tuple[str, str]],
+    version: int,
+) -> None:
+    """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
     topics = _mappings(info, "topics_with_message_count")
     listed = set()
-    for each in topics:
-        topic_metadata = _described(each)
+    for topic in topics:
+        topic_metadata = _described(topic)
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
-        each["message_count"] = counts[key]
-        offered = [_offered(channel, version) for channel in channels if _key(channel) == key]
+        topic["message_count"] = counts[key]
+        of_topic = (channel for channel in channels if (channel.topic, channel.type) == key)
+        offered = [_offered(channel, version) for channel in of_topic]
         # rosbags returns no message of a channel whose profiles differ from these.
         if offered and topic_metadata.get("offered_qos_profiles") not in offered:
             topic_metadata["offered_qos_profiles"] = offered[0]
     for channel in channels:
-        key = _key(channel)
+        key = channel.topic, channel.type
         if key not in listed:
             listed.add(key)
             new = _topic_metadata(channel, version)
             topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
-    return _dumped(content)
 
 
 def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
@@ -258,10 +275,6 @@ def _topic_metadata(channel: Channel, version: int) -> dict[str, object]:
         type_hash = dict(channel.metadata).get("topic_type_hash", "")
         topic_metadata["type_description_hash"] = type_hash
     return topic_metadata
-
-
-def _key(channel: Channel) -> tuple[str, str]:
-    return channel.topic, channel.type
 
 
 def _offered(channel: Channel, version: int) -> object:
@@ -310,27 +323,27 @@ def without(text: str, gone: Mapping[str, Counts]) -> str | None:
     names = {bare_name(name): counts for name, counts in gone.items()}
     files = _mappings(info, "files")
     paths = _list(info, "relative_file_paths")
-    deleted = [each for each in files if bare_name(each.get("path")) in names]
-    left = [each for each in files if bare_name(each.get("path")) not in names]
-    left_paths = [each for each in paths if bare_name(each) not in names]
+    deleted = [file for file in files if bare_name(file.get("path")) in names]
+    left = [file for file in files if bare_name(file.get("path")) not in names]
+    left_paths = [path for path in paths if bare_name(path) not in names]
     if len(left_paths) == len(paths) and not deleted:
         return None
     if not left or len(left) != len(left_paths):
         raise ValueError("it does not list the files that are left")
     lost = Counter[str]()
     is_equal = True
-    for each in deleted:
-        counts = names[bare_name(each.get("path"))]
-        is_equal &= sum(counts.values()) == integer(each, "message_count")
+    for file in deleted:
+        counts = names[bare_name(file.get("path"))]
+        is_equal &= sum(counts.values()) == integer(file, "message_count")
         lost.update(counts)
     topics = _mappings(info, "topics_with_message_count")
-    for each in topics:
-        name = _described(each).get("name")
-        each["message_count"] = integer(each, "message_count") - lost.pop(str(name), 0)
-    total = sum(integer(each, "message_count") for each in left)
-    if not is_equal or lost or total != sum(integer(each, "message_count") for each in topics):
+    for topic in topics:
+        name = _described(topic).get("name")
+        topic["message_count"] = integer(topic, "message_count") - lost.pop(str(name), 0)
+    total = sum(integer(file, "message_count") for file in left)
+    if not is_equal or lost or total != sum(integer(topic, "message_count") for topic in topics):
         raise ValueError("its numbers are not those of the files")
-    spans = [_span_of(each) for each in left]
+    spans = [_span_of(file) for file in left]
     info["message_count"] = total
     info.update(_span(min(start for start, _ in spans), max(end for _, end in spans)))
     info["relative_file_paths"], info["files"] = left_paths, left
@@ -354,19 +367,19 @@ def recounted(text: str, left: Mapping[str, Counts]) -> str:
         files = _mappings(info, "files")
         topics = _mappings(info, "topics_with_message_count")
         counts, others = Counter[str](), 0
-        for each in files:
-            count = integer(each, "message_count")
+        for file in files:
+            count = integer(file, "message_count")
             # None, where rosbag2 wrote it before the first message.
-            known = left.get(bare_name(each.get("path"))) if count else {}
-            if known is None:
+            counts_of_file = left.get(bare_name(file.get("path"))) if count else {}
+            if counts_of_file is None:
                 others += count
             else:
-                counts.update(known)
-                each["message_count"] = min(count, sum(known.values()))
-        for each in topics:
-            name = str(_described(each).get("name"))
-            each["message_count"] = min(integer(each, "message_count"), counts[name] + others)
-        info["message_count"] = sum(integer(each, "message_count") for each in files)
+                counts.update(counts_of_file)
+                file["message_count"] = min(count, sum(counts_of_file.values()))
+        for topic in topics:
+            name = str(_described(topic).get("name"))
+            topic["message_count"] = min(integer(topic, "message_count"), counts[name] + others)
+        info["message_count"] = sum(integer(file, "message_count") for file in files)
     except ValueError:
         return text
     return _dumped(content)
@@ -423,7 +436,7 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
 
 def _mappings(fields: dict[object, object], key: str) -> list[dict[object, object]]:
     """Returns the items of the list under a key, each of which must hold keys."""
-    return [_mapping(each, key.partition("_")[0]) for each in _list(fields, key)]
+    return [_mapping(item, key.partition("_")[0]) for item in _list(fields, key)]
 
 
 def _described(topic: dict[object, object]) -> dict[object, object]:

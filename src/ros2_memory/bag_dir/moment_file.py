@@ -351,7 +351,7 @@ class RequestQueue:
         requests = [name for name in names if self._is_request(name)]
         requests.sort(key=lambda name: not name.endswith(".taken"))
         for name in requests[:MAX_AT_ONCE]:
-            request = self._take(name, now)
+            request = self._claim(name, now)
             if request is not None:
                 yield request
         self._delete_left_over(names, now)
@@ -362,9 +362,9 @@ class RequestQueue:
         Raises:
             OSError: it cannot be written.
         """
-        self._answer(request.number, outcome)
+        self._write_outcome(request.number, outcome)
 
-    def _take(self, name: str, now: Ns) -> SaveRequest | None:
+    def _claim(self, name: str, now: Ns) -> SaveRequest | None:
         number = name.partition(".")[0]
         path = self._folder / f"{number}.taken"
         try:
@@ -378,10 +378,10 @@ class RequestQueue:
             _log.warning("request_ignored", path=str(path), reason=str(error))
             refused = f"the recorder cannot read the request: {error}"
             with suppress(OSError):
-                self._answer(number, Outcome(refused=refused))
+                self._write_outcome(number, Outcome(refused=refused))
             return None
 
-    def _answer(self, number: str, outcome: Outcome) -> None:
+    def _write_outcome(self, number: str, outcome: Outcome) -> None:
         text = json.dumps({"format": FORMAT, **asdict(outcome)})
         write_durably(self._folder / f"{number}.answer", text, mode=READABLE)
         with suppress(OSError):

@@ -116,15 +116,15 @@ class ListRow:
         if self.adopted and self.bags is None:
             return True
         bags = self.bags or ()
-        nth = bisect_left(bags, name)
-        if bags[nth : nth + 1] == (name,):
+        place = bisect_left(bags, name)
+        if bags[place : place + 1] == (name,):
             return True
         number = split_number(self.recording, name)
         return number is not None and (self.splits is None or number < self.splits)
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
-        others = {each.removesuffix(COMPRESSED) for each in files if not self.holds(each)}
+        others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
         return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
 
     def counted(self, files: Container[str]) -> int:
@@ -184,7 +184,7 @@ class OwnRecordings:
             OSError: there is one that cannot be read.
         """
         with self._lock:
-            return self._read()
+            return self._read_if_changed()
 
     def names(self) -> Collection[str]:
         """Returns the listed recordings, whatever lies under their names; no saved moments.
@@ -194,7 +194,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        return [name for name in [*self._current()] if not is_kept_apart(name)]
+        return [name for name in [*self._current_rows()] if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
         """Returns the listed recordings in the order in which they began; no adopted ones.
@@ -202,7 +202,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        return [name for name, row in [*self._current().items()] if not row.adopted]
+        return [name for name, row in [*self._current_rows().items()] if not row.adopted]
 
     def owns_bag(self, path: Path) -> bool:
         """Returns whether a bag file is the recorder's: see `judge`.
@@ -210,7 +210,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        self._current()
+        self._current_rows()
         return self.judge_of(str(path.parent))(path.name)
 
     def judge_of(self, directory: str) -> Callable[[str], bool]:
@@ -239,7 +239,7 @@ class OwnRecordings:
             OSError: the list cannot be read.
         """
         name = self.name_of(directory)
-        if name in self._current():
+        if name in self._current_rows():
             with suppress(OSError):
                 return self.lists(name, identity_of(directory))
         return False
@@ -250,7 +250,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        row = self._current().get(self.name_of(directory))
+        row = self._current_rows().get(self.name_of(directory))
         return row is not None and row.identity is None
 
     def lists(self, name: str, identity: Identity | None) -> bool:
@@ -290,7 +290,7 @@ class OwnRecordings:
         """
         with self._lock:
             try:
-                exists = self._read()
+                exists = self._read_if_changed()
                 folders = () if exists else self._bag_dir.iterdir()
                 left = sorted(
                     path.name
@@ -299,9 +299,9 @@ class OwnRecordings:
                 )
             except OSError as error:
                 raise self._failure(error, "read") from error
-            found = self._find_completed(custom_data)
-            self._list.add(found)
-            found += self._find_ended()
+            rows = self._find_completed(custom_data)
+            self._list.add(rows)
+            rows += self._find_ended()
             if left:
                 names, count = left[:_MAX_NAMED], len(left)
                 _log.warning(
@@ -310,13 +310,13 @@ class OwnRecordings:
             for name, row in self._list.entries.items():
                 if row.identity is None and (self._bag_dir / name).is_dir():
                     _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
-            gone = self._gone(self._list.entries)
-            if exists and self.bag_dir_id and not (found or gone):
+            gone = self._missing_on_disk(self._list.entries)
+            if exists and self.bag_dir_id and not (rows or gone):
                 return
             try:
-                self._rewrite(found)
+                self._rewrite(rows)
             except OSError as error:
-                self._know(found)
+                self._remember_unwritten(rows)
                 _log.error("recordings_not_listed", reason=str(self._failure(error)))
 
     def begin(self, name: str) -> None:
@@ -325,7 +325,7 @@ class OwnRecordings:
         Raises:
             RecorderError: it cannot be listed: then it must not begin.
         """
-        self._add([ListRow(recording=name)])
+        self._append([ListRow(recording=name)])
 
     def complete(self, name: str) -> bool:
         """Lists the directory that the child made for a recording; False while there is none.
@@ -339,7 +339,7 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._add([ListRow("", name, *identity, splits=0)])
+        self._append([ListRow("", name, *identity, splits=0)])
         return True
 
     def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
@@ -355,13 +355,13 @@ class OwnRecordings:
                 return
             noted = replace(row, splits=row.counted(files), ended=ended)
             try:
-                if noted == row and self._read():
+                if noted == row and self._read_if_changed():
                     return
-                self._add([noted])
+                self._append([noted])
             except OSError as error:
                 raise self._failure(error) from error
             except RecorderError:
-                self._know([noted])
+                self._remember_unwritten([noted])
                 raise
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
@@ -371,16 +371,19 @@ class OwnRecordings:
             RecorderError: they cannot be listed.
         """
         with self._lock:
-            self._add([self._adopted(*each) for each in sorted(identities.items())])
+            rows = [
+                self._adopted_row(name, identity) for name, identity in sorted(identities.items())
+            ]
+            self._append(rows)
 
-    def _adopted(self, name: str, identity: Identity) -> ListRow:
+    def _adopted_row(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory that is adopted."""
-        row = self._row(name, identity)
+        row = self._row_of(name, identity)
         with suppress(OSError):
             return row.with_bags(path.name for path in bags_in(self._bag_dir / name))
         return row
 
-    def _row(self, name: str, identity: Identity) -> ListRow:
+    def _row_of(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory, one of the list or another."""
         row = self._list.entries.get(name)
         if row is None or not row.lists(identity):
@@ -397,20 +400,20 @@ class OwnRecordings:
             OSError: the list or the directory cannot be read.
         """
         with self._lock:
-            self._read()
+            self._read_if_changed()
             name, identity = self.name_of(directory), identity_of(directory)
             if identity is None:
                 raise FileNotFoundError(f"{directory} is not there any more")
-            row = self._row(name, identity).with_bags(bags)
+            row = self._row_of(name, identity).with_bags(bags)
             if row == self._list.entries.get(name):
                 return
             try:
-                self._add([row])
+                self._append([row])
             except RecorderError as error:
-                self._know([row])
+                self._remember_unwritten([row])
                 _log.error("recordings_not_listed", reason=str(error))
 
-    def _know(self, rows: Iterable[ListRow]) -> None:
+    def _remember_unwritten(self, rows: Iterable[ListRow]) -> None:
         """Counts rows as listed that cannot be written; the next one that is written takes them."""
         self._unwritten.update({row.recording: row for row in rows})
         self._list.add(self._unwritten.values())
@@ -424,7 +427,7 @@ class OwnRecordings:
         """
         ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
         named = read_heartbeat(self._bag_dir).recordings
-        found: list[ListRow] = []
+        completed: list[ListRow] = []
         for name, entry in self._list.entries.items():
             if entry.identity is not None:
                 continue
@@ -436,20 +439,20 @@ class OwnRecordings:
                 embedded = [custom_data(path) or {} for path in files]
                 is_ours = all(ours.items() <= data.items() for data in embedded)
                 if embedded and (is_ours or (name in named and not any(embedded))):
-                    found.append(ListRow("", name, *identity, splits=0))
-        return found
+                    completed.append(ListRow("", name, *identity, splits=0))
+        return completed
 
     def _find_ended(self) -> list[ListRow]:
         """Returns the recordings that a kill ended, with the splits that they have."""
-        found: list[ListRow] = []
+        ended: list[ListRow] = []
         for name, row in self._list.entries.items():
             if row.identity is not None and row.splits is not None and not row.ended:
                 with suppress(OSError):
                     files = {path.name for path in bags_in(self._bag_dir / name)}
-                    found.append(replace(row, splits=row.counted(files), ended=True))
-        return found
+                    ended.append(replace(row, splits=row.counted(files), ended=True))
+        return ended
 
-    def _gone(self, names: Iterable[str]) -> list[str]:
+    def _missing_on_disk(self, names: Iterable[str]) -> list[str]:
         """Returns the recordings that are no longer in the bag directory."""
         gone = []
         for name in names:
@@ -460,17 +463,17 @@ class OwnRecordings:
                     gone.append(name)
         return gone
 
-    def _current(self) -> Mapping[str, ListRow]:
+    def _current_rows(self) -> Mapping[str, ListRow]:
         """Returns the lines of recordings, read again if the file has changed.
 
         Raises:
             OSError: the list cannot be read.
         """
         with self._lock:
-            self._read()
+            self._read_if_changed()
             return self._list.entries
 
-    def _read(self) -> bool:
+    def _read_if_changed(self) -> bool:
         """Reads the file if it has changed; returns whether there is one."""
         try:
             status = os.lstat(state_path(self._bag_dir, LIST_FILE))
@@ -487,7 +490,7 @@ class OwnRecordings:
         content = _Content(lines=len(lines))
         content.add(row for row in rows if row.recording and not row.bag_dir_id)
         content.add(self._unwritten.values())
-        content.bag_dir_id = next((each.bag_dir_id for each in rows[::-1] if each.bag_dir_id), "")
+        content.bag_dir_id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
         self._list, self._stamp = content, stamp
         damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
         if damaged > self._reported_damaged:
@@ -495,12 +498,12 @@ class OwnRecordings:
             _log.warning("recordings_list_damaged", path=str(self._path), lines=damaged)
         return True
 
-    def _add(self, rows: Sequence[ListRow]) -> None:
+    def _append(self, rows: Sequence[ListRow]) -> None:
         """Appends entries, or writes the whole list where there is none or most of it is gone."""
         rows = [*self._unwritten.values(), *rows]
         try:
             with self._lock:
-                exists = self._read()
+                exists = self._read_if_changed()
                 if not exists or self._list.lines > self._max_lines or self.bag_dir_id is None:
                     self._rewrite(rows)
                     self._unwritten.clear()
@@ -516,19 +519,14 @@ class OwnRecordings:
 
     def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
-        known = self._list
+        before = self._list
         try:
             with self._locked() as descriptor:
                 if descriptor is not None:
                     # Another program may have appended meanwhile.
                     self._stamp = None
-                    self._read()
-                content = _Content(self.bag_dir_id or known.bag_dir_id or uuid.uuid4().hex)
-                for name, entry in (*known.entries.items(), *self._list.entries.items()):
-                    if entry.identity or name not in content.entries:
-                        content.entries[name] = entry
-                for name in self._gone(content.entries):
-                    del content.entries[name]
+                    self._read_if_changed()
+                content = self._merged_with(before)
                 content.add(rows)
                 folder = self._path.parent
                 if not folder.is_dir():
@@ -539,10 +537,20 @@ class OwnRecordings:
                 write_durably(self._path, LIST.text([header, *content.entries.values()]))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._list = known
+            self._list = before
             raise
         self._max_lines = 2 * len(content.entries) + _SPARE_LINES
         self._list, self._stamp = content, None
+
+    def _merged_with(self, before: _Content) -> _Content:
+        """Returns the entries of the list, now and before, whose recordings have not gone."""
+        content = _Content(self.bag_dir_id or before.bag_dir_id or uuid.uuid4().hex)
+        for name, entry in (*before.entries.items(), *self._list.entries.items()):
+            if entry.identity or name not in content.entries:
+                content.entries[name] = entry
+        for name in self._missing_on_disk(content.entries):
+            del content.entries[name]
+        return content
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:

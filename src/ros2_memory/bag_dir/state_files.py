@@ -24,7 +24,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from itertools import chain
-from operator import attrgetter
+from operator import attrgetter, itemgetter
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Final, Literal, NamedTuple, TypeAlias
 
@@ -134,14 +134,14 @@ def append_losses(bag_dir: Path, losses: Iterable[Loss]) -> None:
 
 
 @until_changed(LOST_FILE)
-def _losses(bag_dir: Path) -> Sequence[Loss]:
+def _lost_rows(bag_dir: Path) -> Sequence[Loss]:
     return LOST.rows(bag_dir)
 
 
 def read_losses(bag_dir: Path, start: Ns, stop: Ns) -> Sequence[Loss]:
     """Returns the losses that fall between two log times; none where a file cannot be read."""
     expired = EXPIRED.current(bag_dir) or Expired()
-    losses = (*(_losses(bag_dir) or ()), *expired.gone, *expired.going)
+    losses = (*(_lost_rows(bag_dir) or ()), *expired.gone, *expired.going)
     return [loss for loss in losses if loss.start < stop and start < loss.stop]
 
 
@@ -171,13 +171,13 @@ class Expired:
         before = [loss for loss in self.going if loss.topic not in again]
         topics: dict[str, list[Loss]] = {}
         for loss in sorted([*self.gone, *before], key=attrgetter("start")):
-            known = topics.setdefault(loss.topic, [])
-            if known and loss.start - known[-1].stop <= _APART_NS:
-                last = known.pop()
+            of_topic = topics.setdefault(loss.topic, [])
+            if of_topic and loss.start - of_topic[-1].stop <= _APART_NS:
+                last = of_topic.pop()
                 stop, lost = max(last.stop, loss.stop), last.lost + loss.lost
-                known.append(replace(last, stop=stop, lost=lost))
+                of_topic.append(replace(last, stop=stop, lost=lost))
             else:
-                known.append(loss)
+                of_topic.append(loss)
         gone = sorted(chain.from_iterable(topics.values()), key=attrgetter("start", "topic"))
         return Expired((*gone[-_MOST_EXPIRED:],), bag, going)
 
@@ -232,14 +232,14 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
     """
     if DELETED.append(bag_dir, deleted) <= _MOST_DELETED_BYTES:
         return
-    known = _deleted(bag_dir)
+    known = _deleted_by_recording(bag_dir)
     if known is None:
         return
-    there = {name for name in known if name and (bag_dir / name).is_dir()}
-    gone = (span for name, row in known.items() if name not in there for span in row.spans)
+    present = {name for name in known if name and (bag_dir / name).is_dir()}
+    gone = (span for name, row in known.items() if name not in present for span in row.spans)
     rows, size = [Deleted("", (), (*united(gone, _TOUCHING_NS)[-_MOST_SPANS:],))], 0
     # The newest recordings come last, so they are the first to stay.
-    for name in reversed([name for name in known if name in there]):
+    for name in reversed([name for name in known if name in present]):
         size += len(DELETED.text([known[name]]))
         if size > _MOST_DELETED_BYTES // 2:
             break
@@ -248,27 +248,29 @@ def append_deleted(bag_dir: Path, deleted: Iterable[Deleted]) -> None:
 
 
 @until_changed(DELETED_FILE)
-def _deleted(bag_dir: Path) -> Mapping[str, Deleted]:
+def _deleted_by_recording(bag_dir: Path) -> Mapping[str, Deleted]:
     files: dict[str, dict[str, None]] = {}
     spans: dict[str, list[tuple[Ns, Ns]]] = {}
     for row in DELETED.rows(bag_dir):
         files.setdefault(row.recording, {}).update(dict.fromkeys(row.files))
         spans.setdefault(row.recording, []).extend(row.spans)
     return {
-        name: Deleted(name, (*known,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),))
-        for name, known in files.items()
+        name: Deleted(
+            name, (*names_of_files,), (*united(spans[name], _APART_NS if name else _TOUCHING_NS),)
+        )
+        for name, names_of_files in files.items()
     }
 
 
 def read_deleted(bag_dir: Path) -> Mapping[str, Deleted]:
     """Returns what was deleted, by recording; nothing where the file cannot be read."""
-    return _deleted(bag_dir) or {}
+    return _deleted_by_recording(bag_dir) or {}
 
 
 def deleted_spans(bag_dir: Path) -> Sequence[tuple[Ns, Ns]]:
     """Returns the log times (half-open) of all that was deleted, sorted and apart."""
-    every = (span for row in read_deleted(bag_dir).values() for span in row.spans)
-    return tuple(united(every, _TOUCHING_NS))
+    spans = (span for row in read_deleted(bag_dir).values() for span in row.spans)
+    return tuple(united(spans, _TOUCHING_NS))
 
 
 # superseded.json
@@ -324,10 +326,14 @@ class Thinned:
         """Returns what does not end before a day (UTC), as names have it."""
         return Thinned(
             self.since,
-            tuple(each for each in self.silences if utc_day(each[2]) >= day),
-            tuple(each for each in self.pauses if utc_day(each[1]) >= day),
-            tuple(each for each in self.set_back if utc_day(each[0]) >= day),
-            tuple(each for each in self.left_open if utc_day(each) >= day),
+            tuple(
+                (topic, first, last, on_ns, goes_on)
+                for topic, first, last, on_ns, goes_on in self.silences
+                if utc_day(last) >= day
+            ),
+            tuple((start, end) for start, end in self.pauses if utc_day(end) >= day),
+            tuple((time, by_ns) for time, by_ns in self.set_back if utc_day(time) >= day),
+            tuple(time for time in self.left_open if utc_day(time) >= day),
         )
 
 
@@ -414,7 +420,7 @@ def append_receipts(bag_dir: Path, receipts: Iterable[Receipt]) -> None:
     rows = SHIPPED.rows(bag_dir)
     if len(rows) > _SPARE_RECEIPTS:
         newest = {receipt.bag: receipt for receipt in rows}
-        present = [each for path, each in newest.items() if (bag_dir / path).exists()]
+        present = [receipt for path, receipt in newest.items() if (bag_dir / path).exists()]
         if len(rows) > _SPARE_RECEIPTS + 2 * len(present):
             SHIPPED.replace(bag_dir, present)
 
@@ -472,12 +478,12 @@ def read_forgettings(bag_dir: Path) -> Sequence[Forgetting]:
         OSError: the file cannot be read.
         ValueError: a line is damaged, or the file too large: what was deleted is unknown.
     """
-    found: dict[Forgetting, None] = {}
+    forgettings: dict[Forgetting, None] = {}
     for number, row in FORGOTTEN.all_rows(bag_dir):
         if not (row.topics or row.bags):
             raise ValueError(f"line {number}: it names no topics and no bags")
-        found[row] = None
-    return [*found]
+        forgettings[row] = None
+    return [*forgettings]
 
 
 # erasing.json
@@ -529,9 +535,9 @@ class Erasure:
             return None
         times = (log_time, publish_time) if topic in self.latched else (log_time,)
         for time in times:
-            nth = bisect_right(self.windows, time, key=lambda window: window[0])
-            if nth and time < self.windows[nth - 1][1]:
-                return self.windows[nth - 1]
+            begun = bisect_right(self.windows, time, key=itemgetter(0))
+            if begun and time < self.windows[begun - 1][1]:
+                return self.windows[begun - 1]
         return None
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
@@ -628,8 +634,9 @@ class Gate(NamedTuple):
         """Returns whether a file of a recording is held back; both by their names."""
         if not self.holds_some(recording):
             return False
-        files = {} if self.state is None else self.state.recordings[recording].files
-        return files.get(file) is not FileStep.RELEASED
+        if self.state is None:
+            return True
+        return self.state.recordings[recording].files.get(file) is not FileStep.RELEASED
 
     def holds_some(self, recording: str) -> bool:
         """Returns whether files of a recording are held back, or may come to be."""
@@ -657,8 +664,8 @@ def read_gate(bag_dir: Path) -> Gate:
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
     """Returns the stretches that were excluded between two log times."""
     state = read_gate(bag_dir).state
-    known = () if state is None else state.excluded
-    return [each for each in known if each.start < stop and start < each.stop]
+    stretches = () if state is None else state.excluded
+    return [stretch for stretch in stretches if stretch.start < stop and start < stretch.stop]
 
 
 # triggers.json

@@ -123,19 +123,15 @@ class BagTable:
         is_first = not (self._files or self._unchanged)
         known = self._known() if self._known is not None and is_first else {}
         unchanged = self._take_known(scanned.stamps, known, context)
-        changed = self._forget(scanned.gone) | self._examine(
+        changed = self._drop(scanned.gone) | self._examine(
             scanned.stamps, known, context, unchanged if is_first else None
         )
-        if unchanged:
-            # Sorted here by numpy: sorting what is sorted takes no time later.
-            starts = np.array([bag.start for bag in unchanged], np.int64)
-            unchanged = [unchanged[at] for at in np.argsort(starts, kind="stable").tolist()]
-        hidden = frozenset(self._hidden)
-        removed, added = self._count(changed | hidden, context)
-        changed |= hidden - self._hidden
-        added = [*unchanged, *added]
+        hidden_before = frozenset(self._hidden)
+        removed, counted = self._update_counted(changed | hidden_before, context)
+        changed |= hidden_before - self._hidden
+        added = [*_by_start(unchanged), *counted]
         self._timeline = self._timeline.changed(removed, added)
-        self._settle(context)
+        self._keep_rows_of_settled(context)
         is_new = bool(changed or unchanged) or not scanned.is_like(self._scanned)
         # Without the stamps, of which the first scan has one for each file.
         self._scanned = replace(scanned, stamps={}, gone=set())
@@ -143,23 +139,23 @@ class BagTable:
 
     def snapshot(self, now: Ns) -> Snapshot:
         """Returns what is known since the last scan."""
-        timeline, scanned = self._counting(), self._scanned or ScanResult()
+        timeline, scanned = self._without_superseded(), self._scanned or ScanResult()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty: list[Path] = []
-        for path, each in self._counted.items():
-            if each.aside is not None:
-                aside.setdefault(each.state, []).append(each.aside)
-            elif each.bag is None:
+        for path, classification in self._counted.items():
+            if classification.aside is not None:
+                aside.setdefault(classification.state, []).append(classification.aside)
+            elif classification.bag is None:
                 empty.append(Path(path))
-                silent.update(each.silent)
+                silent.update(classification.silent)
         return Snapshot(
             timeline=timeline,
-            active=_by_path(
+            active=_sorted_by_path(
                 [*aside.get(FileState.ACTIVE, ()), *aside.get(FileState.HELD_BACK, ())]
             ),
-            damaged=_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
-            unread=_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
+            damaged=_sorted_by_path([*aside.get(FileState.DAMAGED, ()), *scanned.damaged]),
+            unread=_sorted_by_path([*aside.get(FileState.UNREAD, ()), *scanned.links]),
             empty=tuple(sorted(empty)),
             silent_topics=frozenset(silent - timeline.types.keys()),
             scanned_at=now,
@@ -167,29 +163,27 @@ class BagTable:
             metadata_folders=tuple(sorted(scanned.metadata_folders)),
         )
 
-    def _counting(self) -> Timeline:
-        """Returns the bags without those of which thinned days have what stays, if there are."""
+    def _without_superseded(self) -> Timeline:
+        """Returns the timeline without the bags in whose place thinned days answer, if any do."""
         superseded = read_superseded(self._bag_dir)
-        days = {name: self._bag(name) for name in superseded.days}
+        days = {name: self._bag_named(name) for name in superseded.days}
         whole = {
             name
             for name, day in days.items()
             if day is not None and (day.size, day.mtime_ns) == superseded.days[name]
         }
-        bags = [
-            *filter(
-                None, (self._bag(name) for name, day in superseded.bags.items() if day in whole)
-            )
-        ]
+        names = (name for name, day in superseded.bags.items() if day in whole)
+        bags = [*filter(None, map(self._bag_named, names))]
         return self._timeline.changed(bags, ()) if bags else self._timeline
 
-    def _bag(self, name: str) -> BagFile | None:
+    def _bag_named(self, name: str) -> BagFile | None:
         """Returns the bag at a path below the bag directory, if that answers."""
         path = str(self._bag_dir / name)
         if path in self._unchanged:
-            return self._unchanged[path][0]
-        found = self._counted.get(path)
-        return None if found is None else found.bag
+            bag, _ = self._unchanged[path]
+            return bag
+        classification = self._counted.get(path)
+        return None if classification is None else classification.bag
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
         """Returns what retention considers; `named` are recordings that are being written."""
@@ -215,8 +209,8 @@ class BagTable:
         if not self._unchanged:
             return
         for path, stamp in [*scanned.stamps.items()]:
-            known = self._stamp(path)
-            if known and settled(stamp.mtime_ns, context.now) and stamp.matches(known):
+            before = self._stamp(path)
+            if before and settled(stamp.mtime_ns, context.now) and stamp.matches(before):
                 del scanned.stamps[path]
             else:
                 self._reactivate(path, context)
@@ -242,7 +236,7 @@ class BagTable:
         bag, inode = self._unchanged.get(path, (None, 0))
         return bag and Stamp(bag.size, bag.mtime_ns, 0, inode, bag.sidecar_ns)
 
-    def _forget(self, paths: Iterable[str]) -> set[str]:
+    def _drop(self, paths: Iterable[str]) -> set[str]:
         """Drops the state of files; returns those that were classified."""
         forgotten = set()
         for path in paths:
@@ -252,7 +246,7 @@ class BagTable:
                 forgotten.add(path)
         return forgotten
 
-    def _settle(self, context: ScanContext) -> None:
+    def _keep_rows_of_settled(self, context: ScanContext) -> None:
         """Keeps no more than a row of bags that will not change."""
         for path in [*self._files]:
             classification = self._counted.get(path)
@@ -260,13 +254,13 @@ class BagTable:
                 self._add_unchanged(path, classification)
                 del self._classified[path], self._counted[path]
 
-    def _is_settled(self, path: str, found: Classification, context: ScanContext) -> bool:
+    def _is_settled(self, path: str, classification: Classification, context: ScanContext) -> bool:
         """Returns whether a bag is closed and old, and has no other form or link."""
         notes = self._files[path]
         return (
-            found.state is FileState.CLOSED
-            and found.bag is not None
-            and found.aside is None
+            classification.state is FileState.CLOSED
+            and classification.bag is not None
+            and classification.aside is None
             and notes.trusted
             # A compressed bag may lie beside the file it was made from.
             and notes.kind in PLAIN_KINDS
@@ -275,11 +269,11 @@ class BagTable:
             and other_form(path) not in self._files
         )
 
-    def _add_unchanged(self, path: str, found: Classification) -> None:
-        if found.bag is not None:
+    def _add_unchanged(self, path: str, classification: Classification) -> None:
+        if classification.bag is not None:
             if self._packs:
-                found.bag.summary.pack()
-            self._unchanged[path] = found.bag, self._files.pop(path).stamp.inode
+                classification.bag.summary.pack()
+            self._unchanged[path] = classification.bag, self._files.pop(path).stamp.inode
 
     def _take_known(
         self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
@@ -293,22 +287,22 @@ class BagTable:
         last = context.now - max(context.three_splits, YOUNG_NS)
         kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
-        taken = []
+        bags = []
         for path, stamp in [*stamps.items()]:
-            file = known.get(path)
+            bag = known.get(path)
             if (
-                file is not None
-                and stamp.is_of(file)
+                bag is not None
+                and stamp.is_of(bag)
                 and stamp.mtime_ns < last
                 and path.endswith(kinds)
-                and (schema := file.summary.schema).complete
+                and (schema := bag.summary.schema).complete
                 and schema.topics
                 and not (compressed and other_form(path) in compressed)
             ):
-                self._unchanged[file.file] = file, stamp.inode
-                taken.append(file)
+                self._unchanged[bag.file] = bag, stamp.inode
+                bags.append(bag)
                 del stamps[path]
-        return taken
+        return bags
 
     def _examine(
         self,
@@ -332,7 +326,7 @@ class BagTable:
                 classification = classify(notes, self._reader, context)
             except BagVanishedError:
                 self._tree.distrust(path)
-                changed |= self._forget([path])
+                changed |= self._drop([path])
                 continue
             if notes.must_be_watched(classification, context):
                 self._watched.add(path)
@@ -363,14 +357,14 @@ class BagTable:
             notes.restore(known.summary)
         return True
 
-    def _count(
+    def _update_counted(
         self, changed: Iterable[str], context: ScanContext
     ) -> tuple[list[BagFile], list[BagFile]]:
         """Updates which files count; returns the bags that left and those that came."""
         removed, added = [], []
-        paths = {form for each in changed for form in (each, other_form(each))}
+        paths = {form for path in changed for form in (path, other_form(path))}
         for path in paths:
-            before, after = self._counted.pop(path, None), self._that_counts(path, context)
+            before, after = self._counted.pop(path, None), self._counted_form(path, context)
             if after is not None:
                 self._counted[path] = after
             if before == after:
@@ -381,27 +375,33 @@ class BagTable:
                 added.append(after.bag)
         return removed, added
 
-    def _that_counts(self, path: str, context: ScanContext) -> Classification | None:
+    def _counted_form(self, path: str, context: ScanContext) -> Classification | None:
         """Returns a file's classification; None if there is none, or another file counts.
 
         While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
         complete ones that have been there for three splits are kept on purpose: both count.
         """
         self._hidden.discard(path)
-        own, other = self._classified.get(path), self._classified.get(other_form(path))
-        if own is None or other is None or own.state > other.state:
-            return own
+        classification, other = self._classified.get(path), self._classified.get(other_form(path))
+        if classification is None or other is None or classification.state > other.state:
+            return classification
         forms = (self._files.get(form) for form in (path, other_form(path)))
         is_kept = not any(notes is not None and notes.grew_lately(context) for notes in forms)
-        if is_kept and own.state is FileState.UNREAD:
-            return own
-        if own.state == other.state and (
-            (is_kept and own.state is FileState.CLOSED) or not path.endswith(COMPRESSED)
+        if is_kept and classification.state is FileState.UNREAD:
+            return classification
+        if classification.state == other.state and (
+            (is_kept and classification.state is FileState.CLOSED) or not path.endswith(COMPRESSED)
         ):
-            return own
+            return classification
         self._hidden.add(path)
         return None
 
 
-def _by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
-    return tuple(sorted(asides, key=lambda each: each.path))
+def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
+    return tuple(sorted(asides, key=lambda aside: aside.path))
+
+
+def _by_start(bags: list[BagFile]) -> list[BagFile]:
+    """Returns bags by start; by numpy, since sorting what is sorted takes no time later."""
+    starts = np.array([bag.start for bag in bags], np.int64)
+    return [bags[row] for row in np.argsort(starts, kind="stable").tolist()]

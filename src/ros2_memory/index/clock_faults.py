@@ -137,19 +137,19 @@ def check_dates(
         steps: where a clock was set back while a recording ran.
         now: the present by this machine's clock.
     """
-    parts = timeline.recorded_segments
+    segments = timeline.recorded_segments
     limit = max_plausible(now)
     ahead = [
         ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
-        for part in parts
-        if part.latest > limit
-        for bag in part.bags
+        for segment in segments
+        if segment.latest > limit
+        for bag in segment.bags
         if bag.end > limit
     ]
-    recorded = chain.from_iterable(part.bags for part in parts)
+    recorded = chain.from_iterable(segment.bags for segment in segments)
     first = takewhile(lambda bag: bag.start < FIRST_BAGS_NS, recorded)
     unset = [ClockFault(bag, FaultyClock.UNSET) for bag in first if bag.end <= limit]
-    bags = sum(len(part.bags) for part in parts)
+    bags = sum(len(segment.bags) for segment in segments)
     note: str | None = None
     if len(ahead) == bags and bags:
         ahead = [fault._replace(misleads=False) for fault in ahead]
@@ -160,20 +160,20 @@ def check_dates(
     faults += _step_faults(steps, {fault.bag.file for fault in faults}, timeline)
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
-        dating = replace(dating, faults=tuple(each._replace(misleads=False) for each in faults))
-    earliest, latest = _span(parts, [fault.bag for fault in dating.faults if fault.misleads])
+        dating = replace(dating, faults=tuple(fault._replace(misleads=False) for fault in faults))
+    earliest, latest = _span(segments, [fault.bag for fault in dating.faults if fault.misleads])
     return replace(dating, earliest=earliest, latest=latest)
 
 
 def _step_faults(
     steps: Iterable[StepBack],
-    known: Collection[str],
+    faulty: Collection[str],
     timeline: Timeline,
 ) -> Iterator[ClockFault]:
     """Yields the faults of clocks that were set back, if no other fault explains the step."""
-    named: set[str] = set()
+    strays: set[str] = set()
     for step in steps:
-        if step.before.file in known or step.after.file in known:
+        if step.before.file in faulty or step.after.file in faulty:
             continue
         within = step.before is step.after
         before = None if within else step.before
@@ -187,22 +187,22 @@ def _step_faults(
         ]
         # Of equals the earlier one is wrong: a clock that loses its time falls back.
         for bag in min(sides, key=len):
-            if bag.file not in named and bag.file not in known:
-                named.add(bag.file)
+            if bag.file not in strays and bag.file not in faulty:
+                strays.add(bag.file)
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def _span(parts: Sequence[Segment], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
+def _span(segments: Sequence[Segment], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
     """Returns the first start and the last end of the bags that are not left out."""
     starts = sorted(bag.start for bag in left_out)
     files = {bag.file for bag in left_out}
     spans: list[tuple[Ns, Ns]] = []
-    for part in parts:
-        first, last = part.bags[0].start, part.bags[-1].start
+    for segment in segments:
+        first, last = segment.bags[0].start, segment.bags[-1].start
         if bisect_left(starts, first) == bisect_right(starts, last):
-            spans.append((first, part.latest))
+            spans.append((first, segment.latest))
         else:
-            spans += [(bag.start, bag.end) for bag in part.bags if bag.file not in files]
+            spans += [(bag.start, bag.end) for bag in segment.bags if bag.file not in files]
     if not spans:
         return None, None
     return min(first for first, _ in spans), max(last for _, last in spans)

@@ -241,7 +241,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
             empty = notes.stamp.size == 0
             notes.closing = Closing.OPEN if empty else reader.closing(notes.path)
         if _is_active(notes, context) and not _is_copy(notes, reader, context):
-            return _active(notes, reader, context)
+            return _classify_active(notes, reader, context)
         if notes.summary is None and notes.fault is None:
             notes.summary = reader.summarize(notes.path)
     except BagVanishedError:
@@ -250,7 +250,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
         notes.fault, notes.is_transient = error.reason, isinstance(error, BagUnreachableError)
     if notes.summary is None:
         return _set_aside(FileState.DAMAGED, notes, notes.fault or "it cannot be read")
-    return _readable(notes, notes.summary)
+    return _classify_readable(notes, notes.summary)
 
 
 def files_in_metadata(path: Path) -> frozenset[str]:
@@ -291,14 +291,14 @@ def _is_copy(notes: FileNotes, reader: BagReader, context: ScanContext) -> bool:
     return abs(notes.stamp.mtime_ns - summary.end) > context.three_splits
 
 
-def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
+def _classify_active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classification:
     """Returns the state of an active file; as a bag, too, as far as it can be one.
 
     Raises:
         BagVanishedError: the file does not exist any more.
     """
-    growing = notes.was_seen_growing(context) or context.names(notes.path)
-    aside = SetAside(notes.path, _ACTIVE, growing=growing)
+    is_growing = notes.was_seen_growing(context) or context.names(notes.path)
+    aside = SetAside(notes.path, _ACTIVE, growing=is_growing)
     if not context.include_active or notes.kind != ".mcap":
         return Classification(FileState.ACTIVE, aside=aside)
     summary = _summary_so_far(notes, reader)
@@ -310,7 +310,7 @@ def _active(notes: FileNotes, reader: BagReader, context: ScanContext) -> Classi
     if not summary.complete:
         # The first note is on the early end of the file, which goes on.
         summary = summary.replaced(notes=summary.notes[1:])
-    bag = _bag(notes, BagState.ACTIVE, summary)
+    bag = _bag_file(notes, BagState.ACTIVE, summary)
     answering = replace(aside, reason=_ANSWERS, answers=True, until=bag.end)
     return Classification(FileState.ACTIVE, bag, answering)
 
@@ -331,7 +331,7 @@ def _summary_so_far(notes: FileNotes, reader: BagReader) -> BagSummary | None:
     return notes.summary
 
 
-def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
+def _classify_readable(notes: FileNotes, summary: BagSummary) -> Classification:
     is_closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
         if is_closed and not summary.notes:
@@ -340,11 +340,11 @@ def _readable(notes: FileNotes, summary: BagSummary) -> Classification:
             return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
         closes = _RECOVER if notes.kind == ".mcap" else ""
         return _set_aside(FileState.DAMAGED, notes, _NO_MESSAGE + closes)
-    bag = _bag(notes, BagState.CLOSED if is_closed else BagState.INCOMPLETE, summary)
+    bag = _bag_file(notes, BagState.CLOSED if is_closed else BagState.INCOMPLETE, summary)
     return Classification(FileState.CLOSED if is_closed else FileState.INCOMPLETE, bag=bag)
 
 
-def _bag(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
+def _bag_file(notes: FileNotes, state: BagState, summary: BagSummary) -> BagFile:
     stamp = notes.stamp
     return BagFile(
         notes.file,

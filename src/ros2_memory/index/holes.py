@@ -69,8 +69,8 @@ def pauses_within(bags: Sequence[BagFile]) -> Iterator[Pause]:
 
 def _follows(before: BagFile, after: BagFile) -> bool:
     """Returns whether a bag is the next split of the same recording."""
-    one, other = split_of(before.file), split_of(after.file)
-    return one is not None and other == (one[0], one[1] + 1)
+    name, next_name = split_of(before.file), split_of(after.file)
+    return name is not None and next_name == (name.series, name.number + 1)
 
 
 class Rhythm:
@@ -113,8 +113,8 @@ class Rhythm:
             return pause.length > _LONGEST_LEAST_NS
         # In the split after a stall one topic may still be silent.
         enough = any if pause.ran_on else all
-        several = enough(len(self._periods_of(bag)) > 1 for bag in pause.bags)
-        if several and pause.length > _GAP_PERIODS * self._slower(pause):
+        have_two_topics = enough(len(self._periods_of(bag)) > 1 for bag in pause.bags)
+        if have_two_topics and pause.length > _GAP_PERIODS * self._slower(pause):
             return True
         if len(pause.bags) == 1:
             return False
@@ -124,13 +124,12 @@ class Rhythm:
 
     def _slower(self, pause: Pause) -> Ns:
         """Returns the period of the second most frequent topic, or of the only one, in the bags."""
-        return max(known[-1] for known in map(self._periods_of, pause.bags) if known)
+        return max(periods[-1] for periods in map(self._periods_of, pause.bags) if periods)
 
     def _periods_of(self, bag: BagFile) -> list[Ns]:
         """Returns the shortest two usual periods of topics in a bag, as far as it has them."""
         schema: SummarySchema = bag.summary.schema
-        known = self._by_schema.get(id(schema))
-        if known is None:
-            known = sorted(map(self._periods.__getitem__, self._periods.keys() & schema.positions))
-            self._by_schema[id(schema)] = known[:2]
-        return known[:2]
+        if id(schema) not in self._by_schema:
+            topics = self._periods.keys() & schema.positions
+            self._by_schema[id(schema)] = sorted(self._periods[topic] for topic in topics)[:2]
+        return self._by_schema[id(schema)]

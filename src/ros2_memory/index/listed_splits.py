@@ -21,10 +21,12 @@ from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.index.scan import settled
+from ros2_memory.index.segment import Tally
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.snapshot import Snapshot
 
 _MAX_CACHED_FOLDERS: Final = 65_536
@@ -47,11 +49,15 @@ class Absent(NamedTuple):
     unreadable: bool = False
 
 
-_Stamp: TypeAlias = "tuple[int, int, int]"
-"""Mtime and size of a metadata.yaml, and mtime of its folder: of names added and deleted."""
+class _Stamp(NamedTuple):
+    """Of a metadata.yaml; the mtime of its folder shows names that were added and deleted."""
+
+    mtime_ns: Ns
+    size: int
+    folder_mtime_ns: Ns
 
 
-class _Listed(NamedTuple):
+class _FolderListing(NamedTuple):
     """A recording's metadata.yaml compared with the bag files in its folder.
 
     Attributes:
@@ -69,23 +75,23 @@ class _Listed(NamedTuple):
     is_total: bool = False
 
 
-Listings: TypeAlias = "dict[str, tuple[_Stamp, _Listed]]"
+Listings: TypeAlias = "dict[str, tuple[_Stamp, _FolderListing]]"
 """By folder: how it was when its metadata.yaml was read, and what that listed."""
 
 
-def listing_to_json(stamp: _Stamp, listed_there: _Listed) -> str:
+def listing_to_json(stamp: _Stamp, listing: _FolderListing) -> str:
     """Returns what was read of a folder as one line."""
-    return json.dumps([stamp, listed_there])
+    return json.dumps([stamp, listing])
 
 
-def listing_from_json(text: str) -> tuple[_Stamp, _Listed]:
+def listing_from_json(text: str) -> tuple[_Stamp, _FolderListing]:
     """Returns what was read of a folder.
 
     Raises:
         ValueError, TypeError, OverflowError: the text is nothing of that kind.
     """
     (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
-    return (mtime, size, folder), _Listed(
+    return _Stamp(mtime, size, folder), _FolderListing(
         tuple((str(name), int(count)) for name, count in first),
         tuple((str(name), int(count)) for name, count in later),
         None if bags is None else int(bags),
@@ -111,44 +117,49 @@ def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Ab
             bags[name] += tally.bags
             messages[name] += tally.messages
     absent, deleted = [], read_deleted(bag_dir)
-    for path, listed_there in _listed(snapshot, bag_dir, known):
-        if listed_there is None or listed_there.bags is None:
-            absent.append(Absent(path, unreadable=True))
+    for folder, listing in _folder_listings(snapshot, bag_dir, known):
+        if listing is None or listing.bags is None:
+            absent.append(Absent(folder, unreadable=True))
             continue
         # Asked only where the first file is missing: it takes longer than all else here.
-        is_own = bool(listed_there.first) and _may_be_deleted(own, bag_dir, Path(path))
-        noted = deleted.get(path.removeprefix(f"{bag_dir}/"))
-        gone = frozenset[str]() if noted is None else frozenset(noted.files)
-        absent.append(_compare(path, listed_there, bags[path], messages[path], gone, is_own=is_own))
-    return [each for each in absent if each.files or each.messages or each.unreadable]
+        is_own = bool(listing.first) and _may_be_deleted(own, bag_dir, Path(folder))
+        of_recording = deleted.get(folder.removeprefix(f"{bag_dir}/"))
+        gone = frozenset[str]() if of_recording is None else frozenset(of_recording.files)
+        present = Tally(bags[folder], messages[folder])
+        absent.append(_absent_from(folder, listing, present, gone, is_own=is_own))
+    return [
+        recording
+        for recording in absent
+        if recording.files or recording.messages or recording.unreadable
+    ]
 
 
 def absent_files(absent: Sequence[Absent]) -> list[SetAside]:
     """Returns missing files as closed files that cannot be read."""
-    return [SetAside(Path(each.folder) / name, _MISSING) for each in absent for name in each.files]
+    return [
+        SetAside(Path(recording.folder) / name, _MISSING)
+        for recording in absent
+        for name in recording.files
+    ]
 
 
 def describe_absent(absent: Sequence[Absent]) -> Iterator[str]:
     """Yields sentences on what is missing: counted, with the first few recordings named."""
-    missing = [each for each in absent if not each.unreadable]
+    missing = [recording for recording in absent if not recording.unreadable]
     if missing:
         parts = []
-        if files := sum(len(each.files) for each in missing):
+        if files := sum(len(recording.files) for recording in missing):
             parts.append(counted(files, "missing file", "missing files"))
-        if messages := sum(each.messages for each in missing):
-            noun, plural = (
-                "message that no file here contains",
-                "messages that no file here contains",
-            )
-            parts.append(counted(messages, noun, plural))
+        if messages := sum(recording.messages for recording in missing):
+            parts.append(f"{counted(messages, 'message')} that no file here contains")
         yield f"metadata.yaml of {_names(missing)} lists {' and '.join(parts)}"
-    unreadable = [each for each in absent if each.unreadable]
+    unreadable = [recording for recording in absent if recording.unreadable]
     if unreadable:
         yield f"metadata.yaml of {_names(unreadable)} cannot be read: what it lists is not compared"
 
 
 def _names(absent: Sequence[Absent]) -> str:
-    names = [PurePosixPath(each.folder).name for each in absent]
+    names = [PurePosixPath(recording.folder).name for recording in absent]
     return listed(names[:MAX_NAMED], len(names))
 
 
@@ -163,60 +174,61 @@ def _may_be_deleted(own: OwnRecordings, bag_dir: Path, folder: Path) -> bool:
         return True
 
 
-def _compare(
-    path: str, found: _Listed, bags: int, messages: int, gone: Collection[str], *, is_own: bool
+def _absent_from(
+    folder: str, listing: _FolderListing, present: Tally, gone: Collection[str], *, is_own: bool
 ) -> Absent:
-    """Compares what is listed with the bags of a folder, which hold `messages` messages.
+    """Returns what a folder lists and its bags do not hold.
 
     `gone` are names of files that retention deleted.
     """
-    every = found.later if is_own else (*found.first, *found.later)
-    missing = [each for each in every if each[0] not in gone]
+    expected = listing.later if is_own else (*listing.first, *listing.later)
+    missing = [(name, count) for name, count in expected if name not in gone]
     lost = sum(count for _, count in missing)
     # A bag that is damaged or cut by a handover holds fewer that count, and is not compared. Nor is
     # the number of all files together, where some were deleted.
-    is_comparable = bags == found.bags and not (found.is_total and (is_own or gone))
-    if found.messages is not None and is_comparable:
-        lost += max(found.messages - messages, 0)
-    return Absent(path, tuple(name for name, _ in missing), lost)
+    is_comparable = present.bags == listing.bags and not (listing.is_total and (is_own or gone))
+    if listing.messages is not None and is_comparable:
+        lost += max(listing.messages - present.messages, 0)
+    return Absent(folder, tuple(name for name, _ in missing), lost)
 
 
-def _listed(
+def _folder_listings(
     snapshot: Snapshot, bag_dir: Path, known: Listings
-) -> Iterator[tuple[str, _Listed | None]]:
+) -> Iterator[tuple[str, _FolderListing | None]]:
     """Yields the folders with a metadata.yaml that is not being written, and what that lists.
 
-    None where the folder or the file cannot be read.
+    None where the folder or the file cannot be read. What was read is added to `known`.
     """
     now = snapshot.scanned_at
-    for path in snapshot.metadata_folders:
+    for folder in snapshot.metadata_folders:
         try:
-            stamp = _stamp(path)
-            if not settled(stamp[0], now):
+            stamp = _stamp_of(folder)
+            if not settled(stamp.mtime_ns, now):
                 continue
-            listing = known.get(path)
-            if listing is None or listing[0] != stamp:
-                listing = stamp, _read(bag_dir, path)
+            read_at, listing = known.get(folder, (None, None))
+            if listing is None or read_at != stamp:
+                listing = _read_listing(bag_dir, folder)
         except FileNotFoundError:
             continue
         except (OSError, ValueError):
-            yield path, None
+            yield folder, None
             continue
         # A folder that changed just now may change again within the same mtime.
-        if settled(stamp[2], now):
-            known[path] = listing
-        yield path, listing[1]
+        if settled(stamp.folder_mtime_ns, now):
+            known[folder] = stamp, listing
+        yield folder, listing
     if len(known) > _MAX_CACHED_FOLDERS:
         known.clear()
 
 
-def _stamp(folder: str) -> _Stamp:
+def _stamp_of(folder: str) -> _Stamp:
     # As texts: a path for each folder takes longer than to look at it.
     status = os.lstat(f"{folder}/{METADATA_FILE}")
-    return status.st_mtime_ns, status.st_size, os.stat(folder).st_mtime_ns  # noqa: PTH116
+    changed = os.stat(folder).st_mtime_ns  # noqa: PTH116
+    return _Stamp(status.st_mtime_ns, status.st_size, changed)
 
 
-def _read(bag_dir: Path, folder: str) -> _Listed:
+def _read_listing(bag_dir: Path, folder: str) -> _FolderListing:
     """Reads a folder with a metadata.yaml.
 
     Raises:
@@ -229,13 +241,13 @@ def _read(bag_dir: Path, folder: str) -> _Listed:
     present = {bare_name(name) for name in files if bag_kind(name)}
     names = tuple(dict.fromkeys(map(bare_name, listing.names)))
     if not names:
-        return _Listed()
+        return _FolderListing()
     counts = listing.messages
     there = [name for name in names if name in present]
     missing = [(name, counts.get(name, 0)) for name in names if name not in present]
     begun = names.index(there[0]) if there else len(names)
     messages = sum(counts.get(name, 0) for name in there) if counts else listing.total
-    return _Listed(
+    return _FolderListing(
         tuple(missing[:begun]),
         tuple(missing[begun:]),
         bags=sum(counts.get(name, 1) > 0 for name in there),

@@ -69,43 +69,46 @@ class RecordingFilter:
     def __init__(self, bag_dir: Path, name: str) -> None:
         self._is_named = paths_named(str(bag_dir), name).fullmatch
         self._lock = threading.Lock()
-        self._known: WeakKeyDictionary[Segment, list[BagFile]] = WeakKeyDictionary()
+        self._bags_by_segment: WeakKeyDictionary[Segment, list[BagFile]] = WeakKeyDictionary()
         self._whole: Timeline | None = None
         self._narrowed = Timeline()
 
     def narrowed(self, snapshot: Snapshot) -> Snapshot:
         """Returns the part of a snapshot that is of the recording; it may be empty."""
-
-        def of(files: tuple[SetAside, ...]) -> tuple[SetAside, ...]:
-            return tuple(each for each in files if self._is_named(str(each.path)))
-
-        timeline = self._timeline(snapshot.timeline)
+        timeline = self._narrowed_timeline(snapshot.timeline)
         return replace(
             snapshot,
             timeline=timeline,
-            active=of(snapshot.active),
-            damaged=of(snapshot.damaged),
-            unread=of(snapshot.unread),
-            empty=tuple(each for each in snapshot.empty if self._is_named(str(each))),
+            active=self._named(snapshot.active),
+            damaged=self._named(snapshot.damaged),
+            unread=self._named(snapshot.unread),
+            empty=tuple(path for path in snapshot.empty if self._is_named(str(path))),
             silent_topics=timeline.silent - timeline.types.keys(),
             metadata_folders=tuple(filter(self._is_named, snapshot.metadata_folders)),
         )
 
-    def _timeline(self, whole: Timeline) -> Timeline:
+    def _named(self, asides: tuple[SetAside, ...]) -> tuple[SetAside, ...]:
+        return tuple(aside for aside in asides if self._is_named(str(aside.path)))
+
+    def _narrowed_timeline(self, whole: Timeline) -> Timeline:
         with self._lock:
             if whole is not self._whole:
                 before = {bag.file: bag for bag in self._narrowed.bags}
-                after = {bag.file: bag for each in whole.segments for bag in self._of(each)}
+                after = {
+                    bag.file: bag for segment in whole.segments for bag in self._bags_in(segment)
+                }
                 removed = [bag for file, bag in before.items() if after.get(file) is not bag]
                 added = [bag for file, bag in after.items() if before.get(file) is not bag]
                 self._narrowed = self._narrowed.changed(removed, added)
                 self._whole = whole
             return self._narrowed
 
-    def _of(self, segment: Segment) -> list[BagFile]:
-        if segment not in self._known:
-            self._known[segment] = [bag for bag in segment.bags if self._is_named(bag.file)]
-        return self._known[segment]
+    def _bags_in(self, segment: Segment) -> list[BagFile]:
+        if segment not in self._bags_by_segment:
+            self._bags_by_segment[segment] = [
+                bag for bag in segment.bags if self._is_named(bag.file)
+            ]
+        return self._bags_by_segment[segment]
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
@@ -114,10 +117,10 @@ def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
     With `data.recording` each of these names, below the bag directory, is one recording.
     """
     loose = loose_bags(snapshot)
-    found: dict[str, list[BagFile]] = {}
+    recordings: dict[str, list[BagFile]] = {}
     for bag in snapshot.bags:
-        found.setdefault(loose.get(bag.file) or folder_of(bag), []).append(bag)
-    return found
+        recordings.setdefault(loose.get(bag.file) or folder_of(bag), []).append(bag)
+    return recordings
 
 
 def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:
@@ -144,15 +147,17 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
         folder = folder_of(bag)
         if folder not in whole and not is_named_after_folder(bag.file):
             folders.setdefault(folder, []).append(bag)
-    found: dict[str, str] = {}
+    recordings: dict[str, str] = {}
     for bags in folders.values():
         series: dict[str, list[BagFile]] = {}
         for bag in bags:
             series.setdefault(_series_of(bag.file), []).append(bag)
         for name, members in series.items():
-            is_one = _follow(members)
-            found.update({bag.file: name if is_one else stem_of(bag.file) for bag in members})
-    return found
+            are_splits = _are_splits(members)
+            recordings.update(
+                {bag.file: name if are_splits else stem_of(bag.file) for bag in members}
+            )
+    return recordings
 
 
 def is_named_after_folder(file: str) -> bool:
@@ -163,16 +168,16 @@ def is_named_after_folder(file: str) -> bool:
 
 def _series_of(file: str) -> str:
     """Returns the path of a bag without its suffixes, and without its number where it has one."""
-    split = split_of(file)
-    return split[0][:-1] if split and split[0].endswith("_") else stem_of(file)
+    name = split_of(file)
+    return name.series[:-1] if name and name.series.endswith("_") else stem_of(file)
 
 
-def _follow(bags: Sequence[BagFile]) -> bool:
+def _are_splits(bags: Sequence[BagFile]) -> bool:
     """Returns whether bags are numbered, and each ends before the next begins."""
     ordered = sorted(bags, key=lambda bag: (bag.start, bag.end))
     is_numbered = len(bags) == 1 or all(_series_of(bag.file) != stem_of(bag.file) for bag in bags)
     return is_numbered and all(
-        one.end <= next_one.start + OUT_OF_ORDER_NS for one, next_one in pairwise(ordered)
+        bag.end <= next_bag.start + OUT_OF_ORDER_NS for bag, next_bag in pairwise(ordered)
     )
 
 
@@ -188,7 +193,7 @@ class Overlapping(NamedTuple):
     def names(self) -> tuple[str, str]:
         """The names of the two, with those of their parents where these are equal."""
         depth = 1 if self.first.name != self.second.name else 2
-        first, second = ("/".join(each.parts[-depth:]) for each in (self.first, self.second))
+        first, second = ("/".join(path.parts[-depth:]) for path in (self.first, self.second))
         return first, second
 
 
@@ -202,59 +207,67 @@ def overlapping_recordings(
     the recording that they were saved from.
     """
     overlaps = snapshot.timeline.memo.of(_OVERLAPS, partial(_long_overlaps, snapshot))
-    return tuple(each for each in overlaps if not _took_over(each, joined_with))
+    return tuple(pair for pair in overlaps if not _took_over(pair, joined_with))
 
 
 def _long_overlaps(snapshot: Snapshot) -> tuple[Overlapping, ...]:
-    spans, pairs = _sweep(snapshot)
-    found = []
-    for (one, other), (start, end, shared) in pairs.items():
-        shorter = min(spans[one], spans[other])
+    lengths, overlaps = _sweep(snapshot)
+    pairs = []
+    for (first, second), overlap in overlaps.items():
+        shorter = min(lengths[first], lengths[second])
+        shared = overlap.shared
         if shared > LONG_NS or (shared > SHORT_NS and 2 * shared >= shorter):
-            found.append(Overlapping(Path(one), Path(other), start, end))
-    return tuple(sorted(found, key=lambda each: each.start)[:_MAX_READ])
+            pairs.append(Overlapping(Path(first), Path(second), overlap.start, overlap.end))
+    return tuple(sorted(pairs, key=lambda pair: pair.start)[:_MAX_READ])
 
 
-def _sweep(
-    snapshot: Snapshot,
-) -> tuple[dict[str, Ns], dict[tuple[str, str], tuple[Ns, Ns, Ns]]]:
-    """Returns how long each recording is, and when and for how long two have a bag at once."""
-    left_out, spans = snapshot.dating.misdated, dict[str, Ns]()
-    loose = loose_bags(snapshot)
-    pairs: dict[tuple[str, str], tuple[Ns, Ns, Ns]] = {}
-    reach: dict[str, Ns] = {}
+class _Overlap(NamedTuple):
+    """When two recordings have bags at once: first and last log time, and how much between them."""
+
+    start: Ns
+    end: Ns
+    shared: Ns
+
+    def extended(self, start: Ns, end: Ns) -> _Overlap:
+        """Returns it with a time that begins later; a part of that may be in it already."""
+        more = max(end - max(start, self.end), 0)
+        return _Overlap(self.start, max(end, self.end), self.shared + more)
+
+
+def _sweep(snapshot: Snapshot) -> tuple[dict[str, Ns], dict[tuple[str, str], _Overlap]]:
+    """Returns how long each recording is, and where two of them have bags at once."""
+    misdated, loose = snapshot.dating.misdated, loose_bags(snapshot)
+    lengths: dict[str, Ns] = {}
+    overlaps: dict[tuple[str, str], _Overlap] = {}
+    ends: dict[str, Ns] = {}  # of the recordings that may last into the next bag
     for bag in snapshot.bags:
-        if bag.file in left_out or is_thinned(bag.file):
+        if bag.file in misdated or is_thinned(bag.file):
             continue
-        own, start, end = loose.get(bag.file) or folder_of(bag), bag.start, bag.end
-        if _IN_MOMENTS in own:
-            own = _recorded_folder(own)
-        before = reach.get(own)
-        if len(reach) > (before is not None):
-            for other, until in [*reach.items()]:
-                if other == own:
-                    continue
-                if until <= start:
-                    del reach[other]
-                    continue
-                pair = (other, own) if other < own else (own, other)
-                last = min(until, end)
-                first, until_then, shared = pairs.get(pair, (start, start, 0))
-                more = max(last - max(start, until_then), 0)
-                pairs[pair] = (first, max(last, until_then), shared + more)
-        spans[own] = spans.get(own, 0) + max(end - max(start, before or start), 0)
-        reach[own] = end if before is None or end > before else before
-    return spans, pairs
+        recording, start = loose.get(bag.file) or folder_of(bag), bag.start
+        if _IN_MOMENTS in recording:
+            recording = _recorded_folder(recording)
+        for other in [name for name in ends if name != recording]:
+            if ends[other] <= start:
+                del ends[other]
+                continue
+            pair = (min(other, recording), max(other, recording))
+            overlap = overlaps.get(pair, _Overlap(start, start, 0))
+            overlaps[pair] = overlap.extended(start, min(ends[other], bag.end))
+        before = ends.get(recording, bag.end)
+        added = bag.end - max(start, ends.get(recording) or start)
+        lengths[recording] = lengths.get(recording, 0) + max(added, 0)
+        ends[recording] = max(before, bag.end)
+    return lengths, overlaps
 
 
 def _recorded_folder(folder: str) -> str:
     """Returns the folder of the recording that a folder in a saved moment has bags of."""
-    found = _MOMENT.fullmatch(folder)
-    return f"{found['bag_dir']}/{found['recording']}" if found else folder
+    match = _MOMENT.fullmatch(folder)
+    return f"{match['bag_dir']}/{match['recording']}" if match else folder
 
 
 def _took_over(pair: Overlapping, joined_with: Callable[[Path], tuple[str, ...]]) -> bool:
     """Returns whether a handover joins the two recordings."""
-    one, other = pair.first, pair.second
-    is_named = other.name in joined_with(one) or one.name in joined_with(other)
-    return one.parent == other.parent and is_named
+    first, second = pair.first, pair.second
+    is_named = second.name in joined_with(first) or first.name in joined_with(second)
+    return first.parent == second.parent and is_named

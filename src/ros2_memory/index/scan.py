@@ -105,9 +105,9 @@ class ScanResult:
 
     def is_like(self, before: ScanResult | None) -> bool:
         """Returns whether an earlier scan found the same, apart from bag files."""
-        return before is not None and self._beside_bags() == before._beside_bags()
+        return before is not None and self._apart_from_bags() == before._apart_from_bags()
 
-    def _beside_bags(self) -> tuple[object, ...]:
+    def _apart_from_bags(self) -> tuple[object, ...]:
         return self.problem, set(self.damaged), set(self.links), set(self.metadata_folders)
 
 
@@ -202,7 +202,7 @@ class Tree:
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
-        self._second: set[str] = set()
+        self._second_links: set[str] = set()
         self.saved: dict[str, Stamp] = {}
 
     def scan(self, now: Ns, watched: Iterable[str]) -> ScanResult:
@@ -219,7 +219,11 @@ class Tree:
             return ScanResult(problem=self._problem(fault))
         problem = self._unmounted() if fault is None else self._problem(fault)
         folders = self._folders.values()
-        if problem is None and self._only and not any(each.files or each.odd for each in folders):
+        if (
+            problem is None
+            and self._only
+            and not any(folder.files or folder.odd for folder in folders)
+        ):
             problem = f"no bag is named {self._only} (data.recording)"
         if problem is not None:
             self._folders = {}
@@ -244,15 +248,15 @@ class Tree:
         is_same = len(before) == len(self._folders) and all(
             self._folders.get(path) is folder for path, folder in before.items()
         )
-        second = self._second if is_same else self._second_links()
+        second = self._second_links if is_same else self._find_second_links()
         for path in second:
             result.stamps.pop(path, None)
-        result.gone.update(second - self._second)
-        for path in self._second - second - result.gone:
+        result.gone.update(second - self._second_links)
+        for path in self._second_links - second - result.gone:
             self._look_up(path, result)
-        self._second = second
+        self._second_links = second
 
-    def _second_links(self) -> set[str]:
+    def _find_second_links(self) -> set[str]:
         """Returns all but the first link of each file that has several."""
         # A folder that was listed before a file got its second link does not show that.
         linked = {inode for folder in self._folders.values() for inode in folder.linked}

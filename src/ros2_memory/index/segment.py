@@ -174,33 +174,34 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
-    def _folder_rows(self) -> tuple[list[str], NDArray[np.uint16]]:
-        """The folders of the bags, and the number of each bag's among them."""
-        known: dict[str, int] = {}
-        numbers = [known.setdefault(folder_of(bag), len(known)) for bag in self.bags]
-        return [*known], np.array(numbers, np.uint16)
+    def _numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
+        """The folders of the bags, and for each bag the position of its folder among them."""
+        number_of: dict[str, int] = {}
+        numbers = [number_of.setdefault(folder_of(bag), len(number_of)) for bag in self.bags]
+        return [*number_of], np.array(numbers, np.uint16)
 
     @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
-        return frozenset(self._folder_rows[0])
+        folders, _ = self._numbered_folders
+        return frozenset(folders)
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, of = self._folder_rows
+        folders, numbers = self._numbered_folders
         firsts = [bag.start for bag in self.bags]
         lasts = [bag.end for bag in self.bags]
-        return dict(zip(folders, _spans_of(len(folders), of, firsts, lasts), strict=True))
+        return dict(zip(folders, _spans_of(len(folders), numbers, firsts, lasts), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        folders, of = self._folder_rows
+        folders, numbers = self._numbered_folders
         tallies = np.zeros((len(folders), 3), np.int64)
-        messages = _columns(self).numbers[:, :, 0].sum(axis=0)
+        messages = _topic_columns(self).numbers[:, :, 0].sum(axis=0)
         sizes = np.array([bag.size for bag in self.bags], np.int64)
-        np.add.at(tallies, of, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
+        np.add.at(tallies, numbers, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
         return {
             folder: Tally(*tally) for folder, tally in zip(folders, tallies.tolist(), strict=True)
         }
@@ -233,7 +234,7 @@ class Segment:
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
         """By topic and type, the totals of the bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        columns = _columns(self)
+        columns = _topic_columns(self)
         counts, firsts, lasts = columns.numbers.transpose(2, 0, 1)
         rows = zip(
             columns.headers,
@@ -256,56 +257,59 @@ class Segment:
 
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
-        known = self._known_recordings.get(topic)
-        if known is None:
-            column = _columns(self).of(topic)
-            known = {}
-            if column is not None:
-                of = self._folder_rows[1][column.bags]
-                spans = _spans_of(len(self._recordings), of, column.firsts, column.lasts)
-                for number in dict.fromkeys(of.tolist()):
-                    known[self._recordings[number]] = spans[number]
-            self._known_recordings[topic] = known
-        return known
+        if topic not in self._known_recordings:
+            self._known_recordings[topic] = self._spans_by_recording(topic)
+        return self._known_recordings[topic]
+
+    def _spans_by_recording(self, topic: str) -> dict[Path, Span]:
+        column = self.column(topic)
+        if column is None:
+            return {}
+        _, folder_numbers = self._numbered_folders
+        numbers, paths = folder_numbers[column.bags], self._recording_paths
+        spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
+        return {paths[number]: spans[number] for number in dict.fromkeys(numbers.tolist())}
 
     @cached_property
-    def _recordings(self) -> list[Path]:
-        """The recordings of the bags, as their folders are numbered."""
+    def _recording_paths(self) -> list[Path]:
+        """The recordings of the bags, in the order in which their folders are numbered."""
         # A path for each bag of a week would take longer than all else.
-        first = np.unique(self._folder_rows[1], return_index=True)[1].tolist()
-        return [self.bags[row].recording for row in first]
+        _, folder_numbers = self._numbered_folders
+        _, rows = np.unique(folder_numbers, return_index=True)
+        return [self.bags[row].recording for row in rows.tolist()]
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
-        column = _columns(self).of(topic)
+        column = self.column(topic)
         if column is None:
             return
         if window is not None:
-            here = np.flatnonzero((column.firsts < window.stop) & (column.lasts >= window.start))
-            column = TopicColumn(*(each[here] for each in column))
-        for row, first, last in zip(*(each.tolist() for each in column[:3]), strict=True):
+            is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
+            column = TopicColumn(*(values[is_inside] for values in column))
+        bags, firsts, lasts, _ = (values.tolist() for values in column)
+        for row, first, last in zip(bags, firsts, lasts, strict=True):
             yield TopicExtent(self.bags[row], first, last)
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
-        return _columns(self).of(topic)
+        return _topic_columns(self).of(topic)
 
     def bounds(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Returns the log times of the first and the last message of the topic in each bag."""
-        column = _columns(self).of(topic)
+        column = self.column(topic)
         none = np.empty(0, np.int64)
         return (none, none) if column is None else (column.firsts, column.lasts)
 
     def bounds_in(self, topics: Collection[str], window: TimeWindow) -> NDArray[np.int64]:
         """Returns the first and last log time of topics (2 x N) in each bag that has any there."""
         firsts, lasts = np.full(len(self.bags), MAX_NS), np.full(len(self.bags), MIN_NS)
-        is_here = np.zeros(len(self.bags), np.bool_)
+        is_inside = np.zeros(len(self.bags), np.bool_)
         for column in filter(None, map(self.column, topics)):
-            here = (column.firsts < window.stop) & (column.lasts >= window.start)
-            is_here[column.bags[here]] = True
+            rows = (column.firsts < window.stop) & (column.lasts >= window.start)
+            is_inside[column.bags[rows]] = True
             np.minimum.at(firsts, column.bags, column.firsts)
             np.maximum.at(lasts, column.bags, column.lasts)
-        return np.stack((firsts, lasts))[:, is_here]
+        return np.stack((firsts, lasts))[:, is_inside]
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -325,12 +329,12 @@ class Segment:
 
     def totals_in(self, topic: str, folder: str) -> TopicTotals | None:
         """Returns what the bags in a folder hold of a topic, under all of its types."""
-        column = _columns(self).of(topic)
-        folders, of = self._folder_rows
+        column = self.column(topic)
+        folders, numbers = self._numbered_folders
         if column is None or folder not in folders:
             return None
-        here = of[column.bags] == folders.index(folder)
-        _, firsts, lasts, counts = (numbers[here] for numbers in column)
+        in_folder = numbers[column.bags] == folders.index(folder)
+        _, firsts, lasts, counts = (values[in_folder] for values in column)
         if not counts.size:
             return None
         return TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
@@ -338,7 +342,7 @@ class Segment:
     @cached_property
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
-        columns = _columns(self)
+        columns = _topic_columns(self)
         lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
         return {
             topic: _presence_of(column, lengths)
@@ -372,25 +376,31 @@ def is_log(type_name: str) -> bool:
     return type_name in _LOGS
 
 
-def wider(known: Span | None, span: Span) -> Span:
-    """Returns the span of both, where one is known."""
-    return span if known is None else (min(known[0], span[0]), max(known[1], span[1]))
+def wider(span: Span | None, other: Span) -> Span:
+    """Returns the span that holds both; the other where there is only that."""
+    if span is None:
+        return other
+    (first, last), (other_first, other_last) = span, other
+    return min(first, other_first), max(last, other_last)
 
 
 def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, Ns, int]) -> None:
-    """Adds totals of a type to those that are known."""
-    known, added = totals.get(type_name), TopicTotals(*more)
-    totals[type_name] = added if known is None else known | added
+    """Adds first and last log time and count of a type to its totals."""
+    before, added = totals.get(type_name), TopicTotals(*more)
+    totals[type_name] = added if before is None else before | added
 
 
 def _spans_of(
-    count: int, of: NDArray[np.uint16], firsts: Sequence[Ns] | _Times, lasts: Sequence[Ns] | _Times
+    folders: int,
+    numbers: NDArray[np.uint16],
+    firsts: Sequence[Ns] | _Times,
+    lasts: Sequence[Ns] | _Times,
 ) -> list[Span]:
-    """Returns the first and the last time of each of so many folders, given that of each row."""
-    spans = np.full(count, MAX_NS), np.full(count, MIN_NS)
-    np.minimum.at(spans[0], of, firsts)
-    np.maximum.at(spans[1], of, lasts)
-    return [*zip(spans[0].tolist(), spans[1].tolist(), strict=True)]
+    """Returns the span of each folder; of each row there are its folder's number, and its span."""
+    starts, ends = np.full(folders, MAX_NS), np.full(folders, MIN_NS)
+    np.minimum.at(starts, numbers, firsts)
+    np.maximum.at(ends, numbers, lasts)
+    return [*zip(starts.tolist(), ends.tolist(), strict=True)]
 
 
 def folder_of(bag: BagFile) -> str:
@@ -398,7 +408,7 @@ def folder_of(bag: BagFile) -> str:
     return bag.file[: bag.file.rfind("/")]
 
 
-class _Columns:
+class _TopicColumns:
     """The numbers of a segment's summaries.
 
     Attributes:
@@ -412,43 +422,44 @@ class _Columns:
             by_schema.setdefault(id(bag.summary.schema), []).append(row)
         schemas = [bags[rows[0]].summary.schema for rows in by_schema.values()]
         headers = dict.fromkeys(chain.from_iterable(schema.topics for schema in schemas))
-        numbered = {header: number for number, header in enumerate(headers)}
+        header_rows = {header: row for row, header in enumerate(headers)}
         self.headers = tuple(headers)
         self.numbers = np.zeros((len(headers), len(bags), 3), np.int64)
         for schema, rows in zip(schemas, by_schema.values(), strict=True):
-            own = [numbered[header] for header in schema.topics]
-            found = numbers_of([bags[row].summary for row in rows])
-            self.numbers[np.ix_(own, rows)] = found.swapaxes(0, 1)
-        self._every = np.arange(len(bags))
+            headers_of_schema = [header_rows[header] for header in schema.topics]
+            numbers = numbers_of([bags[row].summary for row in rows])
+            self.numbers[np.ix_(headers_of_schema, rows)] = numbers.swapaxes(0, 1)
+        self._all_bags = np.arange(len(bags))
         self._columns: dict[str, TopicColumn] = {}
-        self._of_topics: dict[str, list[int]] = {}
-        for header, number in numbered.items():
-            self._of_topics.setdefault(header.topic, []).append(number)
+        self._rows_by_topic: dict[str, list[int]] = {}
+        for header, row in header_rows.items():
+            self._rows_by_topic.setdefault(header.topic, []).append(row)
 
     @property
     def topics(self) -> Collection[str]:
         """Their names."""
-        return self._of_topics.keys()
+        return self._rows_by_topic.keys()
 
     def of(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
-        if topic in self._of_topics and topic not in self._columns:
-            self._columns[topic] = self._column(self._of_topics[topic])
+        if topic in self._rows_by_topic and topic not in self._columns:
+            self._columns[topic] = self._column(self._rows_by_topic[topic])
         return self._columns.get(topic)
 
-    def _column(self, own: Sequence[int]) -> TopicColumn:
-        counts, firsts, lasts = self.numbers[own[0]].T
-        if len(own) == 1 and counts.all():
-            return TopicColumn(self._every, firsts, lasts, counts)
-        bags, types = np.nonzero(self.numbers[own, :, 0].T)
-        counts, firsts, lasts = self.numbers[own][types, bags].T
+    def _column(self, header_rows: Sequence[int]) -> TopicColumn:
+        """Returns the column of a topic, whose types have these headers."""
+        counts, firsts, lasts = self.numbers[header_rows[0]].T
+        if len(header_rows) == 1 and counts.all():
+            return TopicColumn(self._all_bags, firsts, lasts, counts)
+        bags, types = np.nonzero(self.numbers[header_rows, :, 0].T)
+        counts, firsts, lasts = self.numbers[header_rows][types, bags].T
         return TopicColumn(bags, firsts, lasts, counts)
 
 
 @lru_cache(maxsize=_CACHED_SEGMENTS)
-def _columns(segment: Segment) -> _Columns:
+def _topic_columns(segment: Segment) -> _TopicColumns:
     """Returns the columns of a segment: a copy of its summaries, so few of a week are kept."""
-    return _Columns(segment.bags)
+    return _TopicColumns(segment.bags)
 
 
 def _presence_of(column: TopicColumn, lengths: _Times) -> Presence:
@@ -474,11 +485,12 @@ def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:
 
 def _spacings(counts: _Times, spans: _Times) -> dict[int, Spacing]:
     """Returns the spacings of the bags with a topic, by the part of an octave of the period."""
-    shown = (counts >= _FEWEST) & (spans > 0)
-    spans, intervals = spans[shown], counts[shown] - 1
+    shows_period = (counts >= _FEWEST) & (spans > 0)
+    spans, intervals = spans[shows_period], counts[shows_period] - 1
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
-    return {
-        octave: Spacing(int(here.sum()), int(spans[here].sum()), int(intervals[here].sum()))
-        for octave in sorted({*octaves.tolist()})
-        for here in [octaves == octave]
-    }
+    spacings: dict[int, Spacing] = {}
+    for octave in sorted({*octaves.tolist()}):
+        bags = octaves == octave
+        span, steps = int(spans[bags].sum()), int(intervals[bags].sum())
+        spacings[octave] = Spacing(int(bags.sum()), span, steps)
+    return spacings

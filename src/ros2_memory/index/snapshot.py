@@ -86,21 +86,21 @@ class Snapshot:
     @property
     def earliest(self) -> Ns | None:
         """Log time of the first message in any correctly dated bag; None without one."""
-        return self._dates.earliest
+        return self._dating_by_times.earliest
 
     @property
     def latest(self) -> Ns | None:
         """Log time of the last message (inclusive) in such a bag; None without one."""
-        return self._dates.latest
+        return self._dating_by_times.latest
 
     @cached_property
-    def _dates(self) -> Dating:
+    def _dating_by_times(self) -> Dating:
         return check_dates(self.timeline, (), self.scanned_at)
 
     @property
     def misdated(self) -> Sequence[ClockFault]:
         """The bags that `earliest` and `latest` leave out, since their dates cannot be true."""
-        return [fault for fault in self._dates.faults if fault.misleads]
+        return [fault for fault in self._dating_by_times.faults if fault.misleads]
 
     @cached_property
     def dating(self) -> Dating:
@@ -112,35 +112,37 @@ class Snapshot:
         return check_dates(self.timeline, [*between, *steps], self.scanned_at)
 
     @cached_property
-    def _dated(self) -> Sequence[Segment]:
+    def _dated_segments(self) -> Sequence[Segment]:
         """The bags that a correct clock dated, without that of carried messages, in order."""
-        parts = self.timeline.recorded_segments
+        segments = self.timeline.recorded_segments
         misdated = self.dating.misdated
         if not misdated:
-            return parts
-        found: list[Segment] = []
-        for part in parts:
-            dated = [bag for bag in part.bags if bag.file not in misdated]
-            if len(dated) == len(part.bags):
-                found.append(part)  # what it remembers serves the next snapshot
+            return segments
+        dated_segments: list[Segment] = []
+        for segment in segments:
+            dated = [bag for bag in segment.bags if bag.file not in misdated]
+            if len(dated) == len(segment.bags):
+                dated_segments.append(segment)  # what it remembers serves the next snapshot
             elif dated:
-                found.append(Segment(dated))
-        return found
+                dated_segments.append(Segment(dated))
+        return dated_segments
 
     @cached_property
     def _presences(self) -> dict[str, Presence]:
         """When bags hold each topic; not of logs, whose lines come when something happens."""
-        found: dict[str, list[Presence]] = {}
-        for part in filter(None, (each.unthinned for each in self._dated)):
+        by_topic: dict[str, list[Presence]] = {}
+        for part in filter(None, (segment.unthinned for segment in self._dated_segments)):
             for topic, presence in part.presences.items():
-                found.setdefault(topic, []).append(presence)
+                by_topic.setdefault(topic, []).append(presence)
         is_log = self.timeline.is_log
-        return {topic: joined(each) for topic, each in found.items() if not is_log(topic)}
+        return {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
 
     @cached_property
     def silences(self) -> tuple[Silence, ...]:
         """Where topics with a usual rate were silent, in order of time; see `analysis.silences`."""
-        together = frozenset(chain.from_iterable(part.together for part in self._dated))
+        together = frozenset(
+            chain.from_iterable(segment.together for segment in self._dated_segments)
+        )
         return tuple(silences(self._presences, together, self.gaps))
 
     def shortest_silence(self, topic: str) -> Ns:
@@ -162,16 +164,20 @@ class Snapshot:
 
     def totals(self, topic: str) -> list[TopicTotals]:
         """Returns what correctly dated bags hold of a topic, in parts."""
-        return [one for part in self._dated for one in part.totals.get(topic, {}).values()]
+        return [
+            totals
+            for segment in self._dated_segments
+            for totals in segment.totals.get(topic, {}).values()
+        ]
 
     @cached_property
     def newest_stretch(self) -> Ns | None:
         """First log time after the newest gap of more than `LONGEST_OFF_NS`; None without a bag."""
         begin = reach = None
-        for part in self._dated:
-            spans = [(part.bags[0].start, part.latest)]
-            if part.latest - part.bags[0].start > LONGEST_OFF_NS:
-                spans = [(bag.start, bag.end) for bag in part.bags]
+        for segment in self._dated_segments:
+            spans = [(segment.bags[0].start, segment.latest)]
+            if segment.latest - segment.bags[0].start > LONGEST_OFF_NS:
+                spans = [(bag.start, bag.end) for bag in segment.bags]
             for start, end in spans:
                 if reach is None or start - reach > LONGEST_OFF_NS:
                     begin = start
@@ -204,27 +210,27 @@ class Snapshot:
     @cached_property
     def _pauses(self) -> Sequence[Pause]:
         """Where no dated bag has a message for a while, in order of time."""
-        found: list[Pause] = []
+        pauses: list[Pause] = []
         newest: BagFile | None = None
-        for part in self._dated:
+        for segment in self._dated_segments:
             if newest is not None:
                 # Bags of other parts may last into this one.
-                found += pauses_between([newest, part.bags[0]])
+                pauses += pauses_between([newest, segment.bags[0]])
                 reach = newest.end
-                found += (
+                pauses += (
                     pause._replace(start=max(pause.start, reach))
-                    for pause in part.pauses
+                    for pause in segment.pauses
                     if pause.end - reach > SHORTEST_PAUSE_NS
                 )
             else:
-                found += part.pauses
-            for pause in part.pauses_within:
-                found += self._alone(pause)
-            last = max(part.bags, key=lambda bag: bag.end)
+                pauses += segment.pauses
+            for pause in segment.pauses_within:
+                pauses += self._shared_parts(pause)
+            last = max(segment.bags, key=lambda bag: bag.end)
             newest = last if newest is None or last.end > newest.end else newest
-        return sorted(found, key=lambda pause: (pause.start, pause.end))
+        return sorted(pauses, key=lambda pause: (pause.start, pause.end))
 
-    def _alone(self, pause: Pause) -> Iterator[Pause]:
+    def _shared_parts(self, pause: Pause) -> Iterator[Pause]:
         """Yields the parts of a bag's pause in which no other bag has a message either."""
         inside = TimeWindow(pause.start + 1, pause.end)
         others = united(
@@ -246,9 +252,9 @@ class Snapshot:
         """
         closed = (*self.damaged, *self.unread)
         return {
-            **{each: self._unread_span(each, growing=True) for each in self.active},
+            **{aside: self._unread_span(aside, growing=True) for aside in self.active},
             **dict.fromkeys(closed),
-            **{each: self._unread_span(each, growing=False) for each in closed[-_MAX_PLACED:]},
+            **{aside: self._unread_span(aside, growing=False) for aside in closed[-_MAX_PLACED:]},
         }
 
     def _unread_span(self, aside: SetAside, *, growing: bool) -> TimeWindow | None:
@@ -270,17 +276,17 @@ class Snapshot:
         """Returns `unread_bounds` of any closed files, even if they do not exist any more."""
         return {
             **dict.fromkeys(files),
-            **{each: self._bounds(each) for each in files[-_MAX_PLACED:]},
+            **{file: self._bounds(file) for file in files[-_MAX_PLACED:]},
         }
 
     def _bounds(self, aside: SetAside) -> TimeWindow | None:
-        split = split_of(str(aside.path))
+        name = split_of(str(aside.path))
         # Files that `ros2 bag record` did not number may lie in any order.
-        is_split = split is not None and is_recording(split[0])
+        is_split = name is not None and is_recording(name.series)
         near = self._neighbours(aside) if is_split else Neighbours()
         return unreadable_bounds(aside.path.parent.name, near, aside.written, self.scanned_at)
 
     def _neighbours(self, aside: SetAside) -> Neighbours:
         folder = str(aside.path.parent)
-        segments = (each for each in self.timeline.segments if folder in each.folders)
+        segments = (segment for segment in self.timeline.segments if folder in segment.folders)
         return neighbours(str(aside.path), segments)

@@ -58,6 +58,13 @@ class SplitRange(NamedTuple):
     steps: tuple[StepBack, ...]
 
 
+class SplitName(NamedTuple):
+    """What the name of a bag file says: its series, and its number there."""
+
+    series: Series
+    number: int
+
+
 _BY_NUMBER: Final = attrgetter("number")
 
 
@@ -67,11 +74,11 @@ def stem_of(file: str) -> str:
     return stem[: stem.rfind(".")]
 
 
-def split_of(file: str) -> tuple[Series, int] | None:
+def split_of(file: str) -> SplitName | None:
     """Returns the series of a bag file and its number there; None where its name has no number."""
     stem = stem_of(file)
     series = stem.rstrip("0123456789")
-    return None if series == stem else (series, int(stem[len(series) :]))
+    return None if series == stem else SplitName(series, int(stem[len(series) :]))
 
 
 def is_recording(series: Series) -> bool:
@@ -84,7 +91,7 @@ def split_ranges_of(bags: Iterable[BagFile]) -> dict[Series, SplitRange]:
     """Returns the range of each series among these bags."""
     ranges: dict[Series, SplitRange] = {}
     for series, splits in _by_series(bags).items():
-        steps = _steps(splits) if is_recording(series) else []
+        steps = _steps_between(splits) if is_recording(series) else []
         ranges[series] = SplitRange(splits[0], splits[-1], tuple(steps))
     return ranges
 
@@ -94,56 +101,59 @@ def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
 
     All bags are looked at only of series whose ranges do not follow each other.
     """
-    found: dict[Series, list[Segment]] = {}
+    by_series: dict[Series, list[Segment]] = {}
     for segment in segments:
-        for series in segment.split_ranges:
-            if is_recording(series):
-                found.setdefault(series, []).append(segment)
+        for series in filter(is_recording, segment.split_ranges):
+            by_series.setdefault(series, []).append(segment)
     steps: list[StepBack] = []
-    for series, holding in found.items():
-        ranges_of_series = [segment.split_ranges[series] for segment in holding]
-        if all(a.last.number < b.first.number for a, b in pairwise(ranges_of_series)):
-            steps.extend(chain.from_iterable(each.steps for each in ranges_of_series))
-            for a, b in pairwise(ranges_of_series):
-                steps.extend(_steps((a.last, b.first)))
+    for series, holding in by_series.items():
+        ranges = [segment.split_ranges[series] for segment in holding]
+        pairs = [*pairwise(ranges)]
+        if all(earlier.last.number < later.first.number for earlier, later in pairs):
+            steps.extend(chain.from_iterable(split_range.steps for split_range in ranges))
+            for earlier, later in pairs:
+                steps.extend(_steps_between((earlier.last, later.first)))
         else:
             bags = chain.from_iterable(segment.bags for segment in holding)
-            steps.extend(_steps(_by_series(bags)[series]))
+            steps.extend(_steps_between(_by_series(bags)[series]))
     return steps
 
 
 def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
     """Returns the nearest splits on both sides of a file in its series."""
-    split = split_of(file)
-    if split is None:
+    name = split_of(file)
+    if name is None:
         return Neighbours()
-    series, number = split
+    series, number = name
     splits: list[Split] = []
     for segment in segments:
-        known = segment.split_ranges.get(series)
-        if known is not None:
-            is_inside = known.first.number < number < known.last.number
-            splits += _by_series(segment.bags)[series] if is_inside else known[:2]
-    before = max((each for each in splits if each.number < number), key=_BY_NUMBER, default=None)
-    after = min((each for each in splits if each.number > number), key=_BY_NUMBER, default=None)
+        split_range = segment.split_ranges.get(series)
+        if split_range is not None:
+            first, last, _ = split_range
+            is_inside = first.number < number < last.number
+            splits += _by_series(segment.bags)[series] if is_inside else (first, last)
+    lower = (split for split in splits if split.number < number)
+    higher = (split for split in splits if split.number > number)
+    before = max(lower, key=_BY_NUMBER, default=None)
+    after = min(higher, key=_BY_NUMBER, default=None)
     return Neighbours(before and before.bag.end, after and after.bag.start)
 
 
 def _by_series(bags: Iterable[BagFile]) -> dict[Series, list[Split]]:
     """Returns the splits of each series among these bags, by number."""
-    found: dict[Series, list[Split]] = {}
+    by_series: dict[Series, list[Split]] = {}
     for bag in bags:
-        split = split_of(bag.file)
-        if split is not None:
-            found.setdefault(split[0], []).append(Split(split[1], bag))
-    for splits in found.values():
+        name = split_of(bag.file)
+        if name is not None:
+            by_series.setdefault(name.series, []).append(Split(name.number, bag))
+    for splits in by_series.values():
         splits.sort(key=_BY_NUMBER)
-    return found
+    return by_series
 
 
-def _steps(splits: Iterable[Split]) -> list[StepBack]:
+def _steps_between(splits: Iterable[Split]) -> list[StepBack]:
     return [
-        StepBack(a.bag, b.bag, a.bag.end - b.bag.start)
-        for a, b in pairwise(splits)
-        if a.number < b.number and a.bag.end - b.bag.start > OUT_OF_ORDER_NS
+        StepBack(earlier.bag, later.bag, earlier.bag.end - later.bag.start)
+        for earlier, later in pairwise(splits)
+        if earlier.number < later.number and earlier.bag.end - later.bag.start > OUT_OF_ORDER_NS
     ]

@@ -143,22 +143,22 @@ class Timeline:
         The bag of carried messages does not: it holds what is left of deleted bags. It is among
         them only where there is no other.
         """
-        return tuple(filter(None, (each.recorded for each in self.segments))) or self.segments
+        return tuple(filter(None, (segment.recorded for segment in self.segments))) or self.segments
 
     @cached_property
     def recorded(self) -> tuple[BagFile, ...]:
         """The bags of `recorded_segments`."""
-        return tuple(chain.from_iterable(each.bags for each in self.recorded_segments))
+        return tuple(chain.from_iterable(segment.bags for segment in self.recorded_segments))
 
     @cached_property
     def thinned(self) -> tuple[BagFile, ...]:
         """The days of which only some messages stayed, in order."""
-        parts = [
-            part
-            for part in self.segments
-            if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in part.folders)
+        segments = [
+            segment
+            for segment in self.segments
+            if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in segment.folders)
         ]
-        return tuple(bag for part in parts for bag in part.bags if is_thinned(bag.file))
+        return tuple(bag for segment in segments for bag in segment.bags if is_thinned(bag.file))
 
     @cached_property
     def thinned_times(self) -> Spans:
@@ -174,7 +174,7 @@ class Timeline:
     @property
     def disk_use(self) -> tuple[int, int]:
         """The bytes of the recorded bags, and how many of them a crash left open."""
-        parts = [each.disk_use for each in self.recorded_segments]
+        parts = [segment.disk_use for segment in self.recorded_segments]
         return sum(size for size, _ in parts), sum(left_open for _, left_open in parts)
 
     @cached_property
@@ -192,7 +192,7 @@ class Timeline:
 
         A subscriber may receive their last messages again, long after they were published.
         """
-        return frozenset(chain.from_iterable(each.transient_local for each in self.segments))
+        return frozenset(chain.from_iterable(segment.transient_local for segment in self.segments))
 
     def topics(self) -> tuple[str, ...]:
         """Returns the topics of which some bag holds a message, sorted."""
@@ -252,14 +252,14 @@ class Timeline:
         Those of a bag that a crash left open reach to the last time that its file was written to,
         if that was within a day.
         """
-        found = []
+        faulty = []
         for segment in self._faulty_segments:
             for bag in segment.faulty if segment.bags[0].start < window.stop else ():
                 is_cut = bag.state is BagState.INCOMPLETE
                 is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
                 if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
-                    found.append(bag)
-        return found
+                    faulty.append(bag)
+        return faulty
 
     @cached_property
     def _faulty_segments(self) -> list[Segment]:
@@ -280,11 +280,13 @@ class Timeline:
 
     def first_with(self, topic: str, type_name: str) -> BagFile:
         """Returns the first bag that holds the topic under a type; there must be one."""
-        segment = next(each for each in self.segments if type_name in each.types.get(topic, ()))
+        segment = next(
+            segment for segment in self.segments if type_name in segment.types.get(topic, ())
+        )
         return next(
             bag
             for bag in segment.bags
-            if any(held.type == type_name for held in bag.summary.of(topic))
+            if any(topic_summary.type == type_name for topic_summary in bag.summary.of(topic))
         )
 
 

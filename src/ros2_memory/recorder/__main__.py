@@ -125,8 +125,8 @@ def _record(settings: Settings) -> None:
         own=own,
         keep_open=(lock.descriptor,),
         excluding={
-            each.topic: f"the rule {each.name!r} of recording.exclude_when"
-            for each in exclusions_of(settings)
+            rule.topic: f"the rule {rule.name!r} of recording.exclude_when"
+            for rule in exclusions_of(settings)
         },
     )
     recorder.check()

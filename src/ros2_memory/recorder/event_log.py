@@ -122,8 +122,8 @@ class EventLog:
                 sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
                 lasts = line.topic is not None and line.kind in _LASTING
                 # Each new recorder says it again, which is no newer fault than why it was started.
-                known = lasts and (line.kind, line.topic) in self._of_topics
-                report = self.remark if known else self.warn
+                is_known = lasts and (line.kind, line.topic) in self._of_topics
+                report = self.remark if is_known else self.warn
                 report(line.kind.value, sentence, recording=recording)
                 if lasts and len(self._of_topics) < _MOST_TOPICS:
                     self._of_topics.add((line.kind, line.topic or ""))

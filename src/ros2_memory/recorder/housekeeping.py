@@ -129,7 +129,7 @@ class Housekeeping(Housekeeper):
             is_synchronised=is_synchronised,
             static_topics=static_topics,
             grace_s=grace_s,
-            needed=self._needed,
+            needed=self._needed_by_rules,
             measure_free=measure_free,
             monotonic=monotonic,
             memory=memory if memory is not None and memory.keeps else None,
@@ -166,14 +166,14 @@ class Housekeeping(Housekeeper):
             OSError: the bag directory, or the list of the recorder's own recordings, cannot be
                 read.
         """
-        last, now = read_heartbeat(self._bag_dir).heartbeat, self._clock.now()
-        if last is not None and last.state is not RecorderState.STOPPED:
-            first = min(last.updated, now)
+        heartbeat, now = read_heartbeat(self._bag_dir).heartbeat, self._clock.now()
+        if heartbeat is not None and heartbeat.state is not RecorderState.STOPPED:
+            last_alive = min(heartbeat.updated, now)
             if self._triggers is not None:
-                self._triggers.note_restart(first, now)
-            if last.state is RecorderState.RECORDING:
-                self._note_interruption(first, now, "unclean")
-        named = _named(self._bag_dir)
+                self._triggers.note_restart(last_alive, now)
+            if heartbeat.state is RecorderState.RECORDING:
+                self._note_interruption(last_alive, now, "unclean")
+        named = _named_in_heartbeat(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
@@ -199,7 +199,7 @@ class Housekeeping(Housekeeper):
 
     def make_room(self, free_bytes_wanted: int) -> None:
         """Begins to delete, oldest first, until so much is free, or nothing may be deleted."""
-        self._begin("make_room", partial(self._make_room, free_bytes_wanted))
+        self._add_unless_under_way("make_room", partial(self._delete_for_room, free_bytes_wanted))
 
     def is_making_room(self) -> bool:
         """Whether room is being made."""
@@ -207,11 +207,11 @@ class Housekeeping(Housekeeper):
 
     def apply(self) -> None:
         """Begins to delete what exceeds the limits, and to repair what nothing writes any more."""
-        self._begin("apply", self._keep_limits)
+        self._add_unless_under_way("apply", self._collect_and_repair)
 
     def keep_moments(self) -> None:
         """Begins to save the moments that were asked for, or wait for bags."""
-        self._begin("keep_moments", self._keep_moments)
+        self._add_unless_under_way("keep_moments", self._save_moments)
 
     def faults(self) -> Mapping[str, str]:
         """Maps each task whose last run failed to the reason."""
@@ -221,12 +221,12 @@ class Housekeeping(Housekeeper):
         """Waits until nothing is under way."""
         self._background.wait(None)
 
-    def _begin(self, task: str, do: Callable[[], None]) -> None:
+    def _add_unless_under_way(self, task: str, job: Callable[[], None]) -> None:
         if not self._background.is_under_way(task):
-            self._background.add(task, do)
+            self._background.add(task, job)
 
-    def _make_room(self, free_bytes_wanted: int) -> None:
-        most_free = self._apply(free_bytes_wanted).most_free
+    def _delete_for_room(self, free_bytes_wanted: int) -> None:
+        most_free = self._collect_and_report(free_bytes_wanted).most_free
         if most_free is not None and not self._out_of_reach:
             _log.error(
                 "room_out_of_reach",
@@ -238,12 +238,12 @@ class Housekeeping(Housekeeper):
             )
         self._out_of_reach = most_free is not None
 
-    def _keep_limits(self) -> None:
-        self._apply()
+    def _collect_and_repair(self) -> None:
+        self._collect_and_report()
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def _keep_moments(self) -> None:
+    def _save_moments(self) -> None:
         self._moments.open()
         restarted = self._triggers is not None and bool(self._triggers.restarts)
         if restarted or self._moments.has_work():
@@ -313,21 +313,14 @@ class Housekeeping(Housekeeper):
         """Counts the time for which these recordings are written."""
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
-    def _apply(self, free_bytes_wanted: int | None = None) -> Collected:
+    def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
         self._update_moments()
         self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
-        limit = f"{self._max_age_h:g} h"
-        age_held = (
-            f"{counted(collected.held, 'bag is', 'bags are')} older than {limit} "
-            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
-            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
-            f"or when {limit} have been recorded after them"
-        )
         self._status = self._status._replace(
-            age_held=age_held if collected.held else None,
+            age_held=self._describe_held(collected.held) if collected.held else None,
             counted_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
         )
@@ -349,6 +342,15 @@ class Housekeeping(Housekeeper):
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
         return collected
+
+    def _describe_held(self, bags: int) -> str:
+        limit = f"{self._max_age_h:g} h"
+        return (
+            f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
+            "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
+            "They are deleted when it is synchronised with a time server (timedatectl shows that), "
+            f"or when {limit} have been recorded after them"
+        )
 
     def _collect(self, free_bytes_wanted: int | None) -> Collected:
         with self._index.undisturbed(patrolling=True) as snapshot:
@@ -417,7 +419,7 @@ class Housekeeping(Housekeeper):
         except (EpisodicError, OSError) as error:
             _log.error("moments_not_minded", reason=str(error))
 
-    def _needed(self, snapshot: Snapshot) -> frozenset[str]:
+    def _needed_by_rules(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: all where the disk does not tell.
 
         Then age deletes none, and the budget the oldest, so that the disk does not fill.
@@ -437,15 +439,13 @@ class Housekeeping(Housekeeper):
                     os.unlink(name, dir_fd=opened)
             for name in names:
                 path = directory / name
-                if name.endswith(_MCAP) and not left_by_repair(name) and self._is_own(path):
-                    self._repair(path)
+                is_bag = name.endswith(_MCAP) and not left_by_repair(name)
+                if is_bag and (not self._keeps_foreign or self._own.owns_bag(path)):
+                    self._repair_file(path)
             # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
         except OSError as error:
             _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
-
-    def _is_own(self, path: Path) -> bool:
-        return not self._keeps_foreign or self._own.owns_bag(path)
 
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
         """Repairs files that the index found unfinished and nothing writes; returns how many."""
@@ -455,7 +455,7 @@ class Housekeeping(Housekeeper):
         candidates = [path for path in paths if path.suffix == _MCAP and self._may_repair(path)]
         if not candidates:
             return 0
-        named, opened = _named(self._bag_dir), open_files()
+        named, opened = _named_in_heartbeat(self._bag_dir), open_files()
         repaired = 0
         for path in candidates:
             with suppress(OSError):
@@ -463,7 +463,7 @@ class Housekeeping(Housekeeper):
                 if path.parent in named or (status.st_dev, status.st_ino) in opened:
                     continue
                 self._tried.add((path, status.st_size, status.st_mtime_ns))
-                repaired += self._repair(path)
+                repaired += self._repair_file(path)
         return repaired
 
     def _may_repair(self, path: Path) -> bool:
@@ -485,11 +485,11 @@ class Housekeeping(Housekeeper):
         unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)
 
-    def _repair(self, path: Path) -> bool:
+    def _repair_file(self, path: Path) -> bool:
         """Repairs one file and reports the result; returns whether it was not whole."""
         begun = time.perf_counter_ns()
         try:
-            repaired = self._repaired(path)
+            repaired = self._repair_if_small(path)
         except (BagVanishedError, FileNotFoundError):
             return False
         except BagError as error:
@@ -513,7 +513,7 @@ class Housekeeping(Housekeeper):
         )
         return True
 
-    def _repaired(self, path: Path) -> Repaired | None:
+    def _repair_if_small(self, path: Path) -> Repaired | None:
         size = path.lstat().st_size
         if size > MOST_REPAIRED_BYTES:
             remedy = f"run ros2-memory recover {path}"
@@ -523,6 +523,6 @@ class Housekeeping(Housekeeper):
         return self._repairer.repair(path)
 
 
-def _named(bag_dir: Path) -> frozenset[Path]:
+def _named_in_heartbeat(bag_dir: Path) -> frozenset[Path]:
     """Returns the recordings that the last heartbeat names, live or not."""
     return frozenset(bag_dir / name for name in read_heartbeat(bag_dir).recordings)

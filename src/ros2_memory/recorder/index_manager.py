@@ -197,13 +197,13 @@ class IndexManager:
         self, before: Snapshot | None, after: Snapshot, change: TableChange, begun: Ns
     ) -> None:
         removed, added, _ = change
-        known = set() if before is None else set(before.damaged)
-        for each in after.damaged:
-            if each not in known:
-                self._log.warning("bag_damaged", path=str(each.path), reason=each.reason)
+        reported_before = set() if before is None else set(before.damaged)
+        for aside in after.damaged:
+            if aside not in reported_before:
+                self._log.warning("bag_damaged", path=str(aside.path), reason=aside.reason)
         # A file that grows and answers is read again with every query: not worth a line each time.
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
-        changed = before is None or _figures(before) != _figures(after)
+        changed = before is None or _logged_figures(before) != _logged_figures(after)
         if after.problem is not None and (before is None or before.problem != after.problem):
             self._log.warning(
                 "bag_directory_not_read", reason=after.problem, bag_dir=str(self.bag_dir.absolute())
@@ -223,7 +223,7 @@ class IndexManager:
         )
 
 
-def _figures(snapshot: Snapshot) -> tuple[object, ...]:
+def _logged_figures(snapshot: Snapshot) -> tuple[object, ...]:
     """Returns what a line about a scan shows, but for what came and went."""
     return (
         snapshot.bags,

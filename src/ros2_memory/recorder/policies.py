@@ -132,7 +132,7 @@ def describe_death(status: int, last_output: str) -> str:
     if status >= 0:
         ended = f"ended by itself with status {status}"
     else:
-        known = {each.value: each.name for each in signal.Signals}
-        ended = f"was killed ({known.get(-status, f'signal {-status}')})"
+        signal_names = {number.value: number.name for number in signal.Signals}
+        ended = f"was killed ({signal_names.get(-status, f'signal {-status}')})"
     said = f"; last it said: {last_output}" if last_output else ""
     return f"ros2 bag record {ended}{said}"

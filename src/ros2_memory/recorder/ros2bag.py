@@ -101,9 +101,9 @@ class Ros2BagRecorder(Recorder):
         self._keep_open = tuple(keep_open)
         self._checked = False
         by_setting = {
-            str(each["topic"]): "recording.required"
-            for each in required
-            if "*" not in str(each["topic"])
+            str(entry["topic"]): "recording.required"
+            for entry in required
+            if "*" not in str(entry["topic"])
         }
         self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
         self._ros = Installation("ros2", {}, frozenset())
@@ -130,7 +130,7 @@ class Ros2BagRecorder(Recorder):
             own=own or OwnRecordings(self._bag_dir),
             reception=self._reception,
             background=background,
-            required=[Required(str(each["topic"]), float(each["min_hz"])) for each in required],
+            required=[Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required],
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )
@@ -181,7 +181,7 @@ class Ros2BagRecorder(Recorder):
                 f"{error.filename} cannot be written: {error.strerror}; the recorder must be able "
                 "to write into recording.bag_dir"
             ) from error
-        _prune(self._bag_dir / ROS_LOG_DIR)
+        _delete_old_logs(self._bag_dir / ROS_LOG_DIR)
         argv = record_argv(
             ros2=self._ros.ros2,
             directory=directory,
@@ -201,7 +201,7 @@ class Ros2BagRecorder(Recorder):
         return Child.start(argv, self._ros.env, keep_open=self._keep_open)
 
 
-def _prune(log_dir: Path) -> None:
+def _delete_old_logs(log_dir: Path) -> None:
     """Deletes all but the newest logs of `ros2`, whose lines the event log has as well."""
     with suppress(OSError):
         if log_dir.is_symlink():

@@ -90,7 +90,7 @@ class Splits:
             split = self._files.setdefault(name, _Split(now_s))
             split.size = max(split.size, size)
         faults: list[str] = []
-        closed = [name for name in sizes if self._has_closed(name, faults)]
+        closed = [name for name in sizes if self._note_closed(name, faults)]
         closed.sort(key=lambda name: (self._files[name].start, name))
         newest_s = max((split.first_seen_s for split in self._files.values()), default=now_s)
         overdue = now_s - newest_s >= EMPTY_GRACE_S
@@ -130,8 +130,8 @@ class Splits:
                     sizes[entry.name] = entry.stat(follow_symlinks=False).st_size
         return sizes
 
-    def _has_closed(self, name: str, faults: list[str]) -> bool:
-        """Whether the split has been closed since the last observation."""
+    def _note_closed(self, name: str, faults: list[str]) -> bool:
+        """Takes what a split has that was closed since the last observation; returns if it was."""
         split = self._files[name]
         if split.closed or split.size == 0:
             return False
@@ -227,10 +227,10 @@ class RecordingSession:
             if line.kind is LineKind.READY:
                 if not self.has_recorded:
                     lines.append(line)
-                self._records()
+                self._note_recording()
             elif line.kind is LineKind.SUBSCRIBED and line.topic is not None:
                 # A child that subscribes records, in whatever words it reports its beginning.
-                self._records()
+                self._note_recording()
                 # Its own topic says nothing of whether it hears the robot.
                 if line.topic != MESSAGES_LOST:
                     self.subscribed.add(line.topic)
@@ -247,13 +247,13 @@ class RecordingSession:
             return frozenset()
         return frozenset(self.subscribed - self.splits.received)
 
-    def _records(self) -> None:
+    def _note_recording(self) -> None:
         self.has_recorded = True
         if self.state is SessionState.STARTING:
             self.state = SessionState.RECORDING
 
     def _is_new(self, line: Line) -> bool:
-        without_numbers = "".join(each for each in line.text if not each.isdigit())
+        without_numbers = "".join(char for char in line.text if not char.isdigit())
         key = (line.topic, without_numbers)
         if key in self._reported or len(self._reported) >= MAX_DISTINCT:
             return False

@@ -142,7 +142,7 @@ class RecordingSessions:
     @property
     def bytes_written(self) -> int:
         """The bytes that all recordings wrote since the start."""
-        return self._ended_bytes + sum(each.splits.bytes_written for each in self.running)
+        return self._ended_bytes + sum(session.splits.bytes_written for session in self.running)
 
     def begin(self, now: ClockReading) -> None:
         """Starts a recording if none is running.
@@ -182,28 +182,28 @@ class RecordingSessions:
 
     def observe(self, now: ClockReading) -> bool:
         """Reads what the children printed and wrote; returns whether a split was closed."""
-        closed = False
+        has_closed = False
         for session in self.running:
-            changes = self._observe(session, now)
-            self._list_own(session)
-            closed = closed or bool(changes.closed)
+            changes = self._observe_session(session, now)
+            self._update_list(session)
+            has_closed |= bool(changes.closed)
             if changes.gone and session.state is not SessionState.ENDING:
                 name = session.name
                 sentence = f"the directory of recording {name} is missing; a new recording starts"
                 self._events.fail("recording_vanished", sentence, recording=name)
                 self.restarts += 1
-                self._lose(session)
-        if closed:
+                self._go_on_without(session)
+        if has_closed:
             self.settle_handovers()
-        return closed
+        return has_closed
 
     def advance_handover(self, now: ClockReading) -> Step:
         """Takes a handover further; returns COMPLETE or ABANDON when it is over."""
         handover = self.handover
         if handover is None:
             return Step.WAIT
-        step = Step.ABANDON
-        with self._reported(handover.old):
+        step = Step.ABANDON  # unless all goes well
+        with self._reporting_failures(handover.old):
             due = handover.advance(now)
             if due is Step.COMPLETE:
                 self._take_over(handover, now)
@@ -225,9 +225,9 @@ class RecordingSessions:
                 self._report_death(session, now)
                 if session is self.current:
                     self._finalize(session, now)
-                    self._lose(session)
+                    self._go_on_without(session)
                 else:
-                    self._lose(session)  # its sidecar says so before it is finalized
+                    self._go_on_without(session)  # its sidecar says so before it is finalized
                     self._finalize(session, now)
                     self.settle_handovers()
         return deaths
@@ -269,7 +269,7 @@ class RecordingSessions:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
         handover = self.handover
         if handover is not None:
-            with self._reported(handover.old):
+            with self._reporting_failures(handover.old):
                 # Else the old one counts up to its end, and the new one from there.
                 if handover.complete(now):
                     self._completed[handover.old.name] = handover
@@ -299,7 +299,7 @@ class RecordingSessions:
         self.running += (session,)
         return session
 
-    def _list_own(self, session: RecordingSession) -> None:
+    def _update_list(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, and its splits; a fault is retried."""
         try:
             session.is_listed = session.is_listed or self._orders.own.complete(session.name)
@@ -312,7 +312,7 @@ class RecordingSessions:
         else:
             self._events.resolve("recording_not_listed", session.name)
 
-    def _observe(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
+    def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)
         before = session.splits.bytes_written
         changes = session.splits.observe(now.monotonic_s)
@@ -327,7 +327,7 @@ class RecordingSessions:
         if changes.closed:
             self.heard |= session.splits.received
             self.closed_s = now.monotonic_s
-            self._flush(session, session.splits.directory, changes.closed)
+            self._flush_later(session, session.splits.directory, changes.closed)
         for name in changes.empty:
             file = f"{session.name}/{name}"
             sentence = f"{file} is empty although a newer split was started"
@@ -345,7 +345,9 @@ class RecordingSessions:
             elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
                 self._orders.reception.lost(session.name, line.topic, line.count or 0)
 
-    def _flush(self, session: RecordingSession, directory: Path, names: tuple[str, ...]) -> None:
+    def _flush_later(
+        self, session: RecordingSession, directory: Path, names: tuple[str, ...]
+    ) -> None:
         def flush() -> None:
             for fault in flush_bags(directory, names):
                 self._events.warn("not_flushed", fault, recording=session.name)
@@ -371,12 +373,12 @@ class RecordingSessions:
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session; the old one continues."""
         self.handover = None
-        with self._reported(handover.old):
+        with self._reporting_failures(handover.old):
             handover.abandon()
         self._unsettled.append(handover.directories)
         handover.new.end()
 
-    def _lose(self, session: RecordingSession) -> None:
+    def _go_on_without(self, session: RecordingSession) -> None:
         """Goes on without a session: with the other one of a handover, if there is one."""
         handover = self.handover
         if handover is not None and session is handover.new:
@@ -428,28 +430,23 @@ class RecordingSessions:
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
         """Reads what an ended session left, completes its sidecar, and makes it durable."""
         session.state = SessionState.ENDED
-        self.running = tuple(each for each in self.running if each is not session)
-        self._observe(session, now)
-        completed = self._completed.pop(session.name, None)
-        if completed is not None:
-            with self._reported(session):
-                completed.add_late_splits()
-        self._list_own(session)
+        self.running = tuple(other for other in self.running if other is not session)
+        self._observe_session(session, now)
+        handover = self._completed.pop(session.name, None)
+        if handover is not None:
+            with self._reporting_failures(session):
+                handover.add_late_splits()
+        self._update_list(session)
         self._events.ended(session.name)
         splits = session.splits
         if remove_if_empty(splits.directory):
             self._events.info("recording_empty", recording=session.name)
-        self._flush(session, splits.directory, (METADATA_FILE,))
-        self._flush(session, self._bag_dir, ())
+        self._flush_later(session, splits.directory, (METADATA_FILE,))
+        self._flush_later(session, self._bag_dir, ())
         self._ended_bytes += splits.bytes_written
-        silent, lived_s = sorted(session.subscribed - splits.received), session.age_s(now)
-        if silent and lived_s >= WHOLE_RECORDING_S:
-            sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
-            if not splits.received:
-                topics = counted(len(silent), "topic")
-                sentence = f"subscribed to {topics} and received nothing from any of them; "
-                sentence += self._orders.advice()
-            self._events.warn("topics_silent", sentence, recording=session.name)
+        lived_s = session.age_s(now)
+        if lived_s >= WHOLE_RECORDING_S:
+            self._report_silent_topics(session)
         self._events.info(
             "recording_ended",
             recording=session.name,
@@ -459,8 +456,19 @@ class RecordingSessions:
             lived_s=round(lived_s, 3),
         )
 
+    def _report_silent_topics(self, session: RecordingSession) -> None:
+        silent = sorted(session.subscribed - session.splits.received)
+        if not silent:
+            return
+        sentence = f"subscribed, and no message in the whole recording: {', '.join(silent)}"
+        if not session.splits.received:
+            topics = counted(len(silent), "topic")
+            sentence = f"subscribed to {topics} and received nothing from any of them; "
+            sentence += self._orders.advice()
+        self._events.warn("topics_silent", sentence, recording=session.name)
+
     @contextmanager
-    def _reported(self, session: RecordingSession) -> Iterator[None]:
+    def _reporting_failures(self, session: RecordingSession) -> Iterator[None]:
         """Reports an error of the handover from this session, and continues after the block."""
         try:
             yield

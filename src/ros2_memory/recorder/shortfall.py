@@ -59,7 +59,7 @@ class TopicWatch:
         self._unheard_from_s: float | None = None
         self._began_s: float | None = None
         # Since when each topic is offered.
-        self._since_s: dict[str, float] = {}
+        self._offered_since_s: dict[str, float] = {}
 
     def began(self, now: ClockReading) -> None:
         """Notes that a recording begins while none runs."""
@@ -75,16 +75,16 @@ class TopicWatch:
             self._name_unknown_types(current)
         if current.age_s(now) >= WAITING_S and sessions.handover is None:
             self._name_absent(current, sessions)
-        before, found = self.shortfall, self._shortfall(now, current, sessions)
-        self.shortfall = found
-        if new := sorted({*found.unheard} - {*before.unheard}):
+        before, after = self.shortfall, self._current_shortfall(now, current, sessions)
+        self.shortfall = after
+        if new := sorted({*after.unheard} - {*before.unheard}):
             sentence = f"offered, and no message has come: {listed(new)}; {self._orders.advice()}"
             self._events.remark("topics_unheard", sentence, topics=new)
-        if new := sorted({*found.fell_silent} - {*before.fell_silent}):
+        if new := sorted({*after.fell_silent} - {*before.fell_silent}):
             sentence = f"regular until now, and silent: {listed(new)}"
             self._events.remark("topics_stopped", sentence, topics=new)
-        if found.required_missing and not before.required_missing:
-            sentence = f"required, and not recorded: {listed(found.required_missing)}"
+        if after.required_missing and not before.required_missing:
+            sentence = f"required, and not recorded: {listed(after.required_missing)}"
             self._events.remark("required_missing", sentence)
 
     def missing(self, sessions: RecordingSessions) -> tuple[str, ...]:
@@ -94,8 +94,8 @@ class TopicWatch:
         if not any(session.has_recorded for session in sessions.running):
             return ()
         unknown = (session.of_unknown_type for session in sessions.running)
-        known = self._offered.union(self.shortfall.unknown_types, *unknown)
-        return tuple(sorted({*self._topics.selection.exact} - known))
+        offered = self._offered.union(self.shortfall.unknown_types, *unknown)
+        return tuple(sorted({*self._topics.selection.exact} - offered))
 
     def _look_for_messages(self, now: ClockReading, sessions: RecordingSessions) -> None:
         """Looks whether any message has arrived since recording started.
@@ -184,7 +184,7 @@ class TopicWatch:
             self._events.remark("topic_silent", sentence, topics=new)
         self.gone = gone
 
-    def _shortfall(
+    def _current_shortfall(
         self, now: ClockReading, current: RecordingSession, sessions: RecordingSessions
     ) -> Shortfall:
         running, now_s = sessions.running, now.monotonic_s
@@ -194,12 +194,14 @@ class TopicWatch:
         unknown = set[str]().union(*(session.of_unknown_type for session in running))
         if len(running) > 1 or current.age_s(now) < TYPES_S:
             # A recording that has not had the time to find all that is offered.
-            offered.update(self._since_s)
+            offered.update(self._offered_since_s)
             unknown.update(self.shortfall.unknown_types)
-        self._since_s = {topic: self._since_s.get(topic, now_s) for topic in offered}
+        self._offered_since_s = {
+            topic: self._offered_since_s.get(topic, now_s) for topic in offered
+        }
         split_s = self._orders.split_duration_s
         # What comes slowly is written when its split is closed.
-        known_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
+        written_until_s = sessions.closed_s if current.splits.bytes_written else now_s - split_s
         idle_s = max(0.0, now_s - sessions.grew_s - IDLE_SPLITS * split_s)
         silent, rates_hz = self._orders.reception.arrivals(ns_from_unix(idle_s))
         return Shortfall(
@@ -208,17 +210,17 @@ class TopicWatch:
                 topic
                 for topic in sorted({*offered} - sessions.heard - OWN_TOPICS)
                 # Services and actions speak when they are used.
-                if "/_" not in topic and known_s - self._since_s[topic] >= UNHEARD_S
+                if "/_" not in topic and written_until_s - self._offered_since_s[topic] >= UNHEARD_S
             ),
             fell_silent=tuple(sorted(silent & offered)),
             required_missing=(
-                tuple(self._lacks(now_s, sessions.heard, unknown, silent, rates_hz))
+                tuple(self._unmet_requirements(now_s, sessions.heard, unknown, silent, rates_hz))
                 if now_s - self._began_s >= UNHEARD_S
                 else ()
             ),
         )
 
-    def _lacks(
+    def _unmet_requirements(
         self,
         now_s: float,
         heard: Collection[str],
@@ -229,16 +231,16 @@ class TopicWatch:
         """Yields why topics are not recorded as required, a sentence each."""
         for required in self._orders.required:
             entry = TopicSelection((required.topic,))
-            known = filter(entry.matches, {*self._since_s, *heard, *unknown})
-            for topic in sorted({*known, *entry.exact}) or [required.topic]:
+            matching = filter(entry.matches, {*self._offered_since_s, *heard, *unknown})
+            for topic in sorted({*matching, *entry.exact}) or [required.topic]:
                 rate = rates_hz.get(topic, 0.0)
                 if topic in unknown:
                     yield f"{topic}: ros2 bag record does not know its type"
-                elif topic not in self._since_s:
+                elif topic not in self._offered_since_s:
                     yield f"{topic}: no publisher offers it"
                 elif topic not in heard:
                     yield f"{topic}: it is offered, and nothing has come"
                 elif topic in silent:
                     yield f"{topic}: it came regularly, and is silent"
-                elif now_s - self._since_s[topic] >= UNHEARD_S and rate < required.min_hz:
+                elif now_s - self._offered_since_s[topic] >= UNHEARD_S and rate < required.min_hz:
                     yield f"{topic}: {rate:.3g} Hz, and {required.min_hz:g} are required"

@@ -94,7 +94,9 @@ class Supervisor:
         self._disk = HomeDisk(orders.bag_dir, device)
         self._housekeeper = housekeeper
         self._events = EventLog(orders.clock)
-        self._sessions = RecordingSessions(orders, self._announce, self._note_restart, self._events)
+        self._sessions = RecordingSessions(
+            orders, self._announce, self._add_interruption, self._events
+        )
         self._topic_watch = TopicWatch(orders, self._events)
         self._beat: Heartbeat | None = None
         self._backoff = Backoff()
@@ -134,7 +136,7 @@ class Supervisor:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
         self._check_space(now)
         if not self._paused:
-            self._begin(now)
+            self._begin_recording(now)
         self.stopped = False
         self._write_heartbeat()
 
@@ -180,7 +182,7 @@ class Supervisor:
             ("restart", 0.0, True, self._check_restart),
             ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
             ("reap", 0.0, False, self._sessions.collect_ended),
-            ("interruptions", 0.0, True, self._note_interruptions),
+            ("interruptions", 0.0, True, self._report_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
             ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
             ("faults", 0.0, False, self._report_faults),
@@ -210,7 +212,7 @@ class Supervisor:
 
     def _check_disk(self, now: ClockReading) -> None:
         """Ends recording while another disk lies under the bag directory than at the start."""
-        recordings = [each.name for each in self._sessions.running if each.splits.exists]
+        recordings = [session.name for session in self._sessions.running if session.splits.exists]
         was_away, is_away = self._disk.away, self._disk.is_away(recordings)
         self._reception.may_write = not is_away
         if is_away and not was_away:
@@ -239,37 +241,42 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        free, least = self._free_bytes(), self._orders.min_free_bytes
+        free = self._free_bytes()
         # More than what it was paused for.
-        enough = round(least * RESUME_FACTOR)
+        enough = round(self._orders.min_free_bytes * RESUME_FACTOR)
         if free is None:
             return
-        if self._paused and free >= enough:
+        if not self._paused:
+            self._make_room_or_pause(now, free, enough)
+        elif free >= enough:
             self._paused = False
             self._postpone("restart", 0.0, now)
             self._events.info("recording_resumed", free_bytes=free)
-        elif self._paused:
-            if self._is_due("room", QUIET_RETENTION_S, now):
-                # Bags that were being written when recording was paused may be deleted by now.
-                self._housekeeper.make_room(enough)
-        else:
-            if free < least and not self._room_requested:
-                self._housekeeper.make_room(enough)
-                free = self._free_bytes()
-                if free is None:
-                    return
-            self._room_requested = free < least
-            # Room that is being made is waited for while half of it is free.
-            waits = self._housekeeper.is_making_room() and free >= least // 2
-            if free < least and not waits:
-                self._paused = True
-                self._sessions.end_all(now)
-                self._events.fail(
-                    "recording_paused",
-                    f"recording is paused: {free} bytes are free on the disk, and {least} are "
-                    f"required (retention.min_free_gb); it resumes by itself at {enough}",
-                )
-                self._write_heartbeat()
+        elif self._is_due("room", QUIET_RETENTION_S, now):
+            # Bags that were being written when recording was paused may be deleted by now.
+            self._housekeeper.make_room(enough)
+
+    def _make_room_or_pause(self, now: ClockReading, free: int, enough: int) -> None:
+        """Begins to make room where too little is free; pauses where that does not help."""
+        least = self._orders.min_free_bytes
+        if free < least and not self._room_requested:
+            self._housekeeper.make_room(enough)
+            left = self._free_bytes()
+            if left is None:
+                return
+            free = left
+        self._room_requested = free < least
+        # Room that is being made is waited for while half of it is free.
+        is_waiting = self._housekeeper.is_making_room() and free >= least // 2
+        if free < least and not is_waiting:
+            self._paused = True
+            self._sessions.end_all(now)
+            self._events.fail(
+                "recording_paused",
+                f"recording is paused: {free} bytes are free on the disk, and {least} are "
+                f"required (retention.min_free_gb); it resumes by itself at {enough}",
+            )
+            self._write_heartbeat()
 
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
@@ -284,28 +291,29 @@ class Supervisor:
         current = self._sessions.current
         if current is None:
             return
-        silent = self._silence.is_silent(
+        is_silent = self._silence.is_silent(
             now.monotonic_s,
             current.splits.bytes_written,
             offered=bool(current.subscribed - OWN_TOPICS),
         )
         # Every split repeats the list of all splits before it, so a recording that is never
         # rotated grows with the square of its age.
-        over = current.age_s(now) >= self._orders.session_duration_s
+        is_over = current.age_s(now) >= self._orders.session_duration_s
         resubscribe = self._reception.rotation_due(current.name, now.monotonic_s)
-        wanted = self._rotate_now or silent or over or resubscribe is not None
-        ready = current.is_recording and current.splits.exists and self._sessions.handover is None
-        if not (wanted and ready and self._is_due("rotate", 0.0, now)):
+        is_wanted = self._rotate_now or is_silent or is_over or resubscribe is not None
+        is_alone = self._sessions.handover is None
+        may_rotate = is_alone and current.is_recording and current.splits.exists
+        if not (is_wanted and may_rotate and self._is_due("rotate", 0.0, now)):
             return
-        if silent:
+        if is_silent:
             sentence = (
                 f"{current.name} does not grow: the robot is silent, or its messages do not "
                 "arrive; the recording is closed"
             )
             self._events.warn("no_growth", sentence, recording=current.name)
-        self._rotating_for_silence = silent and not over
+        self._rotating_for_silence = is_silent and not is_over
         # A recorder that receives nothing may have missed what is latched now.
-        self._reception.skip_latched(() if silent else self._housekeeper.excluded_latched())
+        self._reception.skip_latched(() if is_silent else self._housekeeper.excluded_latched())
         try:
             self._sessions.begin_handover(now)
         except RecorderError as error:
@@ -341,12 +349,12 @@ class Supervisor:
         if self._sessions.current is not None or self._paused:
             return
         try:
-            self._begin(now)
+            self._begin_recording(now)
         except RecorderError as error:
             self._events.fail("recorder_not_started", str(error))
             self._postpone("restart", self._backoff.failed(), now)
 
-    def _begin(self, now: ClockReading) -> None:
+    def _begin_recording(self, now: ClockReading) -> None:
         make_bag_dir(self._bag_dir)
         self._rotate_now = False
         self._reception.skip_latched(())
@@ -355,7 +363,7 @@ class Supervisor:
         self._silence.began(now.monotonic_s, SETTLE_S)
 
     def _note_recorded(self, now: ClockReading) -> None:
-        names = [each.name for each in self._sessions.running if each.has_recorded]
+        names = [session.name for session in self._sessions.running if session.has_recorded]
         self._housekeeper.note_recorded(
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
@@ -383,12 +391,12 @@ class Supervisor:
         self._housekeeper.announce(name)
         self._write_heartbeat(announced=name)
 
-    def _note_restart(self, first: Ns, how: Interruption) -> None:
+    def _add_interruption(self, first: Ns, how: Interruption) -> None:
         # What hangs when everything is ended is followed by no other recording.
         if not self.stopped:
             self._interruptions.append((first, how))
 
-    def _note_interruptions(self, _: ClockReading) -> None:
+    def _report_interruptions(self, _: ClockReading) -> None:
         while self._interruptions:
             self._housekeeper.note_restart(*self._interruptions.pop(0))
 
@@ -411,7 +419,7 @@ class Supervisor:
             return
         last, now, state = self._beat, self._orders.clock.now(), state or self._state
         since = last.since if last is not None and last.state is state else now
-        beat = self._heartbeat(now, state, since, announced)
+        beat = self._make_heartbeat(now, state, since, announced)
         if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
             return
         self._beat = beat
@@ -422,7 +430,7 @@ class Supervisor:
         else:
             self._events.resolve("heartbeat_not_written", "")
 
-    def _heartbeat(
+    def _make_heartbeat(
         self, now: Ns, state: RecorderState, since: Ns, announced: str | None
     ) -> Heartbeat:
         """Returns what `recorder.json` is to say now."""

@@ -154,7 +154,7 @@ def _clear_folder(
 
     Returns whether there were any, and the directories in it that are not hidden.
     """
-    bags, files, below = _listed(folder)
+    bags, files, below = _names_in(folder)
     going = bags
     if own is not None:
         holds = own.judge("/".join(parts), identity_at(folder))
@@ -175,18 +175,18 @@ def _remove_emptied(root: Path, emptied: list[Path], cleared: Cleared) -> None:
         with suppress(OSError), directories.opened(root, path.parent) as above:
             if path.parent == root / MOMENTS_FOLDER:
                 with directories.opened(root, path) as folder:
-                    bags, files, below = _listed(folder)
+                    bags, files, below = _names_in(folder)
                     if MOMENT_FILE in files and not bags and not below:
                         cleared.delete(path / MOMENT_FILE, folder)
             os.rmdir(path.name, dir_fd=above)
 
 
-def _listed(folder: int) -> tuple[set[str], set[str], list[str]]:
+def _names_in(folder: int) -> tuple[set[str], set[str], list[str]]:
     """Returns the names of bags and their journals, of files, and of directories in a directory."""
-    with os.scandir(folder) as entries:
-        found = [*entries]
-    files = {entry.name for entry in found if entry.is_file(follow_symlinks=False)}
-    below = [entry.name for entry in found if entry.is_dir(follow_symlinks=False)]
+    with os.scandir(folder) as listing:
+        entries = [*listing]
+    files = {entry.name for entry in entries if entry.is_file(follow_symlinks=False)}
+    below = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
     return {name for name in files if bag_kind(name) or is_journal(name)}, files, below
 
 
@@ -194,6 +194,6 @@ def _is_worthless(entry: os.DirEntry[str]) -> bool:
     """Whether a file of a recording means nothing where that has no bag with content."""
     if not entry.is_file(follow_symlinks=False):
         return False
-    known = bag_kind(entry.name) or is_journal(entry.name) or entry.name == METADATA_FILE
-    empty = not entry.stat(follow_symlinks=False).st_size
-    return entry.name == HANDOVER_FILE or bool(known and empty)
+    is_known = bag_kind(entry.name) or is_journal(entry.name) or entry.name == METADATA_FILE
+    is_empty = not entry.stat(follow_symlinks=False).st_size
+    return entry.name == HANDOVER_FILE or bool(is_known and is_empty)

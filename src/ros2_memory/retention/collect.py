@@ -227,11 +227,12 @@ class GarbageCollector:
             plan = plan_deletions(stock, limits)
             result.foreign_bytes, result.state_bytes = stock.foreign_bytes, stock.state_bytes
             result.saved_bytes = sum(file.size for file in stock.saved)
-            result.total_bytes, result.fits, result.most_free = plan[1:4]
+            result.total_bytes, result.fits = plan.total_bytes, plan.fits
+            result.most_free = plan.most_free
             going = plan.to_delete if self._memory is None else by_hours(plan, stock)
             to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
-                self._delete_all(to_delete, stock, snapshot, run, plan)
+                self._delete_bags(to_delete, stock, snapshot, run, plan)
                 run.unshipped += sorted(stock.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
@@ -240,13 +241,7 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
-        if self._memory is not None:
-            # As bags do, days age by the newest that is recorded, and by a clock that is right.
-            newest = snapshot.latest if stock.synchronised else None
-            try:
-                self._memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
-            except (EpisodicError, OSError) as error:
-                _log.error("memory_not_limited", reason=str(error))
+        self._limit_memory(snapshot, is_synchronised=stock.synchronised)
         if free_bytes_wanted is None and result.fits:
             self._cut_topics(stock, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
@@ -256,6 +251,16 @@ class GarbageCollector:
             if path not in run.saved
         )
         return result
+
+    def _limit_memory(self, snapshot: Snapshot, *, is_synchronised: bool) -> None:
+        if self._memory is None:
+            return
+        # As bags do, days age by the newest that is recorded, and by a clock that is right.
+        newest = snapshot.latest if is_synchronised else None
+        try:
+            self._memory.limit(None if newest is None else min(newest, snapshot.scanned_at))
+        except (EpisodicError, OSError) as error:
+            _log.error("memory_not_limited", reason=str(error))
 
     def _stock(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> RetentionStock:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
@@ -309,7 +314,7 @@ class GarbageCollector:
         except OSError as error:
             _log.error("topics_not_cut", reason=error.strerror or str(error))
 
-    def _delete_all(
+    def _delete_bags(
         self,
         to_delete: Sequence[StoredBag],
         stock: RetentionStock,
@@ -321,6 +326,18 @@ class GarbageCollector:
         run.saved |= {
             bag.path for bag in to_delete if any(file.inode in saved for file in bag.files)
         }
+        self._carry(to_delete, snapshot, run)
+        going = [bag for bag in to_delete if bag.path not in run.remaining]
+        self._keep_memory(going, plan, stock, snapshot, run)
+        going = [bag for bag in going if bag.path not in run.remaining]
+        self._write_down(going)
+        for bag in going:
+            self._delete_bag(bag, run)
+        # Where the disk was full, there is room now.
+        self._write_down(())
+
+    def _carry(self, to_delete: Sequence[StoredBag], snapshot: Snapshot, run: _Pass) -> None:
+        """Carries latched messages on; bags remain of which that failed, or was just done."""
         paths = {Path(path) for path in (*run.deleted, *(bag.path for bag in to_delete))}
         latched = {bag.file for bag in self._carrier.with_latched(snapshot, paths)}
         try:
@@ -329,7 +346,9 @@ class GarbageCollector:
             # Bags without latched messages can still be deleted, and may free enough space.
             for bag in to_delete:
                 if bag.path in latched:
-                    self._keep(bag, f"its latched messages cannot be carried on: {error}", run)
+                    self._keep_failed(
+                        bag, f"its latched messages cannot be carried on: {error}", run
+                    )
         else:
             run.result.carried = run.result.carried if carried is None else carried
         now = self._monotonic()
@@ -339,16 +358,8 @@ class GarbageCollector:
             if not run.urgent and now - since < self._grace_s:
                 run.remaining.add(path)
                 run.waiting.add(path)
-        going = [bag for bag in to_delete if bag.path not in run.remaining]
-        self._outlive(going, plan, stock, snapshot, run)
-        going = [bag for bag in going if bag.path not in run.remaining]
-        self._note(going)
-        for bag in going:
-            self._delete(bag, run)
-        # Where the disk was full, there is room now.
-        self._note(())
 
-    def _outlive(
+    def _keep_memory(
         self,
         to_delete: Sequence[StoredBag],
         plan: DeletionPlan,
@@ -371,16 +382,16 @@ class GarbageCollector:
             now = self._monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
-            must = {bag.path for bag in plan.to_delete}
-            must -= plan.aged if now - since < RETRIED_S else frozenset()
-            waiting = [bag for bag in to_delete if bag.path not in must]
+            must_go = {bag.path for bag in plan.to_delete}
+            must_go -= plan.aged if now - since < RETRIED_S else frozenset()
+            waiting = [bag for bag in to_delete if bag.path not in must_go]
             run.remaining |= {bag.path for bag in waiting}
             lost = len(to_delete) - len(waiting)
             _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)
         else:
             self._memory_fails_since = None
 
-    def _note(self, going: Sequence[StoredBag]) -> None:
+    def _write_down(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
@@ -398,7 +409,7 @@ class GarbageCollector:
         else:
             self._unwritten.clear()
 
-    def _delete(self, bag: StoredBag, run: _Pass) -> None:
+    def _delete_bag(self, bag: StoredBag, run: _Pass) -> None:
         size = 0
         for path, file in zip((bag.path, other_form(bag.path)), bag.files, strict=False):
             try:
@@ -407,7 +418,7 @@ class GarbageCollector:
             except FileNotFoundError:
                 continue
             except OSError as error:
-                self._keep(bag, str(error), run)
+                self._keep_failed(bag, str(error), run)
                 return
         self._reported.discard(bag.path)
         self._carried_since.pop(bag.path, None)
@@ -427,7 +438,7 @@ class GarbageCollector:
                 self._emptied.discard(recording)
                 run.result.recordings += not recording.exists()
 
-    def _keep(self, bag: StoredBag, reason: str, run: _Pass) -> None:
+    def _keep_failed(self, bag: StoredBag, reason: str, run: _Pass) -> None:
         run.remaining.add(bag.path)
         run.result.failed += 1
         self._report(bag.path, reason)

@@ -13,6 +13,7 @@ import stat
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from operator import itemgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -58,6 +59,7 @@ from ros2_memory.retention.repair import (
     left_in,
     open_files,
     opened_folder,
+    reason_of,
     replace_file,
     rewritten,
 )
@@ -103,7 +105,7 @@ class Survey(NamedTuple):
     @property
     def counts(self) -> Counter[str]:
         """The messages that go, by topic."""
-        return sum((each.counts for each in self.holders), Counter[str]())
+        return sum((holder.counts for holder in self.holders), Counter[str]())
 
 
 class Kept(NamedTuple):
@@ -144,32 +146,32 @@ class Eraser:
 
     def topics(self) -> frozenset[str]:
         """Returns the topics of all bags that can be read; of those that do not count too."""
-        found: set[str] = set()
-        for paths in self._files().values():
+        topics: set[str] = set()
+        for paths in self._paths_by_inode().values():
             with suppress(BagError):
-                found.update(each.topic for each in self._reader.channels(paths[0]))
-        return frozenset(found)
+                topics.update(channel.topic for channel in self._reader.channels(paths[0]))
+        return frozenset(topics)
 
     def survey(self, erasure: Erasure) -> Survey:
         """Returns which bags hold messages that go; changes nothing."""
         holders: list[Holder] = []
         kept: list[str] = []
-        for inode, paths in sorted(self._files().items(), key=lambda each: each[1]):
+        for inode, paths in sorted(self._paths_by_inode().items(), key=itemgetter(1)):
             try:
-                found = self._look_into(erasure, paths, inode)
+                judged = self._holder_or_reason(erasure, paths, inode)
             except (BagError, OSError) as error:
                 if not any(map(self._may_change, paths)):
                     continue
-                found = f"its contents are unknown: {_reason_of(error)}"
-            if isinstance(found, str):
-                kept.append(f"{self._name(paths[0])}: {found}")
-            elif found is not None:
-                holders.append(found)
-                foreign = [self._name(each) for each in paths if each not in found.paths]
-                kept.extend(f"{each}: {_FOREIGN}" for each in foreign)
+                judged = f"its contents are unknown: {reason_of(error)}"
+            if isinstance(judged, str):
+                kept.append(f"{self._relative(paths[0])}: {judged}")
+            elif judged is not None:
+                holders.append(judged)
+                foreign = [path for path in paths if path not in judged.paths]
+                kept.extend(f"{self._relative(path)}: {_FOREIGN}" for path in foreign)
         return Survey(tuple(holders), tuple(kept))
 
-    def _look_into(
+    def _holder_or_reason(
         self, erasure: Erasure, paths: Sequence[Path], inode: Identity
     ) -> Holder | str | None:
         """Returns what of a file goes; why it is kept; or None where it holds nothing that goes.
@@ -197,7 +199,7 @@ class Eraser:
                 for start, stop in erasure.windows
             )
         ]
-        holder = self._holder(erasure, topics, paths, inode)
+        holder = self._read_holder(erasure, topics, paths, inode)
         if not holder.counts:
             return None
         return self._reason_to_keep(paths, inode, summary) or holder
@@ -218,7 +220,7 @@ class Eraser:
         if not erasure.files:
             windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
             counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
-            erasure = replace(erasure, files=tuple(map(self._name, taken)), counts=counts)
+            erasure = replace(erasure, files=tuple(map(self._relative, taken)), counts=counts)
         ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
         linked: list[str] = []
@@ -227,34 +229,49 @@ class Eraser:
         for holder in survey.holders:
             try:
                 if line := self._erase_in(holder, erasure, left[holder.paths[0].parent]):
-                    again = any(map(self._may_change, self._files().get(holder.inode, ())))
+                    again = any(map(self._may_change, self._paths_by_inode().get(holder.inode, ())))
                     (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
-                kept.append(f"{self._name(holder.paths[0])}: {_reason_of(error)}")
+                kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
         files = [self._bag_dir / name for name in erasure.files]
         notes = [*self._correct_metadata({path.parent for path in files})]
         try:
-            for path in files:  # what an interrupted erasure left beside a bag
-                with (
-                    suppress(FileNotFoundError, NotADirectoryError),
-                    directories.opened(self._bag_dir, path.parent) as folder,
-                ):
-                    os.unlink(repair_name(path.name), dir_fd=folder)
+            self._delete_left_over(files)
             self._forget_silences(erasure)
             forgotten(erasure)
-            # So that answers report it.
-            known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
-            losses = [
-                Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
-                for gone in erasure.counts
-            ]
-            append_losses(self._bag_dir, [loss for loss in losses if loss not in known])
+            self._add_losses(erasure)
             # Another attempt takes nothing out of links elsewhere, as a backup has them.
             if not kept:
                 ERASING.remove(self._bag_dir)
         except (EpisodicError, OSError) as error:
-            kept.append(_reason_of(error))
+            kept.append(reason_of(error))
         return Kept((*kept, *linked), tuple(notes))
+
+    def _delete_left_over(self, bags: Sequence[Path]) -> None:
+        """Deletes what an interrupted erasure left beside bags.
+
+        Raises:
+            OSError: it cannot be deleted.
+        """
+        for path in bags:
+            with (
+                suppress(FileNotFoundError, NotADirectoryError),
+                directories.opened(self._bag_dir, path.parent) as folder,
+            ):
+                os.unlink(repair_name(path.name), dir_fd=folder)
+
+    def _add_losses(self, erasure: Erasure) -> None:
+        """Notes the messages that went as lost, so that answers report it.
+
+        Raises:
+            OSError: that cannot be written.
+        """
+        known = {*read_losses(self._bag_dir, MIN_NS, MAX_NS)}
+        losses = [
+            Loss(gone.topic, gone.start, gone.stop, gone.count, "forgotten")
+            for gone in erasure.counts
+        ]
+        append_losses(self._bag_dir, [loss for loss in losses if loss not in known])
 
     def _forget_silences(self, erasure: Erasure) -> None:
         """Takes the silences of topics in the windows out of what is known of deleted bags.
@@ -268,29 +285,29 @@ class Eraser:
         except ValueError as error:
             raise BagError(THINNED_FILE, f"it is damaged, delete it: {error}") from error
         left = tuple(
-            silence
-            for silence in thinned.silences
-            if silence[0] not in erasure.topics
-            or not any(start <= silence[2] and silence[1] < stop for start, stop in erasure.windows)
+            (topic, first, last, on_ns, goes_on)
+            for topic, first, last, on_ns, goes_on in thinned.silences
+            if topic not in erasure.topics
+            or not any(start <= last and first < stop for start, stop in erasure.windows)
         )
         if left != thinned.silences:
             if self._recorder is not None:
-                raise BagError(THINNED_FILE, _of_recorder(self._recorder))
+                raise BagError(THINNED_FILE, _recorder_refuses(self._recorder))
             THINNED.write(self._bag_dir, replace(thinned, silences=left))
 
-    def _files(self) -> dict[Identity, list[Path]]:
+    def _paths_by_inode(self) -> dict[Identity, list[Path]]:
         """Returns the paths of every bag file by device and inode, the recorded one first."""
-        found: defaultdict[Identity, list[Path]] = defaultdict(list)
+        by_inode: defaultdict[Identity, list[Path]] = defaultdict(list)
         for folder, entries in directories.walk(self._bag_dir):
             for entry in entries:
                 if bag_kind(entry.name) and not entry.is_symlink():
                     with suppress(OSError):
                         status = entry.stat(follow_symlinks=False)
                         if stat.S_ISREG(status.st_mode):
-                            found[status.st_dev, status.st_ino].append(Path(folder, entry.name))
-        for paths in found.values():
-            paths.sort(key=lambda path: (is_kept_apart(self._name(path)), path))
-        return dict(found)
+                            by_inode[status.st_dev, status.st_ino].append(Path(folder, entry.name))
+        for paths in by_inode.values():
+            paths.sort(key=lambda path: (is_kept_apart(self._relative(path)), path))
+        return dict(by_inode)
 
     def _reason_to_keep(
         self, paths: Sequence[Path], inode: Identity, summary: BagSummary
@@ -308,18 +325,18 @@ class Eraser:
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
         elif (is_carried(path) or is_thinned(path)) and self._recorder is not None:
-            reason = _of_recorder(self._recorder)
+            reason = _recorder_refuses(self._recorder)
         return reason
 
     def _may_change(self, path: Path) -> bool:
         return self._own is None or self._own.owns_bag(path)
 
-    def _holder(
+    def _read_holder(
         self, erasure: Erasure, topics: Sequence[str], paths: Sequence[Path], inode: Identity
     ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
-        listed = {topic for path in holder.paths for topic in self._listed(path)}
+        listed = {topic for path in holder.paths for topic in self._topics_in_sidecar(path)}
         for topic in topics:
             first, last = erasure.windows[0][0], erasure.windows[-1][1]
             span = (
@@ -331,15 +348,15 @@ class Eraser:
                     holder.counts[topic] += 1
                     holder.windows[topic, *window] += 1
                     if topic in listed:
-                        known = holder.ids.setdefault(topic, set())
-                        known.add(message_id(record.publish_time, record.payload))
+                        identity = message_id(record.publish_time, record.payload)
+                        holder.ids.setdefault(topic, set()).add(identity)
         return holder
 
-    def _listed(self, path: Path) -> Collection[str]:
+    def _topics_in_sidecar(self, path: Path) -> Collection[str]:
         """Returns the topics of which a sidecar lists messages of a file."""
         handover = read_handover(path.parent).handover
         lists = (handover.also_counts, handover.counts_elsewhere)
-        return {topic for each in lists for topic in each.get(path.name, ())}
+        return {topic for message_list in lists for topic in message_list.get(path.name, ())}
 
     def _erase_in(
         self,
@@ -370,21 +387,21 @@ class Eraser:
                 left_of=left_of,
             ) as new:
                 for other in holder.paths[1:]:
-                    self._link(new, other, holder.inode)
+                    self._replace_link(new, other, holder.inode)
             if os.fstat(old.fileno()).st_nlink:
                 # A recorder may have kept the old file in a moment meanwhile.
-                for late in filter(self._may_change, self._files().get(holder.inode, ())):
-                    self._link(path, late, holder.inode)
+                for late in filter(self._may_change, self._paths_by_inode().get(holder.inode, ())):
+                    self._replace_link(path, late, holder.inode)
             left = os.fstat(old.fileno()).st_nlink
         if left:
             links = counted(left, "more hard link", "more hard links")
-            return f"{self._name(path)}: all of it is still in {links} of it"
+            return f"{self._relative(path)}: all of it is still in {links} of it"
         if is_carried(path) and self._reader.summarize(path).empty:
             path.unlink()
             flush(path.parent)
         return None
 
-    def _link(self, new: Path, path: Path, inode: Identity) -> None:
+    def _replace_link(self, new: Path, path: Path, inode: Identity) -> None:
         """Puts a new file in place of one name of the old one."""
         with opened_folder(self._bag_dir, path) as here, beside(here) as name:
             os.link(new, name, follow_symlinks=False)
@@ -406,25 +423,23 @@ class Eraser:
         with directories.opened(self._bag_dir, folder):
             before = target.stat()
             handover = handover_to_change(folder)
-            lists = [
-                _without(each, path.name, ids)
-                for each in (handover.also_counts, handover.counts_elsewhere)
-            ]
-            if lists == [handover.also_counts, handover.counts_elsewhere]:
+            also = _without_messages(handover.also_counts, path.name, ids)
+            elsewhere = _without_messages(handover.counts_elsewhere, path.name, ids)
+            if (also, elsewhere) == (handover.also_counts, handover.counts_elsewhere):
                 return
             if (
                 self._own is None
                 or self._own.name_of(folder) in read_heartbeat(self._bag_dir).recordings
             ):
                 raise BagError(str(target), "its recorder still writes it; forget again later")
-            also, elsewhere = lists
+
             write_handover(folder, replace(handover, also_counts=also, counts_elsewhere=elsewhere))
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
 
     def _correct_metadata(self, recordings: Collection[Path]) -> Iterator[str]:
         """Corrects each recording's metadata.yaml by what is left; yields a line for each."""
         for recording in sorted(recordings):
-            name = f"{self._name(recording)}/{METADATA_FILE}"
+            name = f"{self._relative(recording)}/{METADATA_FILE}"
             if not (recording / METADATA_FILE).exists():
                 if recording.name in read_heartbeat(self._bag_dir).recordings:
                     yield f"{name} will count deleted messages: the recorder writes it at the end"
@@ -439,29 +454,23 @@ class Eraser:
                     f"{recording}` rewrites it"
                 )
 
-    def _name(self, path: Path) -> str:
+    def _relative(self, path: Path) -> str:
         return os.path.relpath(path, self._bag_dir)
 
 
-def _without(listed: MessageList, file: str, ids: Ids) -> MessageList:
+def _without_messages(listed: MessageList, file: str, ids: Ids) -> MessageList:
     """Returns lists of a sidecar without messages of a file."""
     topics = {
-        topic: tuple(each for each in known if each not in ids.get(topic, ()))
-        for topic, known in listed.get(file, {}).items()
+        topic: tuple(message for message in messages if message not in ids.get(topic, ()))
+        for topic, messages in listed.get(file, {}).items()
     }
-    left = {topic: known for topic, known in topics.items() if known}
-    others = {name: each for name, each in listed.items() if name != file}
+    left = {topic: messages for topic, messages in topics.items() if messages}
+    others = {name: by_topic for name, by_topic in listed.items() if name != file}
     return {**others, file: left} if left else others
 
 
-def _of_recorder(reason: str) -> str:
+def _recorder_refuses(reason: str) -> str:
     return (
         f"only the recorder may change it while it runs: {reason}; stop the recorder, and forget "
         "again"
     )
-
-
-def _reason_of(error: Exception) -> str:
-    if isinstance(error, BagError):
-        return error.reason
-    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -63,7 +63,7 @@ class ForeignBags:
 
     def __init__(self, bag_dir: Path) -> None:
         self._own = OwnRecordings(bag_dir)
-        self._known: tuple[tuple[object, ...], Foreign] | None = None
+        self._measured: tuple[tuple[object, ...], Foreign | None] = ((), None)
 
     def measured(self, snapshot: Snapshot, recording: Collection[str]) -> Foreign | None:
         """Measures them; returns None if no recorder has listed yet which recordings are its own.
@@ -77,12 +77,13 @@ class ForeignBags:
             return None
         set_aside = (snapshot.active, snapshot.damaged, snapshot.unread)
         key = (snapshot.timeline, *set_aside, self._own.stamp, tuple(recording))
-        known = self._known
-        if known is None or known[0] != key:
-            known = self._known = (key, self._measured(snapshot, frozenset(recording)))
-        return known[1]
+        key_before, foreign = self._measured
+        if foreign is None or key_before != key:
+            foreign = self._measure(snapshot, frozenset(recording))
+            self._measured = key, foreign
+        return foreign
 
-    def _measured(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
+    def _measure(self, snapshot: Snapshot, recording: frozenset[str]) -> Foreign:
         judges: dict[str, Callable[[str], bool]] = {}
 
         def is_foreign(file: str) -> bool:
@@ -93,13 +94,16 @@ class ForeignBags:
 
         segments = snapshot.timeline.segments
         bags = {
-            bag.file: bag.size for each in segments for bag in each.bags if is_foreign(bag.file)
+            bag.file: bag.size
+            for segment in segments
+            for bag in segment.bags
+            if is_foreign(bag.file)
         }
         asides = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-        beside = [each for each in asides if not each.answers and is_foreign(str(each.path))]
+        beside = [aside for aside in asides if not aside.answers and is_foreign(str(aside.path))]
         bag_bytes = sum(bags.values())
         return Foreign(
-            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(each.path) for each in beside)
+            frozenset(bags), bag_bytes, bag_bytes + sum(size_of(aside.path) for aside in beside)
         )
 
     def _judge(self, folder: str, recording: frozenset[str]) -> Callable[[str], bool]:
@@ -172,7 +176,7 @@ class Inventory:
             OSError: the list of the recorder's own recordings cannot be read.
         """
         bags: list[StoredBag] = []
-        others = state_bytes = state_bytes_in(self._root)
+        other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
         occupied: set[str] = set()
         mixed: set[str] = set()
@@ -187,34 +191,34 @@ class Inventory:
             if self._own is not None and recording not in judges:
                 judges[recording] = self._own.judge_of(recording)
             name, is_named = path[len(recording) + 1 :], recording in named
-            own = self._own is None or judges[recording](name)
+            is_own = self._own is None or judges[recording](name)
             is_saved = path in known.saved
             # One is listed moments after it appears.
             is_new = is_named and split_number(recording, name) is not None
-            is_closed = state in _CLOSED and not is_carried(path)
-            may_go = is_closed or (state in _LEFT_OPEN and not is_named)
-            may_go = may_go and not is_thinned(path)
-            if not (own or is_saved or is_new):
+            may_go = _may_be_deleted(state, path, is_named=is_named)
+            if not (is_own or is_saved or is_new):
                 mixed.add(recording)
                 foreign_bytes += sum(file.size for file in bag.files)
-            elif own and may_go and not is_saved and path not in remaining:
+            elif is_own and may_go and not is_saved and path not in remaining:
                 bags.append(bag)
             else:
                 occupied.add(recording)
                 if self._counts(state, bag) and not is_saved:
-                    others += sum(file.size for file in bag.files)
-        self._forget(known)
+                    other_bytes += sum(file.size for file in bag.files)
+        self._drop_gone(known)
         occupied |= mixed & {bag.recording for bag in bags}
         emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
-        sidecars = {each: self._folder(each, known.now).size for each in emptied}
+        sidecars = {recording: self._folder_at(recording, known.now).size for recording in emptied}
         occupied.update(bag.recording for bag in bags)
-        others += sum(self._folder(each, known.now).size for each in occupied - emptied)
-        saved = self._saved(known)
+        other_bytes += sum(
+            self._folder_at(recording, known.now).size for recording in occupied - emptied
+        )
+        saved = self._moment_files(known)
         return RetentionStock(
             bags,
             known.now,
             sidecars,
-            others,
+            other_bytes,
             saved=saved,
             foreign_bytes=foreign_bytes,
             state_bytes=state_bytes,
@@ -222,21 +226,21 @@ class Inventory:
 
     def _changing(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags that the index has notes on: few, which may still change."""
-        for path, found in known.counted.items():
+        for path, classification in known.counted.items():
             stamp, other = known.files[path].stamp, other_form(path)
             file = (stamp.inode, stamp.size)
-            bag = self._stored(path, found.bag, stamp.mtime_ns, file, known.now)
+            bag = self._stored(path, classification.bag, stamp.mtime_ns, file, known.now)
             if other in known.hidden:
-                bag = bag._replace(second=_file(bag.device, known.files[other].stamp))
-            yield found.state, bag
+                bag = bag._replace(second=_stored_file(bag.device, known.files[other].stamp))
+            yield classification.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags of which the index keeps rows."""
         rows = self._unchanged
         for bag, inode in known.unchanged.values():
-            stored, now = rows.get(bag.file), (inode, bag.size, bag.mtime_ns)
-            if stored is None or (stored.inode, stored.size, stored.written) != now:
-                stored = self._stored(bag.file, bag, bag.mtime_ns, now[:2], known.now)
+            stored, stamp = rows.get(bag.file), (inode, bag.size, bag.mtime_ns)
+            if stored is None or (stored.inode, stored.size, stored.written) != stamp:
+                stored = self._stored(bag.file, bag, bag.mtime_ns, (inode, bag.size), known.now)
                 rows[bag.file] = stored
             yield FileState.CLOSED, stored
 
@@ -245,8 +249,8 @@ class Inventory:
     ) -> StoredBag:
         """Returns a bag; `file` is its inode and size."""
         recording = sys.intern(path.rpartition("/")[0])
-        span = _UNDATED if bag is None else self._span(bag)
-        device = self._folder(recording, now).device
+        span = _UNDATED if bag is None else self._dating_span(bag)
+        device = self._folder_at(recording, now).device
         return StoredBag(path, recording, *span, written, device, *file)
 
     def _counts(self, state: FileState, bag: StoredBag) -> bool:
@@ -256,7 +260,7 @@ class Inventory:
             return self._own is not None or has_own_name(Path(bag.recording).name)
         return state is not FileState.UNREAD
 
-    def _saved(self, known: KnownBags) -> tuple[StoredFile, ...]:
+    def _moment_files(self, known: KnownBags) -> tuple[StoredFile, ...]:
         """Returns the files of moments, each once."""
         if not known.saved:
             return ()
@@ -265,9 +269,9 @@ class Inventory:
         except OSError:
             device = -1
         stamps = {stamp.inode: stamp for stamp in known.saved.values()}
-        return tuple(_file(device, stamp) for stamp in stamps.values())
+        return tuple(_stored_file(device, stamp) for stamp in stamps.values())
 
-    def _span(self, bag: BagFile) -> tuple[Ns, Ns]:
+    def _dating_span(self, bag: BagFile) -> tuple[Ns, Ns]:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
         dating = [topic for topic in bag.summary.topics if not self._is_received_again(topic)]
         if not dating:
@@ -283,20 +287,20 @@ class Inventory:
         totals = TopicTotals(topic.first, topic.last, topic.count)
         return topic.latched and Pace(totals, topic.first, topic.last).is_rare
 
-    def _folder(self, path: str, now: Ns) -> _Folder:
-        known = self._folders.get(path)
+    def _folder_at(self, path: str, now: Ns) -> _Folder:
+        folder = self._folders.get(path)
         try:
             status = Path(path).stat()
         except OSError:
             return _Folder(0, device=-1, size=0)
-        if known is None or known.mtime_ns != status.st_mtime_ns:
-            known = _Folder(status.st_mtime_ns, status.st_dev, beside_bags(Path(path)))
+        if folder is None or folder.mtime_ns != status.st_mtime_ns:
+            folder = _Folder(status.st_mtime_ns, status.st_dev, beside_bags(Path(path)))
             # metadata.yaml is created first and written some moments later.
             if abs(now - status.st_mtime_ns) >= COMPLETE_AFTER_NS:
-                self._folders[path] = known
-        return known
+                self._folders[path] = folder
+        return folder
 
-    def _forget(self, known: KnownBags) -> None:
+    def _drop_gone(self, known: KnownBags) -> None:
         if len(self._unchanged) > len(known.unchanged):
             left = {path: bag for path, bag in self._unchanged.items() if path in known.unchanged}
             recordings = self._folders.keys() & {bag.recording for bag in left.values()}
@@ -306,15 +310,24 @@ class Inventory:
 
 def state_bytes_in(bag_dir: Path) -> int:
     """Returns the size of what is stored beside the bags, columns and logs, in bytes."""
-    own = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
+    paths = [bag_dir / name for name in (*OWN_FILES, LOCK_FILE)]
     with suppress(OSError):
-        own += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
+        paths += (bag_dir / MOMENTS_FOLDER).glob(f"*/{MOMENT_FILE}")
     for folder in OWN_FOLDERS:
         with suppress(OSError):
-            own += (bag_dir / folder).iterdir()
+            paths += (bag_dir / folder).iterdir()
     # Deleting bags makes that list longer.
-    return sum(size_of(each) for each in own if each != bag_dir / DELETED_FILE)
+    return sum(size_of(path) for path in paths if path != bag_dir / DELETED_FILE)
 
 
-def _file(device: int, stamp: Stamp) -> StoredFile:
+def _may_be_deleted(state: FileState, path: str, *, is_named: bool) -> bool:
+    """Whether a bag may be deleted by its state; `is_named`: the heartbeat names its recording."""
+    if is_thinned(path):
+        return False
+    if state in _CLOSED:
+        return not is_carried(path)
+    return state in _LEFT_OPEN and not is_named
+
+
+def _stored_file(device: int, stamp: Stamp) -> StoredFile:
     return StoredFile((device, stamp.inode), stamp.size)

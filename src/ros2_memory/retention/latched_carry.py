@@ -29,7 +29,8 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
 from itertools import accumulate, pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from operator import attrgetter
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import structlog
 
@@ -79,7 +80,7 @@ class Origin(NamedTuple):
 def with_origin(record: Record, origin: Origin) -> Record:
     """Returns the message with its origin in place of any that its channel names."""
     channel = record.channel
-    rest = tuple(each for each in channel.metadata if each[0] not in {_RECORDINGS, _OFTEN})
+    rest = tuple(entry for entry in channel.metadata if entry[0] not in {_RECORDINGS, _OFTEN})
     new = ((_RECORDINGS, json.dumps(origin.recordings)), (_OFTEN, json.dumps(origin.often)))
     return record._replace(channel=replace(channel, metadata=(*rest, *new)))
 
@@ -104,6 +105,10 @@ class MessageIdentity(NamedTuple):
     payload: bytes
 
 
+_LateMessages: TypeAlias = "dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]]"
+"""By bag, its mtime and topic: the late messages that it begins with, and their log times."""
+
+
 class Latched(NamedTuple):
     """One latched message without its payload.
 
@@ -114,6 +119,11 @@ class Latched(NamedTuple):
     log_time: Ns
     identity: MessageIdentity
     subjects: tuple[tuple[str, str], ...]
+
+    @property
+    def copy(self) -> tuple[Ns, MessageIdentity]:
+        """What shows which copy of the message it is."""
+        return self.log_time, self.identity
 
 
 def latched_message(record: Record, frames: Collection[str]) -> Latched:
@@ -137,22 +147,22 @@ def worth_carrying(
         repeated: late messages in kept bags, and their earliest log time there.
     """
     # Of the copies of a message the earliest comes last, and remains.
-    earliest = {each.identity: each for each in sorted(messages, reverse=True)}
+    earliest = {message.identity: message for message in sorted(messages, reverse=True)}
     missing = sorted(
-        each
-        for identity, each in earliest.items()
-        if repeated.get(identity, MAX_NS) > each.log_time
+        message
+        for identity, message in earliest.items()
+        if repeated.get(identity, MAX_NS) > message.log_time
     )
-    needed = {each for each in missing if each.identity in repeated}
+    needed = {message for message in missing if message.identity in repeated}
     by_subject: defaultdict[tuple[str, str], list[Latched]] = defaultdict(list)
-    for each in missing:
-        for subject in each.subjects:
-            by_subject[subject].append(each)
-    for (_, frame), held in by_subject.items():
-        needed.add(held[-1])
+    for message in missing:
+        for subject in message.subjects:
+            by_subject[subject].append(message)
+    for (_, frame), of_subject in by_subject.items():
+        needed.add(of_subject[-1])
         # A static transform is valid before it was received, too.
-        since = MIN_NS if frame else held[0].log_time
-        for message, following in pairwise(held):
+        since = MIN_NS if frame else of_subject[0].log_time
+        for message, following in pairwise(of_subject):
             if message not in needed and recorded_in(since, following.log_time):
                 needed.add(message)
             since = following.log_time
@@ -187,7 +197,7 @@ class Carrier:
         self._static_topics = frozenset(static_topics)
         self._own = own
         self._failing = FailingFiles(monotonic)
-        self._late: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
+        self._late: _LateMessages = {}
 
     def with_latched(self, snapshot: Snapshot, paths: Collection[Path]) -> tuple[BagFile, ...]:
         """Returns those of the bags that contain messages of a latched topic."""
@@ -216,27 +226,23 @@ class Carrier:
             return None
         topics = self.topics(snapshot)
         gone = {str(path) for path in {*to_delete} - {*saved}}
-        kept = [
-            bag
-            for bag in snapshot.bags
-            if bag.file not in gone and not is_carried(bag.file) and not is_thinned(bag.file)
-        ]
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and _is_recorded(bag)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
         }
         origins = dict(carried)
-        remaining = {self._folder(each) for each in {bag.recording for bag in kept}}
+        remaining = {self._folder(recording) for recording in {bag.recording for bag in kept}}
         for bag in with_messages:
-            origins.update(self._read(snapshot, bag, topics))
+            origins.update(self._latched_in(snapshot, bag, topics))
         wanted = worth_carrying(
             origins, _recorded_in(kept), self._repeated(snapshot, topics, to_delete)
         )
-        chosen = {each[:2]: _merged_origin(each, origins, remaining) for each in wanted}
-        if chosen == {each[:2]: origin for each, origin in carried.items()}:
+        chosen = {message.copy: _merged_origin(message, origins, remaining) for message in wanted}
+        if chosen == {message.copy: origin for message, origin in carried.items()}:
             return None
         sources = [self.path, *(bag.path for bag in with_messages)]
-        fetched = sorted(self._fetched(sources, topics, chosen), key=lambda each: each.log_time)
+        fetched = sorted(self._fetch(sources, topics, chosen), key=attrgetter("log_time"))
         if len(fetched) < len(chosen):
             raise BagError(str(self.path), "a latched message could not be read a second time")
         self._write(fetched)
@@ -250,7 +256,7 @@ class Carrier:
             if topic in self._static_topics or snapshot.timeline.is_transient_state(topic)
         )
 
-    def _read(
+    def _latched_in(
         self, snapshot: Snapshot, bag: BagFile, topics: Collection[str]
     ) -> Iterator[tuple[Latched, Origin]]:
         """Yields the messages of these topics; of a damaged bag, those that can be read.
@@ -272,7 +278,7 @@ class Carrier:
             newest = self._reader.newest(path, topic, TimeWindow.everything())
         except BagError:
             readable = self._records(path, (topic,))
-            newest = max(readable, key=lambda each: each.log_time, default=None)
+            newest = max(readable, key=lambda record: record.log_time, default=None)
         if newest is not None:
             yield newest
 
@@ -308,7 +314,7 @@ class Carrier:
             else:
                 _log.warning("latched_not_read", path=str(path), reason=record.reason)
 
-    def _fetched(
+    def _fetch(
         self,
         sources: Iterable[Path],
         topics: Collection[str],
@@ -333,7 +339,7 @@ class Carrier:
         except UndecodableError:
             return ()
         transforms: Iterable[object] = getattr(message, "transforms", ())
-        return tuple({str(getattr(each, "child_frame_id", "")) for each in transforms})
+        return tuple({str(getattr(transform, "child_frame_id", "")) for transform in transforms})
 
     def _repeated(
         self, snapshot: Snapshot, topics: Iterable[str], to_delete: Collection[Path]
@@ -343,21 +349,21 @@ class Carrier:
         They come first in a recording, when its recorder has just subscribed.
         """
         repeated: dict[MessageIdentity, Ns] = {}
-        found: dict[tuple[Path, Ns, str], dict[MessageIdentity, Ns]] = {}
+        late: _LateMessages = {}
         for topic in topics:
             seen: set[Path] = set()
             for bag in snapshot.bags:
                 if topic not in bag.summary.schema.positions or bag.recording in seen:
                     continue
-                if bag.path in to_delete or is_carried(bag.file) or is_thinned(bag.file):
+                if bag.path in to_delete or not _is_recorded(bag):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
                 known = self._late.get(key)
-                found[key] = self._late_in(bag.path, topic) if known is None else known
-                for identity, logged in found[key].items():
+                late[key] = self._late_in(bag.path, topic) if known is None else known
+                for identity, logged in late[key].items():
                     repeated[identity] = min(logged, repeated.get(identity, logged))
-        self._late = found
+        self._late = late
         return repeated
 
     def _late_in(self, path: Path, topic: str) -> dict[MessageIdentity, Ns]:
@@ -390,6 +396,10 @@ class Carrier:
         self._own.hold(folder, [CARRY_FILE])
 
 
+def _is_recorded(bag: BagFile) -> bool:
+    return not (is_carried(bag.file) or is_thinned(bag.file))
+
+
 def _is_tf(type_name: str) -> bool:
     return type_name.rpartition("/")[2].lower() == "tfmessage"
 
@@ -398,18 +408,18 @@ def _merged_origin(
     wanted: Latched, origins: Mapping[Latched, Origin | None], remaining: Collection[str]
 ) -> Origin | None:
     """Merges the origins of a message and its copies, of recordings that still have bags."""
-    own = origins[wanted]
-    if own is None:
+    origin_of_wanted = origins[wanted]
+    if origin_of_wanted is None:
         return None
     copies = [
         recording
-        for each, origin in origins.items()
-        if each.identity == wanted.identity and origin is not None
+        for message, origin in origins.items()
+        if message.identity == wanted.identity and origin is not None
         for recording in origin.recordings
         if recording in remaining
     ]
-    first, *others = own.recordings
-    return own._replace(recordings=(first, *sorted({*others, *copies} - {first})))
+    first, *others = origin_of_wanted.recordings
+    return origin_of_wanted._replace(recordings=(first, *sorted({*others, *copies} - {first})))
 
 
 def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:

@@ -201,14 +201,14 @@ class DeletionPlan(NamedTuple):
 
 def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
     """Returns the bags that are too old by either clock."""
-    stock = _in_order(stock, limits)
-    return _ages(stock, _eras(stock, limits), limits.max_age_ns)
+    stock = _with_consistent_dates(stock, limits)
+    return _ages_in_eras(stock, _eras(stock, limits), limits.max_age_ns)
 
 
 def older_than(max_age_ns: Ns, stock: RetentionStock, limits: RetentionLimits) -> frozenset[str]:
     """Returns the bags that age could delete if it were so much, by the clock that is right."""
-    stock = _in_order(stock, limits)
-    return _going(stock, _eras(stock, limits), max_age_ns)
+    stock = _with_consistent_dates(stock, limits)
+    return _deleted_by_age(stock, _eras(stock, limits), max_age_ns)
 
 
 def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
@@ -217,31 +217,29 @@ def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPl
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
     that: it would cost all history, and recording would still have to pause.
     """
-    ordered = _in_order(stock, limits)
-    found, free = _planned(ordered, limits)
-    if not (found.fits or free is None or free >= limits.min_free_bytes):
-        found, _ = _planned(replace(ordered, free_bytes=None), limits)
-        found = found._replace(fits=False, most_free=free)
-    if not found.to_delete or ordered is stock:
-        return found
+    ordered = _with_consistent_dates(stock, limits)
+    plan, free = _plan_and_free_bytes(ordered, limits)
+    if not (plan.fits or free is None or free >= limits.min_free_bytes):
+        plan, _ = _plan_and_free_bytes(replace(ordered, free_bytes=None), limits)
+        plan = plan._replace(fits=False, most_free=free)
+    if not plan.to_delete or ordered is stock:
+        return plan
     given = {bag.path: bag for bag in stock.bags}
-    return found._replace(to_delete=tuple(given[bag.path] for bag in found.to_delete))
+    return plan._replace(to_delete=tuple(given[bag.path] for bag in plan.to_delete))
 
 
-def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPlan, int | None]:
+def _plan_and_free_bytes(
+    stock: RetentionStock, limits: RetentionLimits
+) -> tuple[DeletionPlan, int | None]:
     """Returns a plan, and how much of the disk is free after it."""
-    left = _Left(stock)
+    left = _Remaining(stock)
     total = left.total
     eras = _eras(stock, limits)
-    aged = _going(stock, eras, limits.max_age_ns)
+    aged = _deleted_by_age(stock, eras, limits.max_age_ns)
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True), left.free
     order = _oldest_first(stock, limits, eras[-1] if eras else [])
-    # What stays: the newest dated bag, else the last written one with messages.
-    dated = eras[-1] if eras else [bag for bag in order if bag.has_dates]
-    newest = (
-        max(dated, key=attrgetter("end", "path")) if eras else next(reversed(dated or order), None)
-    )
+    newest = _newest(order, eras)
     going = {bag.path for bag in order if bag.path in aged and bag is not newest}
     for bag in order:
         if bag.path in going:
@@ -253,10 +251,17 @@ def _planned(stock: RetentionStock, limits: RetentionLimits) -> tuple[DeletionPl
             going.add(bag.path)
             left.delete(bag)
     deleted = tuple(bag for bag in order if bag.path in going)
-    found = DeletionPlan(deleted, total, fits=left.fits(limits), aged=aged & going)
-    if newest is not None:
-        found = found._replace(newest=newest.path)
-    return found, left.free
+    kept = "" if newest is None else newest.path
+    fits = left.fits(limits)
+    return DeletionPlan(deleted, total, fits, aged=aged & going, newest=kept), left.free
+
+
+def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
+    """Returns the bag that stays: the newest dated one, else the last written with messages."""
+    if eras:
+        return max(eras[-1], key=attrgetter("end", "path"))
+    with_messages = [bag for bag in order if bag.has_dates]
+    return next(reversed(with_messages or order), None)
 
 
 def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]:
@@ -272,18 +277,18 @@ def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]
         if bag.path not in stays or bag.path in going:
             hours.setdefault(bag.date // HOUR_NS, []).append(bag)
     last = next((bag.end // HOUR_NS for bag in stock.bags if bag.path == plan.newest), None)
-    found: list[StoredBag] = []
+    deleted: list[StoredBag] = []
     for hour, bags in sorted(hours.items()):
         bags.sort(key=attrgetter("date"))
         inside = [bag for bag in bags if bag.path in going]
         if all(bag.path in plan.aged for bag in inside):
-            found += inside if len(inside) == len(bags) else ()
+            deleted += inside if len(inside) == len(bags) else ()
         else:
-            found += inside if hour == last else bags
-    return tuple(found)
+            deleted += inside if hour == last else bags
+    return tuple(deleted)
 
 
-class _Left:
+class _Remaining:
     """Counts what is left when some bags are deleted."""
 
     def __init__(self, stock: RetentionStock) -> None:
@@ -308,7 +313,8 @@ class _Left:
         freed = [(file.size, file.disk) for file in self._freed_by(bag)]
         self._bags_in[bag.recording] -= 1
         if not self._bags_in[bag.recording]:
-            freed.append((self._sidecars.get(bag.recording, 0),) * 2)
+            size = self._sidecars.get(bag.recording, 0)
+            freed.append((size, size))
         for size, disk in freed:
             self.total -= size
             if self.free is not None:
@@ -320,7 +326,7 @@ class _Left:
         return enough and self.total <= limits.max_total_bytes
 
 
-def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
+def _with_consistent_dates(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
     """Returns the stock without ages that contradict the order of the recordings.
 
     A bag whose date does, by its messages or else by its file, gets the newest date of the next
@@ -329,7 +335,7 @@ def _in_order(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
     if not stock.places:
         return stock
     newest: dict[str, Ns] = {}
-    for bag in _dated(stock, limits):
+    for bag in _credibly_dated(stock, limits):
         newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
     names = sorted(stock.places, key=stock.places.__getitem__)
     since, least = {**stock.recorded_since}, MAX_NS
@@ -357,7 +363,7 @@ _Era: TypeAlias = "list[StoredBag]"
 def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
     """Splits the dated bags where a pause is too long; the last era is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    dated = _dated(stock, limits)
+    dated = _credibly_dated(stock, limits)
     if not dated:
         return []
     reach, end = min(bag.start for bag in dated), max(bag.end for bag in dated)
@@ -373,7 +379,7 @@ def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
     return eras
 
 
-def _dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
+def _credibly_dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
     """Returns the bags whose dates are believed."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
     latest = stock.now + FUTURE_NS
@@ -384,21 +390,21 @@ def _dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
     ]
 
 
-def _going(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> frozenset[str]:
-    old = _ages(stock, eras, max_age_ns)
+def _deleted_by_age(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> frozenset[str]:
+    old = _ages_in_eras(stock, eras, max_age_ns)
     aged = old.by_dates if stock.synchronised else old.by_recording
     return aged - stock.needed - stock.unshipped
 
 
-def _ages(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
+def _ages_in_eras(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
     old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
     by_recording = frozenset(bag.path for bag in stock.bags if bag.recording in old)
     doubtful = {bag.path for bag in stock.bags if bag.recording in stock.doubtful}
-    by_dates = _aged(stock, eras, max_age_ns) - doubtful | by_recording & doubtful
+    by_dates = _too_old_by_dates(stock, eras, max_age_ns) - doubtful | by_recording & doubtful
     return Ages(frozenset(by_dates), by_recording)
 
 
-def _aged(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
+def _too_old_by_dates(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
     """Returns the bags that are too old compared with the newest of their era, by their dates.
 
     Dates in the future, of a clock that was ahead for a while, make no other bag older.
@@ -410,19 +416,19 @@ def _aged(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[st
         aged.update(bag.path for bag in era if bag.end < oldest)
         if era is eras[-1]:
             begun = min(bag.start for bag in era)
-            undated = _without(stock.bags, *eras)
+            undated = _outside_eras(stock.bags, *eras)
             aged.update(bag.path for bag in undated if begun <= bag.written < oldest)
     return aged
 
 
 def _oldest_first(stock: RetentionStock, limits: RetentionLimits, present: _Era) -> list[StoredBag]:
     """Sorts all bags, oldest first."""
-    odd = _without(stock.bags, present)
-    keys = {bag.path: _written(bag, stock.now, limits) for bag in odd}
+    odd = _outside_eras(stock.bags, present)
+    keys = {bag.path: _file_time_key(bag, stock.now, limits) for bag in odd}
     return sorted(stock.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path))
 
 
-def _without(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
+def _outside_eras(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
     """Returns the bags that are in none of some eras."""
     if len(bags) == sum(map(len, eras)):
         return ()
@@ -430,7 +436,7 @@ def _without(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
     return [bag for bag in bags if bag.path not in there]
 
 
-def _written(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
+def _file_time_key(bag: StoredBag, now: Ns, limits: RetentionLimits) -> tuple[Ns, Ns]:
     """Returns the sort key of a bag by the time of its file.
 
     The first number may be made up; then the second orders the bags. While the clock is behind by

@@ -83,29 +83,34 @@ class RecordedTime:
         with self._lock:
             self._load()
             before, self._recording = self._recording, frozenset(recordings)
-            if not recordings:
-                self._grew = None
-            elif self._grew is None:
-                self._grew = (monotonic_s, bytes_written)
-            elif bytes_written != self._grew[1]:
-                self._total_s += min(monotonic_s - self._grew[0], LONGEST_SILENCE_S)
-                self._grew = (monotonic_s, bytes_written)
+            self._count_growth(monotonic_s, bytes_written)
             for name in recordings:
                 self._last_grew_s[name] = self._total_s
             self._unsaved |= self._recording
             # While nothing is recorded the disk may be away.
-            judged = self._judge_clock(now - ns_from_unix(monotonic_s))
-            changed = judged or self._recording != before
-            if recordings and (changed or monotonic_s - self._saved_at_s >= SAVE_S):
+            is_judged_anew = self._judge_clock(now - ns_from_unix(monotonic_s))
+            has_changed = is_judged_anew or self._recording != before
+            if recordings and (has_changed or monotonic_s - self._saved_at_s >= SAVE_S):
                 self._saved_at_s = monotonic_s
                 self._save()
+
+    def _count_growth(self, now_s: float, bytes_written: int) -> None:
+        """Adds the time since recordings last grew to the total, if they grew in it."""
+        if not self._recording:
+            self._grew = None
+            return
+        grew_at_s, bytes_then = self._grew or (now_s, bytes_written)
+        if self._grew is None or bytes_written != bytes_then:
+            self._total_s += min(now_s - grew_at_s, LONGEST_SILENCE_S)
+            self._grew = (now_s, bytes_written)
 
     def since(self, recordings: Iterable[str]) -> dict[str, Ns]:
         """Maps each recording to how long was recorded after it."""
         with self._lock:
             self._load()
             return {
-                name: ns_from_unix(self._total_s - self._last_grew(name)) for name in recordings
+                name: ns_from_unix(self._total_s - self._grew_or_grows_now(name))
+                for name in recordings
             }
 
     def doubtful(self, recordings: Iterable[str]) -> frozenset[str]:
@@ -113,7 +118,7 @@ class RecordedTime:
         with self._lock:
             self._load()
             for name in recordings:
-                self._last_grew(name)
+                self._grew_or_grows_now(name)
             return frozenset(recordings) - self._right
 
     def asks_for_clock(self) -> bool:
@@ -146,7 +151,8 @@ class RecordedTime:
         self._right -= self._was_set
         return self._right != before
 
-    def _last_grew(self, name: str) -> float:
+    def _grew_or_grows_now(self, name: str) -> float:
+        """Returns the total when a recording last grew; one without a line counts from now on."""
         if name not in self._last_grew_s:
             self._last_grew_s[name] = self._total_s
             self._unsaved.add(name)
@@ -159,7 +165,7 @@ class RecordedTime:
         if self._loaded:
             return
         try:
-            last = {row.recording: row for row in self._read()}
+            last = {row.recording: row for row in self._read_rows()}
         except OSError as error:
             if self._unread is None:
                 _log.warning("recorded_time_not_read", path=str(self._path), reason=str(error))
@@ -181,7 +187,7 @@ class RecordedTime:
         }
         self._lines = _MOST_LINES  # so that the next save leaves out what is gone
 
-    def _read(self) -> list[Recorded]:
+    def _read_rows(self) -> list[Recorded]:
         """Returns the rows of the file.
 
         Raises:

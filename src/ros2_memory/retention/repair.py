@@ -62,11 +62,11 @@ class Repairer:
             BagVanishedError: it does not exist.
             BagError: it cannot be opened, or is no MCAP file.
         """
-        whole = self._reader.closing(path) is Closing.CLOSED
-        if whole:
+        is_closed = self._reader.closing(path) is Closing.CLOSED
+        if is_closed:
             # A file that is no bag at all counts as closed; this raises for it.
             self._reader.channels(path)
-        return whole
+        return is_closed
 
     def repair(self, path: Path, progress: Callable[[int], None] | None = None) -> Repaired | None:
         """Repairs one file; returns None if its writer had finished it.
@@ -79,7 +79,7 @@ class Repairer:
         """
         try:
             with opened_folder(self._root, path.absolute()) as here:
-                return self._repair(here, path, progress)
+                return self._rewrite_if_open(here, path, progress)
         except BagError as error:
             # With the name of the file in place of that of the open directory.
             raise type(error)(str(path), error.reason) from error
@@ -95,7 +95,7 @@ class Repairer:
         with directories.opened(self._root, recording.absolute()):
             return correct(recording, self._reader)
 
-    def _repair(
+    def _rewrite_if_open(
         self, here: Path, path: Path, progress: Callable[[int], None] | None
     ) -> Repaired | None:
         before = _status(here)
@@ -106,14 +106,14 @@ class Repairer:
         if self._reader.closing(path) is Closing.CLOSED:
             return None
         with beside(here) as new:
-            rewritten = self._writer.rewrite(here, new, progress)
+            result = self._writer.rewrite(here, new, progress)
             give_attributes(new, before, before.st_mtime_ns)
             after = _status(here)
             if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):
                 raise BagError(str(here), "it was written to while it was being repaired")
             new.replace(here)
         flush(here.parent)
-        return Repaired(before.st_size, here.stat().st_size, rewritten)
+        return Repaired(before.st_size, here.stat().st_size, result)
 
 
 @contextmanager
@@ -177,7 +177,7 @@ def rewritten(
         EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
         OSError: likewise, or it is another file now.
     """
-    with opened_folder(bag_dir, path) as here, _alone(here), beside(here) as new:
+    with opened_folder(bag_dir, path) as here, _rewrite_lock(here), beside(here) as new:
         taken = writer.cut(here, new, takes, lambda text: recounted(text, left_of))
         if taken != expected:
             raise BagError(str(path), "its contents changed meanwhile")
@@ -188,7 +188,7 @@ def rewritten(
 
 
 @contextmanager
-def _alone(path: Path) -> Iterator[None]:
+def _rewrite_lock(path: Path) -> Iterator[None]:
     """Holds the lock under which a bag is rewritten: `forget` runs beside the recorder.
 
     Raises:
@@ -221,7 +221,7 @@ def left_in(
 ) -> dict[str, Counter[str]]:
     """Returns how many messages of each topic are left in each file that can be read, by name."""
     files: dict[str, Counter[str]] = {}
-    for path in filter(lambda each: bag_kind(each.name), recording.iterdir()):
+    for path in filter(lambda path: bag_kind(path.name), recording.iterdir()):
         with suppress(BagError):
             counts = Counter[str]()
             for topic in reader.summarize(path).topics:
@@ -232,14 +232,14 @@ def left_in(
 
 def open_files() -> frozenset[tuple[int, int]]:
     """Returns device and inode of every open file that /proc shows."""
-    found: set[tuple[int, int]] = set()
+    inodes: set[tuple[int, int]] = set()
     for process in Path("/proc").glob("[0-9]*"):
         with suppress(OSError), os.scandir(process / "fd") as descriptors:
-            for each in descriptors:
+            for descriptor in descriptors:
                 with suppress(OSError):
-                    status = each.stat()
-                    found.add((status.st_dev, status.st_ino))
-    return frozenset(found)
+                    status = descriptor.stat()
+                    inodes.add((status.st_dev, status.st_ino))
+    return frozenset(inodes)
 
 
 def _status(path: Path) -> os.stat_result:
@@ -253,3 +253,10 @@ def _status(path: Path) -> os.stat_result:
     if not stat.S_ISREG(status.st_mode):
         raise BagError(str(path), "not a regular file")
     return status
+
+
+def reason_of(error: Exception) -> str:
+    """Returns what a sentence says of an error: its reason, without the path where it has one."""
+    if isinstance(error, BagError):
+        return error.reason
+    return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

@@ -97,7 +97,7 @@ def needed_bags(
         open_files: when what is still being written may have been recorded; None if unknown.
         now: the present time.
     """
-    waits = now < window.stop or any(_may_overlap(each, window) for each in open_files)
+    waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
     ready = []
     for bag in bags:
         is_derived = is_carried(bag.file) or is_thinned(bag.file)
@@ -212,31 +212,31 @@ class MomentKeeper:
         Raises:
             OSError: the folders cannot be listed or written to; the next call tries again.
         """
-        now, stored = self._clock.now(), self._stored()
+        now, stored = self._clock.now(), self._read_moments()
         for name, moment in stored.items():
             if moment.moment.pending:
-                stored[name] = self._advance(moment, stored, snapshot)
+                stored[name] = self._continue_moment(moment, stored, snapshot)
         for request in self._queue.take(now) if self._queue.has_requests() else ():
-            self._queue.answer(request, self._outcome(request, stored, snapshot))
+            self._queue.answer(request, self._answer_to(request, stored, snapshot))
         self._waiting = any(moment.moment.pending for moment in stored.values())
 
-    def _outcome(
+    def _answer_to(
         self, request: SaveRequest, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> Outcome:
         """Returns the outcome of a request, whose moment begins unless it has one already."""
-        found: StoredMoment | str | None = _of_number(request, stored)
-        if found is None:
+        begun: StoredMoment | str | None = _moment_of(request, stored)
+        if begun is None:
             try:
-                found = self._begin(SavedMoment(request), stored, snapshot)
+                begun = self._begin_moment(SavedMoment(request), stored, snapshot)
             except OSError as error:
-                found = (
+                begun = (
                     f"the bags cannot be saved in {self._bag_dir / MOMENTS_FOLDER} by hard "
                     f"links: {error.strerror or error}"
                 )
-        if isinstance(found, str):
-            _log.warning("moment_refused", label=request.label, reason=found)
-            return Outcome(refused=found)
-        return Outcome(found.folder.name, len(found.files), found.moment.pending)
+        if isinstance(begun, str):
+            _log.warning("moment_refused", label=request.label, reason=begun)
+            return Outcome(refused=begun)
+        return Outcome(begun.folder.name, len(begun.files), begun.moment.pending)
 
     def keep_for_rule(
         self, request: SaveRequest, rule: str, matches: int, snapshot: Snapshot
@@ -248,18 +248,18 @@ class MomentKeeper:
         Raises:
             OSError: it cannot be stored; the same request may be made again.
         """
-        stored = self._stored()
+        stored = self._read_moments()
         wanted = SavedMoment(request, rule=rule, matches=matches)
-        known = _of_number(request, stored)
+        known = _moment_of(request, stored)
         if known is None:
-            begun = self._begin(wanted, stored, snapshot)
+            begun = self._begin_moment(wanted, stored, snapshot)
             if isinstance(begun, str):
                 return begun
             self._waiting = True
         elif known.moment.matches < matches or known.moment.request.end < request.end:
             extended = known._replace(moment=replace(wanted, missing=known.moment.missing))
             write_saved_moment(extended.folder, extended.moment)
-            self._advance(extended, stored, snapshot)
+            self._continue_moment(extended, stored, snapshot)
             self._waiting = True
         return None
 
@@ -279,16 +279,16 @@ class MomentKeeper:
             except OSError as error:
                 _log.error("moment_not_followed", path=root, reason=str(error))
 
-    def _stored(self) -> dict[str, StoredMoment]:
+    def _read_moments(self) -> dict[str, StoredMoment]:
         """Returns the moments by the names of their folders."""
         self._remove_unbegun()
         return {moment.folder.name: moment for moment in stored_moments_in(self._bag_dir)}
 
-    def _begin(
+    def _begin_moment(
         self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment | str:
         """Begins a moment and adds it to `stored`, or returns why it is refused."""
-        need, window = self._needed(begun.request, snapshot), window_of(begun.request)
+        need, window = self._bags_needed_by(begun.request, snapshot), window_of(begun.request)
         group = self._group(begun, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self._rule_bytes)):
             return (
@@ -313,30 +313,30 @@ class MomentKeeper:
         folder = make_moment_folder(self._bag_dir, begun.request)
         try:
             write_saved_moment(folder, begun)
-            links = self._link(folder, need.bags, share)
-            made = _linked(StoredMoment(folder, begun, {}), need, *links)
-            if made.moment != begun:
-                write_saved_moment(folder, made.moment)
+            links = self._link_bags(folder, need.bags, share)
+            moment = _with_links(StoredMoment(folder, begun, {}), need, *links)
+            if moment.moment != begun:
+                write_saved_moment(folder, moment.moment)
         except OSError:
             directories.remove(folder)
             raise
         flush(folder.parent)
-        stored[folder.name] = made
+        stored[folder.name] = moment
         rule = {} if begun.rule is None else {"rule": begun.rule}
-        _log.info("moment_kept", folder=folder.name, bags=len(made.files), **rule)
-        return made
+        _log.info("moment_kept", folder=folder.name, bags=len(moment.files), **rule)
+        return moment
 
-    def _advance(
+    def _continue_moment(
         self, before: StoredMoment, stored: Mapping[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment:
         """Continues a pending moment; its file lists what cannot be kept.
 
         Where the disk refuses a link, as when it is full, the moment waits and it is tried again.
         """
-        need = self._needed(before.moment.request, snapshot)
+        need = self._bags_needed_by(before.moment.request, snapshot)
         share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
-            after = _linked(before, need, *self._link(before.folder, need.bags, share))
+            after = _with_links(before, need, *self._link_bags(before.folder, need.bags, share))
         except OSError as error:
             reason = error.strerror or str(error)
             if abs(self._clock.now() - before.moment.request.asked) < LONGEST_WAIT_NS:
@@ -344,7 +344,7 @@ class MomentKeeper:
                     _log.error("moment_not_followed", path=str(before.folder), reason=reason)
                 self._refused.add(before.folder)
                 return before
-            after = _linked(before, need, [f"not all can be saved: {reason}"], {})
+            after = _with_links(before, need, [f"not all can be saved: {reason}"], {})
         self._refused.discard(before.folder)
         if after.moment != before.moment:
             try:
@@ -373,13 +373,13 @@ class MomentKeeper:
             return Share(self._rule_bytes[rule], f"max_gb of the rule {rule}", stored)
         return Share(max(self._share - sum(self._rule_bytes.values()), 0), _SHARE, stored)
 
-    def _needed(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
+    def _bags_needed_by(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
         window = window_of(moment)
         open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
         bags = snapshot.timeline.overlapping(window)
         return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
-    def _link(
+    def _link_bags(
         self, folder: Path, bags: Sequence[BagFile], share: Share
     ) -> tuple[Iterable[str], dict[int, int]]:
         """Links bags into a moment's folder, as far as the share has room for them.
@@ -391,32 +391,32 @@ class MomentKeeper:
         """
         missing: dict[str, None] = {}
         linked: dict[int, int] = {}
-        linking: defaultdict[Path, list[tuple[Path, tuple[int, int]]]] = defaultdict(list)
+        by_folder: defaultdict[Path, list[tuple[Path, _BagInode]]] = defaultdict(list)
         for bag in bags:
             name = os.path.relpath(self._links.recorded_as(bag.file), self._bag_dir)
             target, file = folder / name, _file_of(bag.path)
             if file is None:
                 # `forget` deletes in another process, since the index was made.
                 if not target.exists():
-                    missing[_gone(name)] = None
+                    missing[_missing_sentence(name)] = None
             elif share.take(*file):
-                linking[target.parent].append((bag.path, file))
+                by_folder[target.parent].append((bag.path, file))
             else:
                 missing[share.exhausted] = None
-        for parent, here in linking.items():
+        for parent, sources in by_folder.items():
             directories.make(self._bag_dir, parent)
             # Listed first, so that `forget`, in another process, knows whose the new links are.
             free = (
-                path.name for path, file in here if _file_of(parent / path.name) in {None, file}
+                path.name for path, file in sources if _file_of(parent / path.name) in {None, file}
             )
             self._own.hold(parent, free)
-            for recorded, file in here:
+            for recorded, file in sources:
                 target = parent / recorded.name
-                if _link_bag(recorded, target, file[0]):
-                    linked.update((file,))
+                if _link_bag(recorded, target, file.inode):
+                    linked[file.inode] = file.size
                     _link_sidecar(recorded.parent, parent)
                 else:
-                    missing[_gone(str(target.relative_to(folder)))] = None
+                    missing[_missing_sentence(str(target.relative_to(folder)))] = None
             flush(parent)
         return missing, linked
 
@@ -435,26 +435,33 @@ def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
     return recorded is None or (recorded.start < window.stop and window.start < recorded.stop)
 
 
-def _file_of(path: Path) -> tuple[int, int] | None:
-    """Returns inode and size (bytes) of a file; None where it has gone."""
+class _BagInode(NamedTuple):
+    """A file by its inode, with its size in bytes."""
+
+    inode: int
+    size: int
+
+
+def _file_of(path: Path) -> _BagInode | None:
+    """Returns inode and size of a file; None where it has gone."""
     try:
         status = path.lstat()
     except FileNotFoundError:
         return None
-    return status.st_ino, status.st_size
+    return _BagInode(status.st_ino, status.st_size)
 
 
-def _gone(name: str) -> str:
+def _missing_sentence(name: str) -> str:
     return f"{name} is missing, or another file has its name"
 
 
-def _of_number(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
+def _moment_of(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    by_number = {each.moment.request.number: each for each in stored.values()}
+    by_number = {moment.moment.request.number: moment for moment in stored.values()}
     return by_number.get(request.number)
 
 
-def _linked(
+def _with_links(
     before: StoredMoment, need: NeededBags, missing: Iterable[str], linked: Mapping[int, int]
 ) -> StoredMoment:
     """Returns a moment with new links, and what could not be linked."""

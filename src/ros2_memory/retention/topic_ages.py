@@ -155,21 +155,15 @@ class TopicCutter:
         receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            before, counts = bags, self._counts_of(recording)
+            counts, bags_before = self._counts_of(recording), bags
             for cut in of_recording:
                 free = self._measure_free(self._bag_dir)
                 if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
                     break
-                if cut.topics.isdisjoint(counts.left.get(bare_name(cut.bag.path.name), ())):
-                    self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
-                    continue
-                try:
-                    gone += self._cut(cut, counts, receipts)
-                    bags += 1
-                except (EpisodicError, OSError) as error:
-                    self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
-                    _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
-            if bags > before:
+                gone_here = self._cut_if_held(cut, counts, receipts)
+                gone += gone_here or Counter()
+                bags += gone_here is not None
+            if bags > bags_before:
                 _correct_metadata(counts)
                 counts = counts._replace(changed=recording.stat().st_mtime_ns)
             self._known = counts
@@ -203,7 +197,24 @@ class TopicCutter:
             return known
         return _Counts(recording, changed, left_in(recording, self._reader, {}))
 
-    def _cut(self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]) -> Counter[str]:
+    def _cut_if_held(
+        self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]
+    ) -> Counter[str] | None:
+        """Cuts a bag that has messages of the topics; returns what went, by topic.
+
+        None where it has none, or cannot be cut: then it is not looked at again until it changes.
+        """
+        if not cut.topics.isdisjoint(counts.left.get(bare_name(cut.bag.path.name), ())):
+            try:
+                return self._cut_bag(cut, counts, receipts)
+            except (EpisodicError, OSError) as error:
+                _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
+        self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
+        return None
+
+    def _cut_bag(
+        self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]
+    ) -> Counter[str]:
         """Cuts one bag; returns the messages that went, by topic, and takes them from `counts`.
 
         Raises:
@@ -212,14 +223,18 @@ class TopicCutter:
         """
         path, name = cut.bag.path, bare_name(cut.bag.path.name)
         before = path.lstat()
-        going = [one for one in self._reader.summarize(path).topics if one.topic in cut.topics]
+        summary = self._reader.summarize(path)
+        going = [topic for topic in summary.topics if topic.topic in cut.topics]
         gone = Counter[str]()
-        for one in going:
-            gone[one.topic] += one.count
+        for topic in going:
+            gone[topic.topic] += topic.count
         left = {**counts.left, name: counts.left[name] - gone}
         bag = os.path.relpath(path, self._bag_dir)
         expired = self._expired()
-        losses = [Loss(one.topic, one.first, one.last + 1, one.count, "expired") for one in going]
+        losses = [
+            Loss(topic.topic, topic.first, topic.last + 1, topic.count, "expired")
+            for topic in going
+        ]
         EXPIRED.write(self._bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
         is_shipped = receipt is not None and receipt.size == before.st_size
@@ -229,7 +244,7 @@ class TopicCutter:
                 path,
                 before,
                 self._writer,
-                takes=lambda topic, _logged, _published: topic in cut.topics,
+                takes=lambda name, _logged, _published: name in cut.topics,
                 expected=gone,
                 left_of=left,
             ) as new:

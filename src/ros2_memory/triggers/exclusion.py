@@ -106,26 +106,21 @@ def excluded_intervals(
     """
     held: Spans = []
     free: list[Spans] = []
-    for at, each in enumerate(recordings):
-        known: Spans = []
-        for run, following in zip(each.heard, [*each.heard[1:], None], strict=False):
-            stop = _valid_until(run, following, each, rule.stale)
-            if following is None and stop >= each.stop < MAX_NS:
-                stop = each.stop
+    for place, recording in enumerate(recordings, 1):
+        later = recordings[place:]
+        free_here: Spans = []
+        for run, following in zip(recording.heard, [*recording.heard[1:], None], strict=False):
+            stop = _valid_until(run, following, recording, rule.stale)
+            if following is None and stop >= recording.stop < MAX_NS:
+                stop = _valid_past_end(run, recording, later, rule.stale)
                 if run.holds:
-                    held += _carried(run.first, each, recordings[at + 1 :], rule.stale)
-                # Another recording ran when it ended.
-                elif any(
-                    each.start <= later.start < each.stop < later.stop
-                    for later in recordings[at + 1 :]
-                ):
-                    stop = (each.stop if run.lasts else run.last) + rule.stale
+                    held += _carried(run.first, recording, later, rule.stale)
             if run.holds is True:
                 held.append((run.first, stop))
             elif run.holds is False:
-                known.append((run.first, stop))
-        free.append(known)
-    unknown = [span for each in recordings for span in each.unclear]
+                free_here.append((run.first, stop))
+        free.append(free_here)
+    unknown = [span for recording in recordings for span in recording.unclear]
     if rule.excludes_unknown:
         unknown += _unknown(recordings, held, free)
     return [
@@ -138,16 +133,16 @@ def _unknown(
     recordings: Sequence[RecordingConditions], held: Spans, free: Sequence[Spans]
 ) -> Iterator[tuple[Ns, Ns]]:
     """Yields where recordings did not know, by themselves or by others, whether it holds."""
-    for each in recordings:
+    for recording in recordings:
         # Of those alone that ran beside it by one clock.
         beside = (
             spans
-            for spans, one in zip(free, recordings, strict=True)
-            if one is each
-            or (each.previous == one.name and not one.unclear)
-            or one.previous == each.name
+            for spans, other in zip(free, recordings, strict=True)
+            if other is recording
+            or (recording.previous == other.name and not other.unclear)
+            or other.previous == recording.name
         )
-        yield from without([(each.start, each.stop)], united(chain(held, *beside)))
+        yield from without([(recording.start, recording.stop)], united(chain(held, *beside)))
 
 
 def _valid_until(
@@ -166,6 +161,21 @@ def _valid_until(
     return stop if run.lasts else min(stop, run.last + stale)
 
 
+def _valid_past_end(
+    run: ConditionInterval,
+    recording: RecordingConditions,
+    later: Iterable[RecordingConditions],
+    stale: Ns,
+) -> Ns:
+    """Returns until when the last value of a recording is valid; longer if another took over."""
+    was_taken_over = any(
+        recording.start <= other.start < recording.stop < other.stop for other in later
+    )
+    if run.holds or not was_taken_over:
+        return recording.stop
+    return (recording.stop if run.lasts else run.last) + stale
+
+
 def _carried(
     since: Ns, ended: RecordingConditions, others: Iterable[RecordingConditions], stale: Ns
 ) -> Spans:
@@ -175,18 +185,18 @@ def _carried(
     """
     spans: Spans = []
     until: Ns | None = None
-    for each in others:
-        start = each.start
-        if each.previous == ended.name and not (ended.unclear or each.unclear):
+    for other in others:
+        start = other.start
+        if other.previous == ended.name and not (ended.unclear or other.unclear):
             start = max(since, start)
-        if each.start < ended.start:  # the clock was set back
-            start, until = each.start, each.start + stale
+        if other.start < ended.start:  # the clock was set back
+            start, until = other.start, other.start + stale
         elif until is None:
-            until = max(each.start, ended.stop) + stale
-        heard = each.heard[0].first if each.heard else MAX_NS
-        if start < min(until, heard):
-            spans.append((start, min(until, heard)))
-        if each.heard:
+            until = max(other.start, ended.stop) + stale
+        stop = min(until, other.heard[0].first if other.heard else MAX_NS)
+        if start < stop:
+            spans.append((start, stop))
+        if other.heard:
             break
     return spans
 
@@ -208,10 +218,10 @@ class Cut:
         self, stretches: Sequence[Excluded], before: Sequence[Excluded], latched: Collection[str]
     ) -> None:
         self._latched = frozenset(latched)
-        self._all = united((each.start, each.stop) for each in stretches)
+        self._all = united((stretch.start, stretch.stop) for stretch in stretches)
         known = (*before, *stretches)
-        self._known = united((each.start, each.stop) for each in known)
-        self._held = united((each.start, each.stop) for each in known if each.held)
+        self._known = united((stretch.start, stretch.stop) for stretch in known)
+        self._held = united((stretch.start, stretch.stop) for stretch in known if stretch.held)
 
     def takes(self, topic: str, log_time: Ns, publish_time: Ns) -> bool:
         """Returns whether a message is deleted."""
@@ -242,15 +252,17 @@ def add_excluded(
     """
     low, high = start - OUT_OF_ORDER_NS, end + OUT_OF_ORDER_NS + 1
     parts = [
-        Excluded(max(each.start, low), min(each.stop, high), each.held)
-        for each in stretches
-        if each.start <= end and start < each.stop
+        Excluded(max(stretch.start, low), min(stretch.stop, high), stretch.held)
+        for stretch in stretches
+        if stretch.start <= end and start < stretch.stop
     ]
     joined: list[Excluded] = []
     for held in (True, False):
-        spans = [(each.start, each.stop) for each in (*known, *parts) if each.held is held]
+        spans = [
+            (stretch.start, stretch.stop) for stretch in (*known, *parts) if stretch.held is held
+        ]
         joined += (Excluded(*span, held=held) for span in united(spans))
-    return sorted(joined, key=lambda each: (each.start, each.stop))
+    return sorted(joined, key=lambda stretch: (stretch.start, stretch.stop))
 
 
 def _published(log_time: Ns, publish_time: Ns) -> Ns:

@@ -75,7 +75,7 @@ class Rule:
             return []
         if any(mark in self.topic for mark in GLOB_MARKS):
             return match_topics(topics, self.topic)
-        return [each for each in topics if each == self.topic]
+        return [topic for topic in topics if topic == self.topic]
 
     def window(self, first: Ns, fired: Ns) -> TimeWindow:
         """Returns what is kept of a match that began at `first` and made the rule fire."""

@@ -18,7 +18,7 @@ import time
 from collections import Counter
 from copy import deepcopy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import structlog
 
@@ -52,7 +52,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import left_in, rewritten
+from ros2_memory.retention.repair import left_in, reason_of, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
@@ -82,6 +82,9 @@ REMIND_S: Final = 600.0
 """How long until a rule that still cannot be evaluated is logged again."""
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+
+
+_ClosedFiles: TypeAlias = "list[tuple[Path, BagSummary]]"
 
 
 class _UselessRuleError(EpisodicError):
@@ -124,7 +127,7 @@ class Screening:
         self._extractor = extractor
         self._writer = writer
         self._split = ns_from_unix(split_duration_s)
-        self._margin = max((each.margin for each in rules), default=0)
+        self._margin = max((rule.margin for rule in rules), default=0)
         self._lock = threading.Lock()
         self._state: ScreenState | None = None
         self._problems: dict[str, str] = {}
@@ -155,9 +158,9 @@ class Screening:
             OSError: likewise.
         """
         with self._lock:
-            names = [name for name, each in self._loaded().recordings.items() if not each.done]
+            names = [name for name, screen in self._loaded().recordings.items() if not screen.done]
         written = frozenset(live)
-        return lambda: self._step(names, written)
+        return lambda: self._run_step(names, written)
 
     def failing_rules(self) -> tuple[str, ...]:
         """Describes each rule that cannot be evaluated at present, and why."""
@@ -165,12 +168,12 @@ class Screening:
 
     def problem(self) -> str | None:
         """Describes the splits that a fault or a useless rule holds back, or None."""
-        known = [*self._problems.items()]
-        if not known:
+        problems = [*self._problems.items()]
+        if not problems:
             refused = "; ".join(self.failing_rules())
             return f"recording.exclude_when does not work: {refused}" if refused else None
-        name, reason = known[-1]
-        held = counted(len(known), "split is", "splits are")
+        name, reason = problems[-1]
+        held = counted(len(problems), "split is", "splits are")
         return (
             f"{held} not served, because recording.exclude_when could not be applied: "
             f"{name}: {reason}"
@@ -181,9 +184,9 @@ class Screening:
 
         Not those that decide: each recording needs their value.
         """
-        return self._excluded_latched.difference(each.topic for each in self._rules)
+        return self._excluded_latched.difference(rule.topic for rule in self._rules)
 
-    def _step(self, names: Sequence[str], live: Collection[str]) -> None:
+    def _run_step(self, names: Sequence[str], live: Collection[str]) -> None:
         """Reads closed files, and releases those that can be released.
 
         Raises:
@@ -194,10 +197,10 @@ class Screening:
         with self._lock:
             before = self._loaded()
             state = deepcopy(before)
-        closed: dict[str, list[tuple[Path, BagSummary]]] = {}
+        closed: dict[str, _ClosedFiles] = {}
         is_held = False
         for name in names:
-            files, is_whole = self._read(name, state.recordings[name], live)
+            files, is_whole = self._read_recording(name, state.recordings[name], live)
             is_held |= not is_whole
             # What a condition was in a recording that is held back may matter to later ones.
             closed[name] = [] if is_held else files
@@ -216,41 +219,47 @@ class Screening:
         stretches = self._stretches(state, live) if ready else []
         for path, summary in ready[:MOST_AT_ONCE]:
             try:
-                self._cut(path, summary, stretches, state.excluded)
+                self._cut_split(path, summary, stretches, state.excluded)
             except (EpisodicError, OSError) as error:
                 self._report(path, error)
                 self._retry_s[path] = now_s + RETRY_S
-                continue
-            state.recordings[path.parent.name].files[path.name] = FileStep.RELEASED
-            if not summary.empty:
-                state.excluded = add_excluded(
-                    state.excluded, stretches, summary.start, summary.end
-                )[-MOST_EXCLUDED:]
-            self._problems.pop(f"{path.parent.name}/{path.name}", None)
-            self._retry_s.pop(path, None)
+            else:
+                self._release(path, summary, stretches, state)
         for name in names:
             if name not in live:
-                self._end(name, state)
+                self._finish_recording(name, state)
         self._commit(before, state, names)
 
-    def _read(
+    def _release(
+        self, path: Path, summary: BagSummary, stretches: Sequence[Excluded], state: ScreenState
+    ) -> None:
+        """Notes in the state that a split is released, and what of its time was excluded."""
+        recording = path.parent.name
+        state.recordings[recording].files[path.name] = FileStep.RELEASED
+        if not summary.empty:
+            excluded = add_excluded(state.excluded, stretches, summary.start, summary.end)
+            state.excluded = excluded[-MOST_EXCLUDED:]
+        self._problems.pop(f"{recording}/{path.name}", None)
+        self._retry_s.pop(path, None)
+
+    def _read_recording(
         self, name: str, screen: RecordingScreen, live: Collection[str]
-    ) -> tuple[list[tuple[Path, BagSummary]], bool]:
+    ) -> tuple[_ClosedFiles, bool]:
         """Reads the closed files of a recording that were not; returns those not released yet.
 
         With it whether a useless rule left none of them unread.
         """
         paths = self._files(name)
-        present = {each.name for each in paths}
+        present = {path.name for path in paths}
         screen.files = {file: step for file, step in screen.files.items() if file in present}
-        found: list[tuple[Path, BagSummary]] = []
+        unreleased: _ClosedFiles = []
         for path in paths:
             step = screen.files.get(path.name)
             if step in {FileStep.RELEASED, FileStep.UNREADABLE}:
                 continue
             now_s = self._monotonic()
             if step is None and self._retry_s.get(path, now_s) > now_s:
-                return found, False
+                return unreleased, False
             try:
                 if step is None and self._reader.closing(path) is not Closing.CLOSED:
                     if name in live:
@@ -259,32 +268,32 @@ class Screening:
                     continue
                 summary = self._reader.summarize(path)
                 if step is None:
-                    self._hear(path, summary, screen)
-                found.append((path, summary))
+                    self._add_conditions(path, summary, screen)
+                unreleased.append((path, summary))
                 screen.files[path.name] = FileStep.READ
                 self._problems.pop(f"{name}/{path.name}", None)
             except _UselessRuleError as error:
                 waiting = paths[paths.index(path) :]
-                self._problems |= {f"{name}/{each.name}": str(error) for each in waiting}
+                self._problems |= {f"{name}/{left.name}": str(error) for left in waiting}
                 self._retry_s[path] = now_s + RETRY_S
-                return found, False
+                return unreleased, False
             except BagError as error:
                 if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
                     raise
                 _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
                 self._report(path, error)
-        return found, True
+        return unreleased, True
 
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
         try:
-            paths = [each for each in (self._bag_dir / name).iterdir() if bag_kind(each.name)]
+            paths = [path for path in (self._bag_dir / name).iterdir() if bag_kind(path.name)]
         except (FileNotFoundError, NotADirectoryError):
             return []
         return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
 
-    def _hear(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
+    def _add_conditions(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
         """Adds what a file shows to the state.
 
         Raises:
@@ -296,9 +305,9 @@ class Screening:
             raise BagError(str(path), "it is not a complete MCAP file")
         if summary.empty:
             return
-        known = deepcopy(screen.heard)
+        heard_by_rule = deepcopy(screen.heard)
         for rule in self._rules:
-            heard = known.setdefault(rule.name, [])
+            heard = heard_by_rule.setdefault(rule.name, [])
             refusal: str | None = None
             for record in self._reader.records(path, (rule.topic,), TimeWindow.everything()):
                 holds, refused = self._test(rule, record)
@@ -307,11 +316,11 @@ class Screening:
                 add_message(heard, record.log_time, holds, latched=latched, stale=rule.stale)
             if refusal and rule.excludes_unknown and rule.name not in self._evaluated:
                 raise _UselessRuleError(refusal)
-        screen.heard = known
+        screen.heard = heard_by_rule
         # Latched messages may be written again with the times that they had.
-        start = min((each.first for each in summary.topics if not each.latched), default=MAX_NS)
-        is_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
-        if is_back or summary.schema.set_back:
+        start = min((topic.first for topic in summary.topics if not topic.latched), default=MAX_NS)
+        was_set_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
+        if was_set_back or summary.schema.set_back:
             screen.unclear.append((summary.start, summary.end + 1))
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)
         screen.end = summary.end if screen.end is None else max(screen.end, summary.end)
@@ -323,8 +332,8 @@ class Screening:
         """
         type_name, condition = record.channel.type, rule.condition
         if condition.field is not None:
-            own = self._extractor.own_path(condition.field, type_name)
-            condition = replace(condition, field=own)
+            path = self._extractor.own_path(condition.field, type_name)
+            condition = replace(condition, field=path)
         try:
             value = self._extractor.exact(self._reader.decode(record), type_name)
         except UndecodableError as error:
@@ -357,9 +366,9 @@ class Screening:
     def _ready(
         self,
         state: ScreenState,
-        closed: dict[str, list[tuple[Path, BagSummary]]],
+        closed: dict[str, _ClosedFiles],
         live: Collection[str],
-    ) -> list[tuple[Path, BagSummary]]:
+    ) -> _ClosedFiles:
         """Returns the splits that no later message can affect."""
         ends = {name: state.recordings[name].end or 0 for name in closed}
         written = {name: state.recordings[name].end for name in live if name in state.recordings}
@@ -373,24 +382,24 @@ class Screening:
 
     def _stretches(self, state: ScreenState, live: Collection[str]) -> list[Excluded]:
         """Returns what is excluded of the time of recordings that are not done, or were last."""
-        found: list[Excluded] = []
+        stretches: list[Excluded] = []
         for rule in self._rules:
             recordings = [
                 RecordingConditions(
-                    each.start,
-                    None if name in live else each.end,
-                    each.heard.get(rule.name, ()),
-                    each.unclear,
+                    screen.start,
+                    None if name in live else screen.end,
+                    screen.heard.get(rule.name, ()),
+                    screen.unclear,
                     name,
                     read_handover(self._bag_dir / name).handover.previous,
                 )
-                for name, each in state.recordings.items()
-                if each.start is not None
+                for name, screen in state.recordings.items()
+                if screen.start is not None
             ]
-            found += excluded_intervals(rule, recordings)
-        return found
+            stretches += excluded_intervals(rule, recordings)
+        return stretches
 
-    def _cut(
+    def _cut_split(
         self,
         path: Path,
         summary: BagSummary,
@@ -403,48 +412,54 @@ class Screening:
             EpisodicError: it cannot be rewritten.
             OSError: likewise, or it has gone.
         """
-        latched = {each.topic for each in summary.topics if each.latched}
+        latched = {topic.topic for topic in summary.topics if topic.latched}
         cut = Cut(stretches, before, latched)
         topics = {
-            each.topic for each in summary.topics if cut.touches(each.topic, each.first, each.last)
+            topic.topic
+            for topic in summary.topics
+            if cut.touches(topic.topic, topic.first, topic.last)
         }
         gone = Counter[str]()
-        newest: dict[str, tuple[Ns, bool]] = {}
-        for each in self._reader.records(path, sorted(topics), TimeWindow.everything()):
-            topic, published = each.channel.topic, each.publish_time
-            if cut.takes(topic, each.log_time, published):
+        newest: dict[str, tuple[Ns, bool]] = {}  # when it was published, and if it is excluded
+        for record in self._reader.records(path, sorted(topics), TimeWindow.everything()):
+            topic, logged, published = record.channel.topic, record.log_time, record.publish_time
+            if cut.takes(topic, logged, published):
                 gone[topic] += 1
             if topic in latched:
-                shown = (published or each.log_time, cut.takes_always(each.log_time, published))
-                newest[topic] = max(shown, newest.get(topic, shown))
-        if gone and split_number(path.parent.name, path.name) is None:
-            raise BagError(str(path), "it is not named as a split of its recording")
+                latched_record = (published or logged, cut.takes_always(logged, published))
+                newest[topic] = max(latched_record, newest.get(topic, latched_record))
         if gone:
-            with path.open("rb") as old:
-                left = left_in(path.parent, self._reader, {path: gone})
-                with rewritten(
-                    self._bag_dir,
-                    path,
-                    os.fstat(old.fileno()),
-                    self._writer,
-                    takes=cut.takes,
-                    expected=gone,
-                    left_of=left,
-                ):
-                    pass
-            _log.info(
-                "messages_excluded",
-                recording=path.parent.name,
-                file=path.name,
-                messages=gone.total(),
-            )
+            self._rewrite_without(path, gone, cut)
         returning = {topic for topic, (_, is_excluded) in newest.items() if is_excluded}
         self._excluded_latched = (self._excluded_latched - newest.keys()) | returning
 
-    def _end(self, name: str, state: ScreenState) -> None:
+    def _rewrite_without(self, path: Path, gone: Counter[str], cut: Cut) -> None:
+        """Rewrites a split without so many messages of each topic; raises as `_cut_split` does."""
+        if split_number(path.parent.name, path.name) is None:
+            raise BagError(str(path), "it is not named as a split of its recording")
+        with path.open("rb") as old:
+            left = left_in(path.parent, self._reader, {path: gone})
+            with rewritten(
+                self._bag_dir,
+                path,
+                os.fstat(old.fileno()),
+                self._writer,
+                takes=cut.takes,
+                expected=gone,
+                left_of=left,
+            ):
+                pass
+        _log.info(
+            "messages_excluded",
+            recording=path.parent.name,
+            file=path.name,
+            messages=gone.total(),
+        )
+
+    def _finish_recording(self, name: str, state: ScreenState) -> None:
         """Marks an ended recording as done once nothing of it is held back."""
-        screen, files = state.recordings[name], [each.name for each in self._files(name)]
-        if any(screen.files.get(each) is not FileStep.RELEASED for each in files):
+        screen, files = state.recordings[name], [file.name for file in self._files(name)]
+        if any(screen.files.get(file) is not FileStep.RELEASED for file in files):
             return
         if state.excluded and (self._bag_dir / name / METADATA_FILE).exists():
             try:
@@ -487,9 +502,9 @@ class Screening:
         with self._lock:
             recordings = dict(self._loaded().recordings)
             recordings.update({name: deepcopy(state.recordings[name]) for name in names})
-            done = [name for name, each in recordings.items() if each.done]
-            telling = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
-            for name in {*done} - {*telling}:
+            done = [name for name, screen in recordings.items() if screen.done]
+            informative = [name for name in done if recordings[name].start is not None][-DONE_KEPT:]
+            for name in {*done} - {*informative}:
                 del recordings[name]
             self._write(recordings, list(state.excluded))
 
@@ -501,9 +516,7 @@ class Screening:
     def _report(self, path: Path, error: Exception) -> None:
         """Notes why a split is held back, and logs it once."""
         name = f"{path.parent.name}/{path.name}"
-        reason = error.reason if isinstance(error, BagError) else str(error)
-        if isinstance(error, OSError):
-            reason = error.strerror or str(error)
+        reason = reason_of(error)
         if self._problems.get(name) != reason:
             _log.error("split_held_back", file=name, reason=reason)
         self._problems[name] = reason
@@ -513,5 +526,6 @@ def _doubt(screen: RecordingScreen) -> None:
     """Notes a file that cannot be read: the state of the conditions after it is unknown, too."""
     for heard in screen.heard.values():
         if heard and not heard[-1].holds:
-            at = max(heard[-1].last, (screen.end or heard[-1].last) + 1)
-            heard.append(ConditionInterval(at, at, None))
+            last = heard[-1].last
+            begun = max(last, (screen.end or last) + 1)
+            heard.append(ConditionInterval(begun, begun, None))

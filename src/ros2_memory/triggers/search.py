@@ -75,7 +75,7 @@ def chains_to_search(
     for name, bags in closed.items():
         start = searched.get(name, MIN_NS)
         window = TimeWindow(start, max(start, min(limits[name], ends[name] + 1)))
-        touched = tuple(each for each in bags if window.overlaps(each.start, each.end))
+        touched = tuple(bag for bag in bags if window.overlaps(bag.start, bag.end))
         if window.empty or not touched:
             continue
         part = SearchPart(name, window, touched)
@@ -98,11 +98,15 @@ def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns
         split_ns: how long one bag is.
     """
     begun = {name: named_start(name) if end is None else end for name, end in live.items()}
-    known = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
+    reached = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
     near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
     return {
         name: min(
-            (until for other, until in known.items() if other == name or abs(until - end) <= near),
+            (
+                until
+                for other, until in reached.items()
+                if other == name or abs(until - end) <= near
+            ),
             default=MAX_NS,
         )
         for name, end in ends.items()
@@ -181,14 +185,14 @@ class SplitSearch:
                 stopped = event.time
                 break
             previous = event.time
-            fired += self._take(event, state)
+            fired += self._firings_at(event, state)
         until = max(part.window.stop for part in chain.parts)
-        known = until if stopped is None else min(stopped, until)
+        searched = until if stopped is None else min(stopped, until)
         for rule in self._rules:
-            fired += rule.reach(state.rules[rule.name].runs, known)
+            fired += rule.reach(state.rules[rule.name].runs, searched)
         return fired, stopped
 
-    def _take(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
+    def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
         record, rules = event.record, self._rules_of(event.topic)
         latched = record is not None and record.channel.latched
         if record is not None and latched:
@@ -222,24 +226,23 @@ class SplitSearch:
 
         Notes why messages cannot make the rule fire; whether any could, once for each topic.
         """
-        known = state.rules[rule.name]
+        record = state.rules[rule.name]
         if isinstance(value, UndecodableError):
-            known.problem = f"not all could be searched: {value}"
+            record.problem = f"not all could be searched: {value}"
             return None
         matches = condition.matches(value)
         if (rule.name, topic) not in self._tested:
             self._tested.add((rule.name, topic))
             if not matches and condition.can_be_refused:
                 refusal = refusal_for(condition, value)
-                known.problem = None if refusal is None else f"{topic}: {refusal}"
+                record.problem = None if refusal is None else f"{topic}: {refusal}"
         return matches
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
-        known = self._watching.get(topic)
-        if known is None:
-            known = tuple(each for each in self._rules if each.selects([topic]))
-            self._watching[topic] = known
-        return known
+        if topic not in self._watching:
+            rules = (rule for rule in self._rules if rule.selects([topic]))
+            self._watching[topic] = tuple(rules)
+        return self._watching[topic]
 
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
         """Yields the messages of a bag in a window, in order of log time.
@@ -263,8 +266,8 @@ class SplitSearch:
             records = self._reader.records(bag.path, read, part.window) if read else ()
             yield from heapq.merge(
                 (
-                    _Event(each.log_time, each.channel.topic, part.recording, each)
-                    for each in records
+                    _Event(record.log_time, record.channel.topic, part.recording, record)
+                    for record in records
                 ),
                 (_Event(time, topic, part.recording, None) for time, topic in sorted(times)),
                 key=lambda event: event.time,
@@ -290,21 +293,21 @@ def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
     # so where the log clock is simulated.
     latest = event.time + SILENCE_NS
     is_dated = record.publish_time <= latest
-    others = [
-        each
-        for name, each in mark.published.items()
-        if name != event.recording and not (is_dated and each > latest)
+    published_elsewhere = [
+        published
+        for name, published in mark.published.items()
+        if name != event.recording and not (is_dated and published > latest)
     ]
     begun = mark.begun.setdefault(event.recording, event.time)
     if record.publish_time in {0, record.log_time}:
         is_repeat = event.recording not in mark.published and payload == mark.payload
     else:
         is_late = record.publish_time < record.log_time - SILENCE_NS
-        is_repeat = (bool(others) and record.publish_time <= max(others)) or (
-            is_late and event.time - begun < _BURST_NS
-        )
-    known = mark.published.pop(event.recording, record.publish_time)
-    mark.published[event.recording] = max(known, record.publish_time)
+        is_repeat = (
+            bool(published_elsewhere) and record.publish_time <= max(published_elsewhere)
+        ) or (is_late and event.time - begun < _BURST_NS)
+    latest_here = mark.published.pop(event.recording, record.publish_time)
+    mark.published[event.recording] = max(latest_here, record.publish_time)
     while len(mark.published) > _MARKED_RECORDINGS:
         oldest = next(iter(mark.published))
         del mark.published[oldest]

@@ -84,7 +84,7 @@ class Triggers:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
-        self._rules = {each.name: each for each in rules}
+        self._rules = {rule.name: rule for rule in rules}
         self._search = search
         self._moments = moments
         self._own = own
@@ -111,7 +111,7 @@ class Triggers:
             EpisodicError: the disk fails while bags are read; the next look tries again.
             OSError: the state or the list of recordings cannot be read, or the state not written.
         """
-        state = deepcopy(self._loaded(snapshot))
+        state = deepcopy(self._current_state(snapshot))
         self._search_closed(state, snapshot)
         with self._lock:
             restarts, self.restarts = self.restarts, []
@@ -119,11 +119,11 @@ class Triggers:
         for first, at in restarts:
             for rule in self._rules.values():
                 if rule.topic is None:
-                    self._take(Firing(rule.name, "", first, at), state, snapshot)
+                    self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
-            self._store(name, state.rules[name], snapshot)
+            self._store_moments(name, state.rules[name], snapshot)
             if rule.condition is not None:
-                _judge(name, state.rules[name])
+                _note_lasting_match(name, state.rules[name])
         if deleted:
             sentence = (
                 f"{counted(deleted, 'bag')} that rules may have needed were deleted to make room "
@@ -145,11 +145,11 @@ class Triggers:
 
     def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> None:
         deadline = self._monotonic() + LOOK_S
-        closed, live = self._closed(snapshot, state)
+        closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
             fired, stopped = self._search.search(chain, state, lambda: self._monotonic() > deadline)
             for firing in fired:
-                self._take(firing, state, snapshot)
+                self._add_firing(firing, state, snapshot)
             for part in chain.parts:
                 stop = part.window.stop if stopped is None else min(part.window.stop, stopped)
                 state.searched[part.recording] = max(stop, part.window.start)
@@ -158,13 +158,14 @@ class Triggers:
 
     def needed(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: those not searched, and some time before."""
-        state = self._loaded(snapshot)
-        before = max((each.before for each in self._rules.values()), default=0)
+        state = self._current_state(snapshot)
+        before = max((rule.before for rule in self._rules.values()), default=0)
         reached = next(reversed(state.searched.values()), None)
         since = MIN_NS if reached is None else reached - before
+        closed, _ = self._closed_bags(snapshot, state)
         return frozenset(
             bag.file
-            for name, bags in self._closed(snapshot, state)[0].items()
+            for name, bags in closed.items()
             for bag in bags
             if bag.end >= min(state.searched.get(name, MIN_NS), since)
         )
@@ -174,7 +175,7 @@ class Triggers:
         with self._lock:
             self._deleted += bags
 
-    def _loaded(self, snapshot: Snapshot) -> TriggerState:
+    def _current_state(self, snapshot: Snapshot) -> TriggerState:
         """Returns the state, which begins with what is recorded from now on.
 
         Raises:
@@ -189,7 +190,7 @@ class Triggers:
                 problem = f"the state of the rules is lost: .episodic/triggers.json: {error}"
                 _log.error("trigger_state_lost", reason=problem)
             if state is None:
-                state = self._begun(snapshot)
+                state = self._first_state(snapshot)
             state.rules = {name: state.rules.get(name, RuleRecord()) for name in self._rules}
             for record in state.rules.values():
                 record.problem = problem or record.problem
@@ -210,27 +211,33 @@ class Triggers:
             elif record.problem == reason:
                 record.problem = None
 
-    def _begun(self, snapshot: Snapshot) -> TriggerState:
-        closed, live = self._closed(snapshot, TriggerState())
+    def _first_state(self, snapshot: Snapshot) -> TriggerState:
+        closed, live = self._closed_bags(snapshot, TriggerState())
         before = (name for name in reversed([*self._own.names()]) if name not in live)
         searched = {
             name: max(bag.end for bag in closed[name]) + 1 for name in closed if name in live
         }
         return TriggerState(before=next(before, None), searched=searched)
 
-    def _closed(
+    def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
     ) -> tuple[dict[str, list[BagFile]], frozenset[str]]:
         """Returns the closed bags of recordings that are not finished, in their order.
 
         With them the recordings that are being written.
         """
-        active = (self._own.name_of(each.path.parent) for each in snapshot.active)
+        active = (self._own.name_of(aside.path.parent) for aside in snapshot.active)
         live = frozenset((*read_heartbeat(self._bag_dir).recordings, *active))
         names = [*self._own.names()]
-        at = {name: number for number, name in enumerate(names)}
-        known = [at[name] for name in (state.before, *state.searched) if name in at]
-        first = at[state.before] + 1 if state.before in at else min(known, default=0)
+        positions = {name: number for number, name in enumerate(names)}
+        known_positions = [
+            positions[name] for name in (state.before, *state.searched) if name in positions
+        ]
+        first = (
+            positions[state.before] + 1
+            if state.before in positions
+            else min(known_positions, default=0)
+        )
         folders = {str(self._bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
@@ -246,7 +253,7 @@ class Triggers:
         handover = read_handover(self._bag_dir / recording).handover
         return handover.previous if handover.state is Counting.COUNTS else None
 
-    def _take(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
+    def _add_firing(self, firing: Firing, state: TriggerState, snapshot: Snapshot) -> None:
         """Counts a firing, and joins it to the newest moment of its rule or begins another."""
         rule, record = self._rules[firing.rule], state.rules[firing.rule]
         record.fired += 1
@@ -259,7 +266,7 @@ class Triggers:
             newest.matches += 1
             newest.stored = False
             return
-        record.begun = [each for each in record.begun if abs(firing.at - each) < HOUR_NS]
+        record.begun = [begun for begun in record.begun if abs(firing.at - begun) < HOUR_NS]
         if len(record.begun) >= rule.max_per_hour:
             reason = (
                 f"it fires more often than it may begin moments (max_per_hour: "
@@ -268,7 +275,7 @@ class Triggers:
             self._refuse(rule.name, record, reason)
             return
         if newest is not None and not newest.stored:
-            self._store(rule.name, record, snapshot)
+            self._store_moments(rule.name, record, snapshot)
         if len(record.newest) >= MOST_WAITING:
             self._refuse(rule.name, record, f"{MOST_WAITING} of its moments wait to be stored")
             return
@@ -278,32 +285,34 @@ class Triggers:
         number = uuid.uuid5(uuid.NAMESPACE_OID, f"{rule.name}/{firing.topic}/{firing.at}").hex
         record.newest.append(RuleMoment(number, window.start, window.stop))
 
-    def _store(self, name: str, record: RuleRecord, snapshot: Snapshot) -> None:
+    def _store_moments(self, name: str, record: RuleRecord, snapshot: Snapshot) -> None:
         """Has the moments of a rule stored that are not; a fault is reported, and tried again."""
-        kept: list[RuleMoment] = []
-        for moment in record.newest:
-            if not moment.stored:
-                is_new = not moment.known
-                request = SaveRequest(
-                    moment.number,
-                    self._rules[name].label,
-                    moment.start,
-                    moment.end,
-                    self._clock.now(),
-                )
-                try:
-                    refused = self._moments.keep_for_rule(request, name, moment.matches, snapshot)
-                except OSError as error:
-                    self._report(name, record, f"its moments cannot be stored: {error.strerror}")
-                else:
-                    moment.stored = True
-                    if refused is not None:
-                        self._refuse(name, record, refused)
-                        continue
-                    record.moments += is_new
-                    moment.known = True
-            kept.append(moment)
-        record.newest = [each for each in kept[:-1] if not each.stored] + kept[-1:]
+        kept = [
+            moment
+            for moment in record.newest
+            if moment.stored or self._may_store(name, record, moment, snapshot)
+        ]
+        record.newest = [moment for moment in kept[:-1] if not moment.stored] + kept[-1:]
+
+    def _may_store(
+        self, name: str, record: RuleRecord, moment: RuleMoment, snapshot: Snapshot
+    ) -> bool:
+        """Has a moment stored, if the disk can; returns False where it is refused for good."""
+        request = SaveRequest(
+            moment.number, self._rules[name].label, moment.start, moment.end, self._clock.now()
+        )
+        try:
+            refused = self._moments.keep_for_rule(request, name, moment.matches, snapshot)
+        except OSError as error:
+            self._report(name, record, f"its moments cannot be stored: {error.strerror}")
+            return True
+        moment.stored = True
+        if refused is not None:
+            self._refuse(name, record, refused)
+            return False
+        record.moments += not moment.known
+        moment.known = True
+        return True
 
     def _refuse(self, name: str, record: RuleRecord, reason: str) -> None:
         record.refused += 1
@@ -322,7 +331,7 @@ class Triggers:
         return name in self._reported and abs(at - self._reported[name]) < HOUR_NS
 
 
-def _judge(name: str, record: RuleRecord) -> None:
+def _note_lasting_match(name: str, record: RuleRecord) -> None:
     """Logs once that a rule has matched for too long to be useful."""
     lasting = (
         run.first for run in record.runs.values() if run.fired and run.last - run.first > HOUR_NS

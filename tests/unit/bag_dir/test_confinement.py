@@ -305,7 +305,7 @@ class TestDeletions:
         house = keeper_of(bags)
         shutil.rmtree(bags / "run")
         (bags / "run").symlink_to(outside)
-        assert not house._repair(bags / "run/run_0.mcap")
+        assert not house._repair_file(bags / "run/run_0.mcap")
         house._repair_recording(bags / "run")
         assert not remove_if_empty(bags / "run")
         assert contents(outside) == before

@@ -157,7 +157,7 @@ class HandoverTransfer:
         self._began = self._last = began
         self._timeout_s = subscribe_timeout_s
         # Since when both record.
-        self._both: ClockReading | None = None
+        self._both_since: ClockReading | None = None
         self._reader = reader
         self._simulated = simulated
         self._marked = False
@@ -198,18 +198,18 @@ class HandoverTransfer:
         before, self._last = self._last, now
         if set_back(before, now):
             return Step.ABANDON
-        ready = self._marked and self.new.is_recording
+        is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
         if self.missing and age_s < self._timeout_s:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
-            self._both = None
-        elif self._both is None and ready:
-            self._both = now
-        if self._both is None:
-            return Step.WAIT if ready or age_s < READY_TIMEOUT_S else Step.ABANDON
-        over = now.monotonic_s - self._both.monotonic_s >= BOTH_S
-        return Step.COMPLETE if over else Step.WAIT
+            self._both_since = None
+        elif self._both_since is None and is_ready:
+            self._both_since = now
+        if self._both_since is None:
+            return Step.WAIT if is_ready or age_s < READY_TIMEOUT_S else Step.ABANDON
+        is_over = now.monotonic_s - self._both_since.monotonic_s >= BOTH_S
+        return Step.COMPLETE if is_over else Step.WAIT
 
     def complete(self, now: ClockReading) -> bool:
         """Writes the cut if both recorders receive; returns False while they do not overlap.
@@ -217,9 +217,9 @@ class HandoverTransfer:
         Raises:
             RecorderError: a sidecar cannot be written.
         """
-        if self._both is None:
+        if self._both_since is None:
             return False
-        both, clock = self._both.wall, self._clock()
+        both, clock = self._both_since.wall, self._clock_of_cut()
         if self._simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
@@ -261,7 +261,7 @@ class HandoverTransfer:
     def _old_files(self) -> frozenset[str]:
         return self.old.splits.names() - self._closed_before
 
-    def _clock(self) -> CutClock:
+    def _clock_of_cut(self) -> CutClock:
         closed = sorted(self.old.splits.closed_names)
         if not closed:
             return CutClock.PUBLISH

@@ -150,26 +150,32 @@ def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
         write_handover(old, intended(before, None))
     else:
         published, logged = last
-        found = bags_of(new, reader)
-        first = min((bag.start for bag in found.values()), default=logged)
-        until = min(logged + JITTER_NS, first + LONGEST_NS)
-        later = {name for name, bag in found.items() if bag.start >= until}
-        # A file that cannot be read yet is still being written.
-        names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
-        clock = cut_clock(new / next(iter(found)), reader) if found else CutClock.PUBLISH
-        start_of_new = replace(
-            after,
-            state=Counting.COUNTS,
-            clock=clock,
-            previous=old.name,
-            counts_from=published + 1,
-            begin=Overlap(None, until, names),
-            notes=(LOG_CLOCK_NOTE,) if clock is CutClock.LOG else (),
-            compared=False,
-        )
-        write_handover(new, start_of_new)
+        cut = replace(after, previous=old.name, counts_from=published + 1)
+        write_handover(new, _with_begin(cut, new, logged, reader))
         end = Overlap(None, None, ())
         write_handover(old, replace(before, counts_until=published + 1, end=end))
+
+
+def _with_begin(cut: Handover, new: Path, logged: Ns, reader: BagReader) -> Handover:
+    """Returns the sidecar of a new recording with the files and times in which its cut applies.
+
+    `logged` is the last log time of the old recording.
+    """
+    bags = bags_of(new, reader)
+    first = min((bag.start for bag in bags.values()), default=logged)
+    until = min(logged + JITTER_NS, first + LONGEST_NS)
+    later = {name for name, bag in bags.items() if bag.start >= until}
+    # A file that cannot be read yet is still being written.
+    names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
+    clock = cut_clock(new / next(iter(bags)), reader) if bags else CutClock.PUBLISH
+    return replace(
+        cut,
+        state=Counting.COUNTS,
+        clock=clock,
+        begin=Overlap(None, until, names),
+        notes=(LOG_CLOCK_NOTE,) if clock is CutClock.LOG else (),
+        compared=False,
+    )
 
 
 def _end_of(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
@@ -179,7 +185,7 @@ def _end_of(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
         return None
     last = recording / max(bags, key=lambda name: bags[name].end)
     newest: tuple[Ns, Ns] | None = None
-    for record in _readable(_unlatched(last, reader)):
+    for record in _readable(_unlatched_records(last, reader)):
         published, logged = newest or (MIN_NS, MIN_NS)
         # A publish time of 0 means that there is none.
         latest = max(published, record.publish_time or record.log_time)
@@ -194,18 +200,18 @@ def cut_clock(bag: Path, reader: BagReader) -> CutClock:
         RecorderError: the disk fails.
     """
     try:
-        records = list(islice(_unlatched(bag, reader), SAMPLE))
+        records = list(islice(_unlatched_records(bag, reader), SAMPLE))
     except BagUnreachableError as error:
         raise RecorderError(str(error)) from error
     except BagError:
         return CutClock.PUBLISH
-    equal = bool(records) and all(each.publish_time in {0, each.log_time} for each in records)
+    equal = bool(records) and all(record.publish_time in {0, record.log_time} for record in records)
     return CutClock.LOG if equal else CutClock.PUBLISH
 
 
-def _unlatched(bag: Path, reader: BagReader) -> Iterator[Record]:
+def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
     """Yields messages of topics that are not latched: latched ones may be published long before."""
-    topics = [each.topic for each in reader.summarize(bag).topics if not each.latched]
+    topics = [topic.topic for topic in reader.summarize(bag).topics if not topic.latched]
     return reader.records(bag, topics, TimeWindow.everything())
 
 
@@ -233,11 +239,24 @@ class _Side(NamedTuple):
         return max(bag.end for bag in self.bags.values())
 
 
-class _Listed(NamedTuple):
+class _AgainstCut(NamedTuple):
     """What is to be listed of one recording, as file, topic and message."""
 
     also_counts: set[tuple[str, str, str]]  # where the cut says that they do not
     counts_elsewhere: set[tuple[str, str, str]]  # where it says that they count
+
+    def add(self, message: tuple[str, str], copies: _Copies, *, counts_here: bool) -> None:
+        """Lists the copies of a message, by topic and identity, for which the cut is wrong."""
+        listed = self.also_counts if counts_here else self.counts_elsewhere
+        listed.update((file, *message) for file, counts in copies if counts is not counts_here)
+
+    def added_to(self, handover: Handover) -> Handover:
+        """Returns the sidecar of the recording with what is to be listed."""
+        return replace(
+            handover,
+            also_counts=_merged(handover.also_counts, self.also_counts),
+            counts_elsewhere=_merged(handover.counts_elsewhere, self.counts_elsewhere),
+        )
 
 
 def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) -> bool:
@@ -246,50 +265,52 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     if after.compared is not False or after.previous != old.name:
         return True
     gate = read_gate(old.parent)
-    running = {*running, *(each.name for each in (old, new) if gate.holds_some(each.name))}
+    running = {
+        *running,
+        *(recording.name for recording in (old, new) if gate.holds_some(recording.name)),
+    }
     is_void = after.state is Counting.VOID
     if after.state is Counting.PENDING or (new if is_void else old).name in running:
         return False
-    cut = Handover()
+    old_cut = Handover()
     if before.next == new.name:
-        cut = Handover(counts_until=before.counts_until, end=before.end)
-    one = _Side(old, before, cut, bags_of(old, reader, only_closed=old.name in running))
-    cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
-    other = _Side(new, after, cut, bags_of(new, reader, only_closed=new.name in running))
-    ended, lasting = (other, one) if is_void else (one, other)
+        old_cut = Handover(counts_until=before.counts_until, end=before.end)
+    new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
+    old_side = _Side(old, before, old_cut, bags_of(old, reader, only_closed=old.name in running))
+    new_side = _Side(new, after, new_cut, bags_of(new, reader, only_closed=new.name in running))
+    ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
     if lasting.recording.name in running and (
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    _write_lists(one, other, _against_the_cut(one, other, reader))
+    _write_lists(old_side, new_side, *_against_the_cut(old_side, new_side, reader))
     return True
 
 
-def _against_the_cut(old: _Side, new: _Side, reader: BagReader) -> tuple[_Listed, _Listed]:
-    """Returns what counts against the cut, for both sidecars."""
+def _against_the_cut(old: _Side, new: _Side, reader: BagReader) -> tuple[_AgainstCut, _AgainstCut]:
+    """Returns what counts against the cut, for the sidecars of the old and the new recording."""
     window = TimeWindow.everything()
     if old.bags and new.bags:
         start, end = max(old.start, new.start), min(old.end, new.end)
         window = TimeWindow(start - STALL_NS, end + STALL_NS + 1)
     # The cut does not apply to latched channels, but all of a recording without effect is hidden.
     latched = new.handover.state is Counting.VOID
-    of_old, of_new = (_copies(side, window, reader, latched=latched) for side in (old, new))
-    lists = _Listed(set(), set()), _Listed(set(), set())
-    for key in of_old.keys() | of_new.keys():
-        one, other = of_old.get(key, _NOWHERE), of_new.get(key, _NOWHERE)
-        if one is None or other is None:
+    in_old, in_new = (_copies(side, window, reader, latched=latched) for side in (old, new))
+    of_old, of_new = _AgainstCut(set(), set()), _AgainstCut(set(), set())
+    for message in in_old.keys() | in_new.keys():
+        old_copies, new_copies = in_old.get(message, _NOWHERE), in_new.get(message, _NOWHERE)
+        if old_copies is None or new_copies is None:
             continue
         # Where both hold it as often, the cut decides.
-        weights = [
-            (copies.total(), sum(times for (_, counts), times in copies.items() if counts))
-            for copies in (one, other)
-        ]
-        best = weights.index(max(weights))
-        for side, copies in enumerate((one, other)):
-            for file, counts in copies:
-                if counts is (side != best):
-                    lists[side][counts].add((file, *key))
-    return lists
+        counts_in_old = _weight(old_copies) >= _weight(new_copies)
+        of_old.add(message, old_copies, counts_here=counts_in_old)
+        of_new.add(message, new_copies, counts_here=not counts_in_old)
+    return of_old, of_new
+
+
+def _weight(copies: _Copies) -> tuple[int, int]:
+    """Returns how often a recording holds a message, and how often the cut counts it there."""
+    return copies.total(), sum(times for (_, counts), times in copies.items() if counts)
 
 
 _NOWHERE: Final[_Copies] = Counter()
@@ -302,23 +323,23 @@ def _copies(
 
     None stands for a message without a publish time of its own.
     """
-    found: dict[tuple[str, str], _Copies | None] = {}
+    by_message: dict[tuple[str, str], _Copies | None] = {}
     for name, bag in side.bags.items():
         if not window.overlaps(bag.start, bag.end):
             continue
-        topics = [each.topic for each in bag.topics]
+        topics = [topic.topic for topic in bag.topics]
         rule = side.cut.rule(name)
         for record in _readable(reader.records(side.recording / name, topics, window)):
             published, logged = record.publish_time, record.log_time
             if record.channel.latched and not (latched and logged - published <= FRESH_NS):
                 continue
             key = record.channel.topic, message_id(published, record.payload)
-            copies = found.setdefault(key, Counter())
+            copies = by_message.setdefault(key, Counter())
             if published in {0, logged}:
-                found[key] = None
+                by_message[key] = None
             elif copies is not None:
                 copies[name, rule is None or rule.counts(record)] += 1
-    return found
+    return by_message
 
 
 def _readable(records: Iterator[Record]) -> Iterator[Record]:
@@ -330,19 +351,12 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
             yield record
 
 
-def _write_lists(old: _Side, new: _Side, found: tuple[_Listed, _Listed]) -> None:
+def _write_lists(old: _Side, new: _Side, of_old: _AgainstCut, of_new: _AgainstCut) -> None:
     """Writes the sidecars that change, that of the new recording in any case."""
     before, after = old.handover, new.handover
-    messages = sum(len(listed) for lists in found for listed in lists)
+    messages = sum(map(len, (*of_old, *of_new)))
     if messages <= MOST_LISTED:
-        before, after = (
-            replace(
-                handover,
-                also_counts=_joined(handover.also_counts, lists.also_counts),
-                counts_elsewhere=_joined(handover.counts_elsewhere, lists.counts_elsewhere),
-            )
-            for handover, lists in zip((before, after), found, strict=True)
-        )
+        before, after = of_old.added_to(before), of_new.added_to(after)
     else:
         # Without a cut all of both count.
         if before.end is not None and before.next == new.recording.name:
@@ -362,16 +376,16 @@ def _write_lists(old: _Side, new: _Side, found: tuple[_Listed, _Listed]) -> None
         )
 
 
-def _joined(known: MessageList, more: Collection[tuple[str, str, str]]) -> MessageList:
-    joined = {
+def _merged(listed: MessageList, more: Collection[tuple[str, str, str]]) -> MessageList:
+    merged = {
         file: {topic: {*messages} for topic, messages in by_topic.items()}
-        for file, by_topic in known.items()
+        for file, by_topic in listed.items()
     }
     for file, topic, message in more:
-        joined.setdefault(file, {}).setdefault(topic, set()).add(message)
+        merged.setdefault(file, {}).setdefault(topic, set()).add(message)
     return {
         file: {topic: tuple(sorted(messages)) for topic, messages in by_topic.items()}
-        for file, by_topic in joined.items()
+        for file, by_topic in merged.items()
     }
 
 
@@ -386,7 +400,7 @@ def bags_of(
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
-    found: dict[str, BagSummary] = {}
+    summaries: dict[str, BagSummary] = {}
     gate = read_gate(recording.parent) if only_closed else OPEN_GATE
     for path in _bag_files(recording, reader):
         try:
@@ -400,8 +414,8 @@ def bags_of(
         except BagError:
             continue
         if not summary.empty:
-            found[path.name] = summary
-    return found
+            summaries[path.name] = summary
+    return summaries
 
 
 def _bag_files(recording: Path, reader: BagReader) -> list[Path]:

@@ -186,9 +186,9 @@ class MemoryDays:
         bags = [bag for bag in snapshot.bags if bag.file in paths]
         if not bags:
             return
-        thinned = self._thinned()
+        thinned = self._read_thinned()
         shown = shown_by(thinned, snapshot, bags)
-        chosen = self._chosen(snapshot, bags, shown)
+        chosen = self._choose(snapshot, bags, shown)
         if shown != thinned:
             THINNED.write(self._folder.parent, shown)
         # Whole bags, also across midnight: a bag is in one day, or in none.
@@ -197,10 +197,10 @@ class MemoryDays:
             days[utc_day(bag.start)].append(bag)
         messages = 0
         for day, of_day in days.items():
-            records = sorted(self._records(of_day, chosen), key=attrgetter("log_time"))
+            records = sorted(self._staying_records(of_day, chosen), key=attrgetter("log_time"))
             messages += len(records)
             if records:
-                self._write(day, records, of_day)
+                self._write_day(day, records, of_day)
         _log.info(
             "memory_kept",
             days=[*days],
@@ -224,7 +224,7 @@ class MemoryDays:
         today = "" if now is None else memory_file(utc_day(now))
         for path in self._days():
             if _FIRST_DAY <= path.name < oldest:
-                self._delete(path)
+                self._delete_day(path)
         # Those of a clock that was ahead first: they would push out all others, and never age.
         days = sorted(self._days(), key=lambda path: "" < today < path.name, reverse=True)
         size = sum(path.stat().st_size for path in days)
@@ -232,9 +232,13 @@ class MemoryDays:
             if size <= self._limits.max_bytes:
                 break
             size -= path.stat().st_size
-            self._delete(path)
+            self._delete_day(path)
         self._forget_deleted()
-        month_ago = "" if now is None else memory_file(utc_day(now - MONTH_NS))
+        if now is not None:
+            self._thin_one_before(memory_file(utc_day(now - MONTH_NS)))
+
+    def _thin_one_before(self, month_ago: str) -> None:
+        """Thins the oldest day before one, given by the names of files, that has still to be."""
         for path in self._days():
             if path.name < month_ago and path not in self._minutes:
                 self._minutes.add(path)
@@ -247,7 +251,7 @@ class MemoryDays:
 
     def _forget_deleted(self) -> None:
         """Takes out of `thinned.json` what is older than all days; it goes with the last."""
-        thinned, days = self._thinned(), self._days()
+        thinned, days = self._read_thinned(), self._days()
         if thinned.since is None:
             return
         if not days:
@@ -257,7 +261,7 @@ class MemoryDays:
         if left != thinned:
             THINNED.write(self._folder.parent, left)
 
-    def _delete(self, path: Path) -> None:
+    def _delete_day(self, path: Path) -> None:
         path.unlink()
         _log.warning("memory_day_deleted", path=str(path))
 
@@ -269,16 +273,16 @@ class MemoryDays:
             if has_numbers(table) and not table.channel.latched:
                 key = (table.channel.topic, table.channel.type)
                 numbers.setdefault(key, TopicThinning(detections, MINUTE_NS)).add(table)
-        stays = {key: {*one.times().tolist()} for key, one in numbers.items()}
+        stays = {key: {*thinning.times().tolist()} for key, thinning in numbers.items()}
 
-        def left() -> Iterator[Record]:
-            for record in self._joined(path, ()):
+        def thinned() -> Iterator[Record]:
+            for record in self._merged_by_hour(path, ()):
                 channel = record.channel
                 if record.log_time in stays.get((channel.topic, channel.type), [record.log_time]):
                     metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
                     yield record._replace(channel=replace(channel, metadata=(*metadata,)))
 
-        self._write_beside(path, left()).replace(path)
+        self._write_beside(path, thinned()).replace(path)
         flush(self._folder)
 
     def clear(self) -> None:
@@ -317,10 +321,10 @@ class MemoryDays:
         """Returns the files that the recorder wrote, the oldest first; no link is followed."""
         if self._folder.is_symlink() or not self._folder.is_dir():
             return []
-        found = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
-        return sorted(path for path in found if self._own.owns_bag(path))
+        paths = [path for path in self._folder.glob("*.mcap") if not path.is_symlink()]
+        return sorted(path for path in paths if self._own.owns_bag(path))
 
-    def _thinned(self) -> Thinned:
+    def _read_thinned(self) -> Thinned:
         """Returns what is known of deleted bags; nothing, which is logged, of a damaged file."""
         try:
             return THINNED.read(self._folder.parent) or Thinned()
@@ -328,9 +332,9 @@ class MemoryDays:
             _log.warning("memory_not_read", path=THINNED_FILE, reason=str(error))
             return Thinned()
 
-    def _chosen(self, snapshot: Snapshot, bags: Sequence[BagFile], shown: Thinned) -> _Chosen:
-        """Returns which messages of some bags stay."""
-        chosen = _Chosen()
+    def _choose(self, snapshot: Snapshot, bags: Sequence[BagFile], shown: Thinned) -> _Staying:
+        """Returns which messages of some bags stay, also beside the pauses that these show."""
+        chosen = _Staying()
         thinned: dict[tuple[str, str], TopicThinning] = {}
         detections = DetectionColumns(self._extractor)
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
@@ -351,8 +355,8 @@ class MemoryDays:
             elif len(table):
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
                 chosen.times[topic, kind].update(beside(shown.pauses, table.log_times).tolist())
-        for key, one in thinned.items():
-            chosen.times[key].update(one.times().tolist())
+        for key, thinning in thinned.items():
+            chosen.times[key].update(thinning.times().tolist())
         return chosen
 
     def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
@@ -363,19 +367,19 @@ class MemoryDays:
             and all(timeline.pace(topic, path).is_rare for path in timeline.recordings(topic))
         )
 
-    def _records(self, bags: Sequence[BagFile], chosen: _Chosen) -> Iterator[Record]:
+    def _staying_records(self, bags: Sequence[BagFile], chosen: _Staying) -> Iterator[Record]:
         """Yields the messages that stay, without people whose label may not."""
         topics = [*{topic for (topic, _), times in chosen.times.items() if times}]
         for bag in bags:
-            for record in self._readable(bag.path, topics):
+            for record in self._readable_records(bag.path, topics):
                 channel = record.channel
                 if record.log_time not in chosen.times.get((channel.topic, channel.type), ()):
                     continue
                 if channel.latched and channel.topic not in chosen.latched:
                     # Thinned, it would look like one whose messages hold until the next.
-                    metadata = tuple(one for one in channel.metadata if one[0] != _QOS)
+                    metadata = tuple((key, value) for key, value in channel.metadata if key != _QOS)
                     channel = replace(channel, latched=False, metadata=metadata)
-                stays = self._smaller(
+                stays = self._without_people(
                     record._replace(channel=channel), rounds=channel.topic not in chosen.latched
                 )
                 if stays is not None:
@@ -395,7 +399,7 @@ class MemoryDays:
             else:
                 yield from tables
 
-    def _readable(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
+    def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
         """Yields the messages of a bag that can be read; raises as `_tables` does."""
         for record in or_errors(self._reader.records(path, topics, _EVERYTHING)):
             if isinstance(record, BagError):
@@ -408,14 +412,14 @@ class MemoryDays:
         if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
             raise error
 
-    def _smaller(self, record: Record, *, rounds: bool) -> Record | None:
+    def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
         """Returns a message without people whose label may not stay, maybe with rounded numbers.
 
         None where it cannot be parted from them, or where no transform of it is left.
         """
         try:
             whole, channel = self._reader.decode(record), record.channel
-            message = _without(whole, self._is_hidden)
+            message = _without_hidden(whole, self._is_hidden)
             if message is not whole and getattr(message, "transforms", None) == []:
                 return None
             if self._names_people(message, channel.type):
@@ -429,10 +433,12 @@ class MemoryDays:
             return None
 
     def _names_people(self, message: object, type_name: str) -> bool:
-        shown = self._extractor.exact(message, type_name)
+        extracted = self._extractor.exact(message, type_name)
         texts = [value for _, value in _fields(message) if isinstance(value, str)]
-        seen = [each.label for value in (shown, *texts) for each in detections_of(value)]
-        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), seen), *_labels(message)]))
+        labels = [
+            detection.label for value in (extracted, *texts) for detection in detections_of(value)
+        ]
+        return any(starmap(self._is_hidden, [*zip(repeat(LABELS[0]), labels), *_labels(message)]))
 
     def _is_hidden(self, field: str, text: str) -> bool:
         """Returns whether a text in such a field is of people.
@@ -449,7 +455,7 @@ class MemoryDays:
         """Returns whether a label, a frame or a topic has a word for people in it: `person_1`."""
         return not self._people.isdisjoint(map(str.casefold, _WORD.findall(name)))
 
-    def _write(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
+    def _write_day(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
         """Writes a day anew, with more messages, and lists the bags that these are of.
 
         From the moment on in which the new file takes its name, those bags count no longer.
@@ -462,17 +468,17 @@ class MemoryDays:
         if self._folder.is_symlink():
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
         self._folder.mkdir(exist_ok=True)
-        path = self._free(day)
+        path = self._writable_file(day)
         self._own.hold(self._folder, [path.name])
         name = str(path.relative_to(bag_dir))
-        beside = self._write_beside(path, self._joined(path, records))
+        beside = self._write_beside(path, self._merged_by_hour(path, records))
         status, before = beside.stat(), Superseded()
         with suppress(ValueError):  # a damaged list is replaced
             before = SUPERSEDED.read(bag_dir) or before
         # Those that could not be deleted yet.
         left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
         listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
-        days = {known: before.days[known] for known in {*left.values()} - {name}}
+        days = {other: before.days[other] for other in {*left.values()} - {name}}
         SUPERSEDED.write(
             bag_dir, Superseded({**days, name: (status.st_size, status.st_mtime_ns)}, listed)
         )
@@ -491,7 +497,7 @@ class MemoryDays:
             raise
         return beside
 
-    def _free(self, day: str) -> Path:
+    def _writable_file(self, day: str) -> Path:
         """Returns the file of a day that can be written anew: no damaged one, nor one of others."""
         number = 0
         while True:
@@ -507,7 +513,7 @@ class MemoryDays:
         summary = self._reader.summarize(path)
         return summary.complete and not summary.notes
 
-    def _joined(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
+    def _merged_by_hour(self, path: Path, added: Sequence[Record]) -> Iterator[Record]:
         """Yields the messages of a day and others, hour by hour and topic by topic, copies once.
 
         So what is alike lies together, and compresses.
@@ -523,18 +529,19 @@ class MemoryDays:
                 hours.setdefault(hour, [])
         for hour in sorted(hours):
             window = TimeWindow(hour * HOUR_NS, (hour + 1) * HOUR_NS)
-            found = [*self._reader.records(path, topics, window)] if topics else []
-            known: set[tuple[str, Ns, Ns, bytes]] = set()
+            before = [*self._reader.records(path, topics, window)] if topics else []
+            identities: set[tuple[str, Ns, Ns, bytes]] = set()
             by_topic = attrgetter("channel.topic", "log_time")
-            for record in sorted([*found, *hours[hour]], key=by_topic):
-                key = (record.channel.topic, *record[1:])
-                if key not in known:
-                    known.add(key)
+            for record in sorted([*before, *hours[hour]], key=by_topic):
+                channel, logged, published, payload = record
+                identity = (channel.topic, logged, published, payload)
+                if identity not in identities:
+                    identities.add(identity)
                     yield record
 
 
 @dataclass(slots=True)
-class _Chosen:
+class _Staying:
     """Which messages of some bags stay.
 
     Attributes:
@@ -556,12 +563,12 @@ def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
     if isinstance(node, str):
         yield field, node
     for name, value in _fields(node):
-        for one in value if isinstance(value, list) else [value]:
-            if name in _NAMES or not isinstance(one, str):
-                yield from _labels(one, name)
+        for item in value if isinstance(value, list) else [value]:
+            if name in _NAMES or not isinstance(item, str):
+                yield from _labels(item, name)
 
 
-def _without(message: object, is_hidden: Callable[[str, str], bool]) -> object:
+def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> object:
     """Returns a decoded message without those entries of its lists that have a hidden label.
 
     What lies at the same place of a list of texts belongs to it: `name`, `position`.
@@ -572,27 +579,28 @@ def _without(message: object, is_hidden: Callable[[str, str], bool]) -> object:
         name: value for name, value in _fields(message) if isinstance(value, list | np.ndarray)
     }
     hidden = {
-        name: {nth for nth, one in enumerate(value) if any(starmap(is_hidden, _labels(one, name)))}
-        for name, value in lists.items()
+        name: {
+            row for row, item in enumerate(items) if any(starmap(is_hidden, _labels(item, name)))
+        }
+        for name, items in lists.items()
     }
     changed: dict[str, object] = {}
-    for name, value in lists.items():
-        gone = hidden[name].union(
-            *(
-                hidden[other]
-                for other, texts in lists.items()
-                if len(texts) == len(value) and all(isinstance(one, str) for one in texts)
-            )
+    for name, items in lists.items():
+        parallel = (
+            hidden[other]
+            for other, texts in lists.items()
+            if len(texts) == len(items) and all(isinstance(text, str) for text in texts)
         )
+        gone = hidden[name].union(*parallel)
         if gone:
-            left = [nth for nth in range(len(value)) if nth not in gone]
+            left = [row for row in range(len(items)) if row not in gone]
             changed[name] = (
-                value[left] if isinstance(value, np.ndarray) else [value[nth] for nth in left]
+                items[left] if isinstance(items, np.ndarray) else [items[row] for row in left]
             )
     return replace(message, **changed) if changed else message
 
 
 def _fields(node: object) -> Iterator[tuple[str, object]]:
     if is_dataclass(node) and not isinstance(node, type):
-        for one in fields(node):
-            yield one.name, getattr(node, one.name)
+        for field_of_node in fields(node):
+            yield field_of_node.name, getattr(node, field_of_node.name)

@@ -68,13 +68,15 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
     if isinstance(message, np.ndarray) and message.dtype.kind == "f":
         return _rounded(message, step_of(path, definition)).astype(message.dtype)
     if isinstance(message, list):
-        return [rounded(one, definition, path) for one in message]
+        return [rounded(member, definition, path) for member in message]
     if not is_dataclass(message) or isinstance(message, type):
         return message
     values = {
-        one.name: rounded(getattr(message, one.name), definition, f"{path}.{one.name}".lstrip("."))
-        for one in fields(message)
-        if not one.name.startswith("__")
+        member.name: rounded(
+            getattr(message, member.name), definition, f"{path}.{member.name}".lstrip(".")
+        )
+        for member in fields(message)
+        if not member.name.startswith("__")
     }
     return replace(message, **values)
 
@@ -242,24 +244,34 @@ class TopicThinning:
 
     def _labels(self, table: Table) -> list[set[Name]]:
         """Returns the labels of the detections in each message, also in JSON, with their number."""
-        found = self.detections.of(table)
+        in_table = self.detections.of(table)
         labels: list[list[str]] = [[] for _ in range(len(table))]
-        if found is not None:
-            seen = found.detections
-            for row, label in zip(seen.rows.tolist(), seen.labels.values(), strict=True):
+        if in_table is not None:
+            detections = in_table.detections
+            for row, label in zip(
+                detections.rows.tolist(), detections.labels.values(), strict=True
+            ):
                 labels[row].append(label)
         for column in table.columns.values():
             if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
                 for row, text in enumerate(column.values()):
-                    labels[row] += [each.label for each in detections_of(text)]
+                    labels[row] += [detection.label for detection in detections_of(text)]
         return [
-            {(label, nth) for label, count in Counter(those).items() for nth in range(count)}
-            for those in labels
+            {
+                (label, repeat)
+                for label, count in Counter(of_message).items()
+                for repeat in range(count)
+            }
+            for of_message in labels
         ]
 
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
-        extremes = [one[1] for both in self._extremes.values() for one in both]
+        extremes = [
+            extreme[1]
+            for extremes_of_column in self._extremes.values()
+            for extreme in extremes_of_column
+        ]
         return np.unique(np.concatenate([*self._stays, np.array(extremes, np.int64)]))
 
     def _add_changes(
@@ -274,16 +286,16 @@ class TopicThinning:
         self._values[path] = values[-1], int(times[-1])
 
     def _add_extremes(self, path: str, numbers: Points, times: IntArray) -> None:
-        for part in np.unique(times // EXTREMES_NS).tolist():
-            inside = np.flatnonzero((times // EXTREMES_NS == part) & np.isfinite(numbers))
-            if not inside.size:
+        for slot in np.unique(times // EXTREMES_NS).tolist():
+            rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
+            if not rows.size:
                 continue
-            found = [(float(numbers[nth]), int(times[nth])) for nth in inside.tolist()]
-            least, greatest = min(found), max(found, key=itemgetter(0))
-            before = self._extremes.get((path, part), (least, greatest))
+            samples = [(float(numbers[row]), int(times[row])) for row in rows.tolist()]
+            least, greatest = min(samples), max(samples, key=itemgetter(0))
+            least_before, most_before = self._extremes.get((path, slot), (least, greatest))
             # Of equal ones the earliest.
-            most = max(before[1], greatest, key=itemgetter(0))
-            self._extremes[path, part] = min(before[0], least), most
+            most = max(most_before, greatest, key=itemgetter(0))
+            self._extremes[path, slot] = min(least_before, least), most
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
@@ -301,10 +313,10 @@ class TopicThinning:
             return
         rows: list[tuple[object, ...]] = [()] * times.size
         for owner, *values in zip(
-            inner.owners.tolist(), *(c.tolist() for c in states), strict=True
+            inner.owners.tolist(), *(column.tolist() for column in states), strict=True
         ):
             rows[owner] = (*rows[owner], *values)
-        codes = {value: nth for nth, value in enumerate(dict.fromkeys(rows))}
+        codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
         self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
 
     def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
@@ -315,9 +327,9 @@ class TopicThinning:
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
             named[row].add((frame, 0))
         for code, frame in enumerate(column.words):
-            own = np.flatnonzero(column.codes == code)
-            poses = {key: rows[own] for key, rows in _poses(inner.columns).items()}
-            self._add_moves(frame, times[inner.owners[own]], poses)
+            rows = np.flatnonzero(column.codes == code)
+            poses = {path: points[rows] for path, points in _poses(inner.columns).items()}
+            self._add_moves(frame, times[inner.owners[rows]], poses)
 
 
 def is_sampled(table: Table) -> bool:
@@ -356,7 +368,7 @@ def _is_discrete(column: Column) -> TypeGuard[Numbers]:
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
     """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
-    found: dict[str, Points] = {}
+    poses: dict[str, Points] = {}
     for path in columns:
         around, _, name = path.removesuffix(".x").rpartition(".")
         if not path.endswith(".x") or name not in _POINTS:
@@ -364,21 +376,24 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
         turn = _TURNS[_POINTS.index(name)]
         names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
         names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
-        found |= _stacked(path[:-2], [columns[each] for each in names if each in columns])
+        poses |= _stacked(
+            path[:-2],
+            [columns[name_of_column] for name_of_column in names if name_of_column in columns],
+        )
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
-        found |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
+        poses |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
     if {"latitude", "longitude"} <= columns.keys():
         degrees = _stacked("latitude", [columns["latitude"], columns["longitude"]])
-        found |= {path: points * _DEGREE_M for path, points in degrees.items()}
-    return found
+        poses |= {path: points * _DEGREE_M for path, points in degrees.items()}
+    return poses
 
 
 def _stacked(path: str, columns: Sequence[Column]) -> dict[str, Points]:
     """Returns columns of numbers as rows, by a path; nothing where one is of texts."""
-    numbers = [one for one in columns if not isinstance(one, Texts)]
+    numbers = [column for column in columns if not isinstance(column, Texts)]
     if len(numbers) < len(columns):
         return {}
-    return {path: np.stack([np.asarray(one, np.float64) for one in numbers], axis=1)}
+    return {path: np.stack([np.asarray(column, np.float64) for column in numbers], axis=1)}
 
 
 _MOST_PAUSES: Final = 32
@@ -391,23 +406,29 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
     def is_in(at: Ns) -> bool:
         return any(bag.start <= at <= bag.end for bag in bags)
 
-    silences = {each[:2]: each for each in known.silences}
-    silences |= {each[:2]: (*each,) for each in snapshot.silences if is_in(each.start)}
+    topic_and_start = itemgetter(0, 1)
+    silences = {topic_and_start(silence): silence for silence in known.silences}
+    silences |= {
+        (silence.topic, silence.start): (*silence,)
+        for silence in snapshot.silences
+        if is_in(silence.start)
+    }
     steps = [
         (fault.bag.start, fault.by)
         for fault in snapshot.dating.faults
-        if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
+        if fault.kind is FaultyClock.SET_BACK
+        if fault.by >= SHORTEST_STEP_NS and is_in(fault.bag.start)
     ]
-    pauses = [(pause.start, pause.end) for pause in snapshot.suspects]
+    pauses = [(pause.start, pause.end) for pause in snapshot.suspects if is_in(pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]
     since = bags[0].start if known.since is None else known.since
     if since > snapshot.scanned_at:  # by a clock that was ahead
         since = min(since, bags[0].start)
     return Thinned(
         since,
-        tuple(sorted(silences.values(), key=lambda each: each[1])),
-        (*_few_a_day([*known.pauses, *(pause for pause in pauses if is_in(pause[0]))]),),
-        tuple(sorted({*known.set_back, *(step for step in steps if is_in(step[0]))})),
+        tuple(sorted(silences.values(), key=itemgetter(1))),
+        (*_few_a_day([*known.pauses, *pauses]),),
+        tuple(sorted({*known.set_back, *steps})),
         tuple(sorted({*known.left_open, *left_open})),
     )
 
@@ -415,11 +436,11 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
 def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
     """Yields pauses in order of time, each once: the first `_MOST_PAUSES` of a day."""
     counts = Counter[str]()
-    for pause in sorted(dict.fromkeys(pauses)):
-        day = utc_day(pause[0])
+    for start, end in sorted({*pauses}):
+        day = utc_day(start)
         counts[day] += 1
         if counts[day] <= _MOST_PAUSES:
-            yield pause
+            yield start, end
 
 
 def beside(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:

@@ -165,14 +165,14 @@ def find_ros2(env: Mapping[str, str], *, sourced: bool = False) -> str:
     Raises:
         RecorderError: it is not on the environment's PATH.
     """
-    found = shutil.which("ros2", path=env.get("PATH", os.defpath))
-    if found is None:
+    program = shutil.which("ros2", path=env.get("PATH", os.defpath))
+    if program is None:
         where = "after sourcing recorder.setup_files" if sourced else "on PATH"
         raise RecorderError(
             f"`ros2` was not found {where}; name the setup.bash of the ROS 2 distribution, and of "
             "the workspace with the robot's own messages, in recorder.setup_files"
         )
-    return str(Path(found).absolute())
+    return str(Path(program).absolute())
 
 
 def _sourced(setup_files: Sequence[Path], base: Mapping[str, str]) -> dict[str, str]:
@@ -268,14 +268,14 @@ def setup_files_here(
     """
     if configured or shutil.which("ros2", path=env.get("PATH", os.defpath)):
         return tuple(configured)
-    found = [
+    setups = [
         file
         for file in sorted(distributions.glob("*/setup.bash"))
         if file.with_name("bin").joinpath("ros2").is_file()
     ]
-    if not found:
+    if not setups:
         raise RecorderError(
             f"there is no ROS 2: `ros2` is not on PATH, and {distributions} has no distribution; "
             "source the robot's setup.bash first, or name it: recorder.setup_files=[FILE]"
         )
-    return (found[-1],)
+    return (setups[-1],)

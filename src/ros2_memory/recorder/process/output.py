@@ -75,9 +75,9 @@ def parse_line(raw: str) -> Line:
     logged = _LOGGED.search(line)
     text = logged["text"].strip() if logged else line
     for kind, pattern in _MEANINGS:
-        found = pattern.match(text)
-        if found is not None:
-            named = found.groupdict()
-            count = named.get("count")
-            return Line(kind, text, named.get("topic"), None if count is None else int(count))
+        meaning = pattern.match(text)
+        if meaning is not None:
+            groups = meaning.groupdict()
+            count = groups.get("count")
+            return Line(kind, text, groups.get("topic"), None if count is None else int(count))
     return Line(_BY_LEVEL.get(logged["level"] if logged else "", LineKind.OTHER), text)

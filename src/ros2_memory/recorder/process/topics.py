@@ -61,7 +61,7 @@ class TopicSelection:
     @property
     def listed(self) -> tuple[str, ...]:
         """All that the file lists: entries, and then exclusions."""
-        return (*self.entries, *(f"not {each}" for each in self.excluded))
+        return (*self.entries, *(f"not {entry}" for entry in self.excluded))
 
     @property
     def services(self) -> tuple[str, ...]:
@@ -157,7 +157,7 @@ def load_topics(path: Path) -> TopicSelection:
         if reason is not None:
             raise ConfigError(f"{path}: {entry!r} cannot be recorded: {reason}")
     selection = TopicSelection(
-        *(tuple(dict.fromkeys(map(str, each))) for each in (entries, excluded))
+        *(tuple(dict.fromkeys(map(str, names))) for names in (entries, excluded))
     )
     if len(selection.regex) > MAX_REGEX:
         raise ConfigError(
@@ -187,8 +187,8 @@ def _entries(path: Path) -> tuple[list[object], list[object]]:
     excluded: object = content.get("exclude") or []
     if listed is None or listed == []:
         raise ConfigError(f"{path}: no topic is listed, so nothing would be recorded; list some")
-    for name, each in (("topics", listed), ("exclude", excluded)):
-        if not isinstance(each, list):
+    for name, value in (("topics", listed), ("exclude", excluded)):
+        if not isinstance(value, list):
             raise ConfigError(f"{path}: {name} must be a list, one topic to a line: - /odom")
     return cast("list[object]", listed), cast("list[object]", excluded)
 

@@ -126,10 +126,10 @@ class LossCounter:
         """Takes the next split of a recording; returns the losses that are certain by now."""
         self._measured += 1
         self._heard[recording] = self._measured
-        for topic, found in split.items():
-            reached = max(self._reached.get(recording, 0), found.positions[-1].log_time)
+        for topic, progress in split.items():
+            reached = max(self._reached.get(recording, 0), progress.positions[-1].log_time)
             self._reached[recording] = reached
-            self._add(topic, found)
+            self._add(topic, progress)
         for name, heard in [*self._heard.items()]:
             if self._measured - heard >= RECENT:
                 del self._heard[name]
@@ -150,17 +150,17 @@ class LossCounter:
 
     def in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are missing of the last hour."""
-        found: dict[str, int] = {}
+        lost: dict[str, int] = {}
         for loss in self._lately:
             if loss.stop > now - HOUR_NS:
-                found[loss.topic] = found.get(loss.topic, 0) + loss.lost
-        return found
+                lost[loss.topic] = lost.get(loss.topic, 0) + loss.lost
+        return lost
 
-    def _add(self, topic: str, found: Progress) -> None:
+    def _add(self, topic: str, progress: Progress) -> None:
         """Puts what a split has of a topic together with what is known of it."""
-        positions, series = found.positions, self._series.get(topic)
+        positions, series = progress.positions, self._series.get(topic)
         steps = enumerate(pairwise(positions), 1)
-        back = [at for at, (one, other) in steps if one.value >= other.value]
+        back = [index for index, (before, after) in steps if before.value >= after.value]
         if len(back) > 1:  # several publishers
             self.unclear([topic])
             return
@@ -170,12 +170,12 @@ class LossCounter:
             series, positions = None, positions[back[0] :]
         elif last.value < first.value and last.log_time > first.log_time:
             series = None
-        known = [] if series is None else series.positions
-        by_value = dict(sorted((*known, *positions), reverse=True))
+        known_positions = [] if series is None else series.positions
+        by_value = dict(sorted((*known_positions, *positions), reverse=True))
         merged = [Position(*item) for item in sorted(by_value.items())]
         if series is not None:
             merged = [position for position in merged if position.value >= first.value]
-        self._series[topic] = _Series(found.kind, merged, self._measured)
+        self._series[topic] = _Series(progress.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:
         """Returns the losses up to a log time that all recordings have reached."""
@@ -184,13 +184,13 @@ class LossCounter:
             positions, is_over = series.positions, until == MAX_NS
             is_over |= self._measured - series.heard >= RECENT
             settled = max(
-                (at for at, position in enumerate(positions) if position.log_time <= until),
+                (index for index, position in enumerate(positions) if position.log_time <= until),
                 default=0,
             )
-            found = holes(positions, series.kind)
-            if found is not None:
+            series_holes = holes(positions, series.kind)
+            if series_holes is not None:
                 self._counted.add(topic)
-            for hole in found or ():
+            for hole in series_holes or ():
                 if hole.after.value > positions[settled].value:
                     break
                 if hole.is_open and not is_over:
@@ -206,24 +206,31 @@ class LossCounter:
         return losses
 
 
-def reader_of(schema: Schema) -> tuple[Kind, Callable[[bytes], int]] | None:
-    """Returns what shows holes in messages of this type; None where nothing does.
+class ValueReader(NamedTuple):
+    """What shows holes in messages of a type: a counter, or stamps (ns).
 
-    The returned function takes a payload, and raises `struct.error` for one that does not fit.
+    `value_of` takes a payload, and raises `struct.error` for one that does not fit.
     """
+
+    kind: Kind
+    value_of: Callable[[bytes], int]
+
+
+def reader_of(schema: Schema) -> ValueReader | None:
+    """Returns what shows holes in messages of this type; None where nothing does."""
     if schema.encoding != "ros2msg":
         return None
     fields = _fields(schema.text.decode(errors="replace"))
     before: list[str] = []
     for kind, name in fields:
         if name in _COUNTERS and kind in _UNSIGNED:
-            return "counter", partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+            value_of = partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+            return ValueReader("counter", value_of)
         if kind not in {"string", *_SIZES, *_HEADERS, *_TIMES}:
             break
         before.append(kind)
-    if fields and fields[0][0] in _HEADERS:
-        return "stamps", _stamp
-    return None
+    first_type, _ = fields[0] if fields else ("", "")
+    return ValueReader("stamps", _stamp) if first_type in _HEADERS else None
 
 
 def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
@@ -237,9 +244,9 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
     """
     if len(positions) < FEWEST:
         return None
-    if sum(one.value >= other.value for one, other in pairwise(positions)) > 1:
+    if sum(before.value >= after.value for before, after in pairwise(positions)) > 1:
         return None
-    steps = [(one, other, other.value - one.value) for one, other in pairwise(positions)]
+    steps = [(before, after, after.value - before.value) for before, after in pairwise(positions)]
     lengths = [length for _, _, length in steps if length > 0]
     usual = 1 if kind == "counter" else median_low(lengths or [0])
     allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
@@ -247,32 +254,35 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
     if usual <= 0 or len(regular) < REGULAR * len(steps):
         return None
     period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
-    found: list[Hole] = []
-    for index, (one, other, length) in enumerate(steps):
+    holes_found: list[Hole] = []
+    for index, (before, after, length) in enumerate(steps):
         missing = round(length / period) - 1
         wide = length > (2 - _TOLERANCE) * period
-        short = other.log_time - one.log_time <= LONGEST_NS and missing <= MOST_MISSING
+        short = after.log_time - before.log_time <= LONGEST_NS and missing <= MOST_MISSING
         if not (wide and short):
             continue
         enough = 1 if kind == "counter" else missing + FEWEST
         later = positions[index + 1 : index + 1 + enough]
-        behind = min(each.value - nth * period for nth, each in enumerate(later, 1)) - one.value
+        behind = (
+            min(position.value - nth * period for nth, position in enumerate(later, 1))
+            - before.value
+        )
         if (missing := round(behind / period)) > 0:
-            found.append(Hole(one, other, missing, len(later) < enough))
-    return found
+            holes_found.append(Hole(before, after, missing, len(later) < enough))
+    return holes_found
 
 
 def _fields(text: str) -> list[tuple[str, str]]:
     """Returns type and name of each field of the message itself."""
-    found: list[tuple[str, str]] = []
+    fields: list[tuple[str, str]] = []
     for raw in text.splitlines():
         line = raw.partition("#")[0].strip()
         if line.startswith("==="):
             break
         words = line.split()
         if len(words) >= 2 and "=" not in "".join(words[1:3]):
-            found.append((words[0], words[1]))
-    return found
+            fields.append((words[0], words[1]))
+    return fields
 
 
 def _stamp(payload: bytes) -> int:
@@ -354,14 +364,14 @@ def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
             listed: object = yaml.safe_load(text)
         except yaml.YAMLError:
             return None
-        if not isinstance(listed, list) or not all(isinstance(each, dict) for each in listed):
+        if not isinstance(listed, list) or not all(isinstance(profile, dict) for profile in listed):
             return None
         profiles += listed
     if not profiles:
         return None
     return OfferedQos(
-        reliable=all(each.get("reliability") in _RELIABLE for each in profiles),
-        latched=all(each.get("durability") in _LATCHED for each in profiles),
+        reliable=all(profile.get("reliability") in _RELIABLE for profile in profiles),
+        latched=all(profile.get("durability") in _LATCHED for profile in profiles),
         publishers=len(profiles),
     )
 
@@ -425,12 +435,12 @@ class SplitMeasure(NamedTuple):
     @property
     def start(self) -> Ns:
         """The first log time, where there is a message."""
-        return min(each.first for each in self.arrivals.values())
+        return min(arrival.first for arrival in self.arrivals.values())
 
     @property
     def end(self) -> Ns:
         """The last log time, where there is a message."""
-        return max(each.last for each in self.arrivals.values())
+        return max(arrival.last for arrival in self.arrivals.values())
 
 
 def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> SplitMeasure:
@@ -443,12 +453,12 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         OSError: it is not there.
     """
     offers: dict[str, list[str]] = {}
-    readers: dict[str, tuple[Kind, Callable[[bytes], int]]] = {}
+    readers: dict[str, ValueReader] = {}
     for channel in reader.channels(path):
         texts = offers.setdefault(channel.topic, [])
         texts += [text for name, text in channel.metadata if name == "offered_qos_profiles"]
-        if found := reader_of(channel.schema):
-            readers[channel.topic] = found
+        if value_reader := reader_of(channel.schema):
+            readers[channel.topic] = value_reader
     window = TimeWindow.everything()
     is_whole = not end_only and path.stat().st_size <= SPLIT_BYTES
     if not is_whole and not (summary := reader.summarize(path)).empty:
@@ -465,7 +475,7 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         arrivals[topic] = arrivals[topic].joined(arrival) if topic in arrivals else arrival
         if topic in readers:
             try:
-                position = Position(readers[topic][1](record.payload), logged)
+                position = Position(readers[topic].value_of(record.payload), logged)
             except struct.error:
                 del readers[topic]
             else:
@@ -476,8 +486,8 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
         if (offered := offered_by_all(offers[topic])) is not None
     }
     progress = {
-        topic: Progress(readers[topic][0], found)
-        for topic, found in positions.items()
+        topic: Progress(readers[topic].kind, of_topic)
+        for topic, of_topic in positions.items()
         if is_whole and topic in readers and topic in flows and flows[topic].offered.publishers == 1
     }
     return SplitMeasure(flows, progress, arrivals)
@@ -533,23 +543,23 @@ class Arrivals:
         end = split.end
         self._newest = end if end < self._newest - _SET_BACK_NS else max(self._newest, end)
         self._splits = [
-            each
-            for each in (*self._splits, split)
-            if self._newest - MEASURED_NS < each.end <= self._newest
+            measured
+            for measured in (*self._splits, split)
+            if self._newest - MEASURED_NS < measured.end <= self._newest
         ]
         for topic, arrival in split.arrivals.items():
-            known = self._topics.get(topic)
-            if known is None or arrival.last < known.arrival.last - _SET_BACK_NS:
+            topic_state = self._topics.get(topic)
+            if topic_state is None or arrival.last < topic_state.arrival.last - _SET_BACK_NS:
                 self._topics[topic] = _Topic(arrival)
                 self._silent.discard(topic)
                 continue
-            joined = known.arrival.joined(arrival)
-            if joined.last > known.arrival.last:
+            joined = topic_state.arrival.joined(arrival)
+            if joined.last > topic_state.arrival.last:
                 self._silent.discard(topic)
-            if max(arrival.pause, arrival.first - known.arrival.last) > known.patience:
-                known.arrival, known.paused = arrival, arrival.first
+            if max(arrival.pause, arrival.first - topic_state.arrival.last) > topic_state.patience:
+                topic_state.arrival, topic_state.paused = arrival, arrival.first
             else:
-                known.arrival = joined
+                topic_state.arrival = joined
 
     def silent(self, idle: Ns) -> frozenset[str]:
         """Returns the topics that came regularly, and have stopped: for ten periods, 10 s at least.
@@ -569,7 +579,7 @@ class Arrivals:
         """Returns the messages a second of each topic in the newest data; see `silent`."""
         if not self._splits:
             return {}
-        start = min(each.start for each in self._splits)
+        start = min(split.start for split in self._splits)
         duration_s = max(self._newest + idle - start, 1) / NS_PER_S
         counts: dict[str, int] = {}
         for split in self._splits:

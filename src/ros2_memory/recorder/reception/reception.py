@@ -69,8 +69,8 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
             return QueuePlan(depths)
     wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     # One message of each, and shares of what is then left.
-    left, topics = queue_bytes - sum(each.message_bytes for each in flows.values()), len(wanted)
-    for topic in sorted(wanted, key=lambda each: wanted[each] * flows[each].message_bytes):
+    left, topics = queue_bytes - sum(flow.message_bytes for flow in flows.values()), len(wanted)
+    for topic in sorted(wanted, key=lambda name: wanted[name] * flows[name].message_bytes):
         size = flows[topic].message_bytes
         more = min(wanted[topic] - 1, max(0, left) // topics // size)
         depths[topic] = 1 + more
@@ -204,12 +204,12 @@ class Reception:
     def cut_short(self) -> frozenset[str]:
         """The topics whose queues hold less than two seconds, for want of memory."""
         with self._lock:
-            return self._plan().cut_short
+            return self._plan_queues().cut_short
 
     def overrides(self, recording: str) -> str:
         """Returns the QoS overrides for a recording that is about to start."""
         with self._lock:
-            plan = self._plan()
+            plan = self._plan_queues()
             self._recordings[recording] = _Recording(plan)
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
@@ -245,16 +245,17 @@ class Reception:
 
     def flush(self) -> None:
         """Counts what no further split can fill; called when nothing is recorded any more."""
-        self._background.add(_TASK, lambda: self._count(self._losses.flush))
+        self._background.add(_TASK, lambda: self._report_losses(self._losses.flush))
 
     def lost(self, recording: str, topic: str, count: int) -> None:
         """Notes that rosbag2 itself lost messages of a topic in a recording that ends."""
 
         def reported() -> list[Loss]:
-            known = self._recordings.get(recording)
-            return self._losses.reported(topic, *((0, 0) if known is None else known.span), count)
+            state = self._recordings.get(recording)
+            start, stop = (0, 0) if state is None else state.span
+            return self._losses.reported(topic, start, stop, count)
 
-        self._background.add(_TASK, lambda: self._count(reported))
+        self._background.add(_TASK, lambda: self._report_losses(reported))
 
     def lost_in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are known to be missing of the last hour."""
@@ -266,7 +267,7 @@ class Reception:
         with self._lock:
             return self._arrivals.silent(idle), self._arrivals.rates_hz(idle)
 
-    def _count(self, take: Callable[[], list[Loss]]) -> None:
+    def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
             losses = take()
         by_topic: dict[str, int] = {}
@@ -296,32 +297,32 @@ class Reception:
         of a latched topic adapts to those that it finds, until a split shows what they offer.
         """
         with self._lock:
-            known = self._recordings.get(recording)
-            if known is not None:
-                known.refused.add(topic)
+            state = self._recordings.get(recording)
+            if state is not None:
+                state.refused.add(topic)
             self._flows.pop(topic, None)
             self._asked_anew.add(topic)
 
     def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
         """Returns why a recording should be rotated now; None where it need not be."""
         with self._lock:
-            known = self._recordings.get(recording)
-            if known is None:
+            state = self._recordings.get(recording)
+            if state is None:
                 return None
-            again = frozenset(
+            refused = frozenset(
                 topic
-                for topic in known.refused
+                for topic in state.refused
                 if now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
             )
-            if again:
+            if refused:
                 sentence = (
-                    f"a publisher offers weaker QoS than requested on {listed(sorted(again))}: a "
+                    f"a publisher offers weaker QoS than requested on {listed(sorted(refused))}: a "
                     "new recording subscribes again; messages sent by it meanwhile are not recorded"
                 )
-                return Rotation("asking_again", sentence, again, is_fault=True)
+                return Rotation("asking_again", sentence, refused, is_fault=True)
             if self._deepened_s is not None and now_s - self._deepened_s < DEEPEN_EVERY_S:
                 return None
-            active, planned = known.plan, self._plan()
+            active, planned = state.plan, self._plan_queues()
             shallow = frozenset(
                 topic
                 for topic, flow in self._planned_for().items()
@@ -348,7 +349,7 @@ class Reception:
             if not (topic in self._latched and flow.offered.latched)
         }
 
-    def _plan(self) -> QueuePlan:
+    def _plan_queues(self) -> QueuePlan:
         return plan_queues(self._planned_for(), self._queue_bytes)
 
     def _measure(self, recording: str, path: Path) -> None:
@@ -361,22 +362,23 @@ class Reception:
                 self._losses.unclear()
             return
         with self._lock:
-            before = self._plan().cut_short
-            known = self._recordings.get(recording)
+            before = self._plan_queues().cut_short
+            state = self._recordings.get(recording)
             for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
-                if known is None or topic not in known.refused:
-                    old = self._flows.get(topic)
-                    self._flows[topic] = flow if old is None else old.joined(flow)
+                if state is None or topic not in state.refused:
+                    old_flow = self._flows.get(topic)
+                    self._flows[topic] = flow if old_flow is None else old_flow.joined(flow)
                     self._asked_anew.discard(topic)
-            short = self._plan().cut_short - before
+            short = self._plan_queues().cut_short - before
             self._losses.unclear(split.arrivals.keys() - split.progress.keys())
             if recording:
                 self._arrivals.measured(split)
-            if known is not None and split.arrivals:
-                known.span = known.span[0] or split.start, split.end
+            if state is not None and split.arrivals:
+                first, _ = state.span
+                state.span = first or split.start, split.end
         if recording:
-            self._count(lambda: self._losses.measured(recording, split.progress))
+            self._report_losses(lambda: self._losses.measured(recording, split.progress))
         for topic in sorted(short):
             _log.warning(
                 "queue_cut_short",
@@ -391,10 +393,10 @@ def newest_splits(bag_dir: Path) -> list[Path]:
 
     More than one: the last of a run may have been recorded when the robot's nodes had ended.
     """
-    found: list[Path] = []
+    newest: list[Path] = []
     with suppress(OSError):
-        folders = sorted(each for each in bag_dir.iterdir() if has_own_name(each.name))
+        folders = sorted(folder for folder in bag_dir.iterdir() if has_own_name(folder.name))
         for folder in [*filter(is_folder, folders)][-_LOOKED_AT:]:
             splits = sorted(folder.glob("*.mcap"), key=lambda split: split.lstat().st_mtime_ns)
-            found += filter(size_of, splits)
-    return found[-_LOOKED_AT:]
+            newest += filter(size_of, splits)
+    return newest[-_LOOKED_AT:]
