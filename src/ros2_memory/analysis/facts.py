@@ -154,10 +154,12 @@ def is_still(numbers: Floats, error: float = 0.0) -> Flags:
 def _labels(value: JsonValue) -> Iterator[Fact]:
     """Yields the labels of detections, in order, with the best score of each."""
     best: dict[str, float] = {}
-    for each in detections_of(value):
-        score = math.nan if each.score is None else each.score
-        known = best.get(each.label, math.nan)
-        best[each.label] = score if math.isnan(known) or score > known else known
+    for detection in detections_of(value):
+        score = math.nan if detection.score is None else detection.score
+        best_so_far = best.get(detection.label, math.nan)
+        best[detection.label] = (
+            score if math.isnan(best_so_far) or score > best_so_far else best_so_far
+        )
     return ((Word(LABEL, label), score) for label, score in best.items())
 
 
@@ -186,8 +188,8 @@ def _log_entry(value: JsonValue) -> Iterator[Fact]:
 
 
 def _diagnostics(value: JsonValue) -> Iterator[Fact]:
-    for each in _listed(value, "status"):
-        name, level, message = each.get("name"), each.get("level"), each.get("message")
+    for status in _listed(value, "status"):
+        name, level, message = status.get("name"), status.get("level"), status.get("message")
         if not isinstance(level, int):
             continue
         if isinstance(name, str):
@@ -205,8 +207,8 @@ def _error(*parts: JsonValue) -> Word:
 
 
 def _goals(value: JsonValue) -> Iterator[Fact]:
-    for each in _listed(value, "status_list"):
-        status, info = each.get("status"), each.get("goal_info")
+    for goal in _listed(value, "status_list"):
+        status, info = goal.get("status"), goal.get("goal_info")
         goal_id = info.get("goal_id") if isinstance(info, dict) else None
         uuid = goal_id.get("uuid") if isinstance(goal_id, dict) else None
         if isinstance(status, int) and isinstance(uuid, list):
@@ -216,9 +218,9 @@ def _goals(value: JsonValue) -> Iterator[Fact]:
 
 def _listed(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
     listed = value.get(key) if isinstance(value, dict) else None
-    for each in listed if isinstance(listed, list) else ():
-        if isinstance(each, dict):
-            yield each
+    for entry in listed if isinstance(listed, list) else ():
+        if isinstance(entry, dict):
+            yield entry
 
 
 def _charge(value: JsonValue) -> Iterator[Fact]:
@@ -268,14 +270,14 @@ class Facts(NamedTuple):
     words: Sequence[Word]
 
     @classmethod
-    def of(cls, found: Sequence[tuple[int, Fact]]) -> Facts:
+    def of(cls, facts: Sequence[tuple[int, Fact]]) -> Facts:
         """Returns facts, each given with its row."""
-        known: dict[Word, int] = {}
+        code_of: dict[Word, int] = {}
         return cls(
-            np.array([row for row, _ in found], np.int64),
-            np.array([known.setdefault(word, len(known)) for _, (word, _) in found], np.int64),
-            np.array([value for _, (_, value) in found], np.float64),
-            tuple(known),
+            np.array([row for row, _ in facts], np.int64),
+            np.array([code_of.setdefault(word, len(code_of)) for _, (word, _) in facts], np.int64),
+            np.array([value for _, (_, value) in facts], np.float64),
+            tuple(code_of),
         )
 
     def of_kinds(self, kinds: Collection[str]) -> Facts:
@@ -302,15 +304,15 @@ def joined_facts(parts: Sequence[Facts]) -> Facts:
     parts = [part for part in parts if part.rows.size]
     if len(parts) <= 1:
         return parts[0] if parts else NOTHING
-    known: dict[Word, int] = {}
+    code_of: dict[Word, int] = {}
     codes = []
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
+        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
         codes.append(np.array(new, np.int64)[part.codes])
     rows = np.concatenate([part.rows for part in parts])
     order = np.argsort(rows, kind="stable")
     values = np.concatenate([part.values for part in parts])
-    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(known))
+    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(code_of))
 
 
 class Stated(NamedTuple):
@@ -335,14 +337,14 @@ class Stated(NamedTuple):
 
 def stated_by(times: Sequence[Ns], states: Sequence[State | None]) -> Stated:
     """Returns what messages state, one by one; None is one that cannot be decoded."""
-    known = [state for state in states if state is not None]
+    decodable = [state for state in states if state is not None]
     decoded = np.array([state is not None for state in states], np.bool_)
     all_times = np.array(times, np.int64)
     return Stated(
         all_times[decoded],
-        Facts.of([(row, fact) for row, state in enumerate(known) for fact in state.facts]),
+        Facts.of([(row, fact) for row, state in enumerate(decodable) for fact in state.facts]),
         all_times[~decoded],
-        max((state.beyond for state in known), default=0),
+        max((state.beyond for state in decodable), default=0),
     )
 
 

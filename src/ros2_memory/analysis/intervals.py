@@ -111,9 +111,10 @@ class IntervalTable(NamedTuple):
     def spans(self) -> dict[str, tuple[Ints, Ints]]:
         """Returns by label the first and the last time of each of its intervals, in order."""
         rows = _rows(self.rows)
-        of = [rows[rows["label"] == place] for place in range(len(self.labels))]
+        rows_of_label = [rows[rows["label"] == place] for place in range(len(self.labels))]
         return {
-            label: (its["first"], its["last"]) for label, its in zip(self.labels, of, strict=True)
+            label: (its["first"], its["last"])
+            for label, its in zip(self.labels, rows_of_label, strict=True)
         }
 
     def most_lasting(self, at_most: int) -> IntervalTable:
@@ -242,10 +243,10 @@ def united(tables: Sequence[IntervalTable]) -> IntervalTable:
 
 def _merged(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTable:
     """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
-    rows = _rows(b"".join([each.rows for each in tables]))
+    rows = _rows(b"".join([table.rows for table in tables]))
     if not rows.size:
         return IntervalTable()
-    part = np.repeat(np.arange(len(tables)), [each.size for each in tables])
+    part = np.repeat(np.arange(len(tables)), [table.size for table in tables])
     labels, label = _shared_labels(tables, part, rows["label"])
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
@@ -266,30 +267,30 @@ def _continued(rows: Rows, reach: Ints, goes_on: Flags) -> bytes:
     """
     begins = np.flatnonzero(np.append(True, ~goes_on))
     stops = np.append(begins[1:], len(rows)) - 1
-    found = rows[begins]
-    found["last"] = reach[stops]
-    found["count"] = np.add.reduceat(rows["count"], begins)
+    intervals = rows[begins]
+    intervals["last"] = reach[stops]
+    intervals["count"] = np.add.reduceat(rows["count"], begins)
     # Times may be as far apart as any two can be: only those of one interval are subtracted.
     pauses = np.append(0, np.where(goes_on, np.maximum(rows["first"][1:] - reach[:-1], 0), 0))
-    found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
-    found["best"] = np.maximum.reduceat(rows["best"], begins)
-    found["ends"] = rows["ends"][begins] & _FROM_START | rows["ends"][stops] & _TO_END
-    return found[np.lexsort((found["label"], found["first"]))].tobytes()
+    intervals["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
+    intervals["best"] = np.maximum.reduceat(rows["best"], begins)
+    intervals["ends"] = rows["ends"][begins] & _FROM_START | rows["ends"][stops] & _TO_END
+    return intervals[np.lexsort((intervals["label"], intervals["first"]))].tobytes()
 
 
 def _shared_labels(
     tables: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
 ) -> tuple[tuple[str, ...], NDArray[np.intp]]:
     """Returns the labels of all tables, sorted, and for each row the index of its label in them."""
-    labels = tuple(sorted({label for each in tables for label in each.labels}))
+    labels = tuple(sorted({label for table in tables for label in table.labels}))
     place = {label: at for at, label in enumerate(labels)}
     places: list[int] = []
     begins: dict[tuple[str, ...], int] = {}
-    for each in tables:
-        if each.labels not in begins:
-            begins[each.labels] = len(places)
-            places += [place[label] for label in each.labels]
-    begin = np.array([begins[each.labels] for each in tables], np.intp)
+    for table in tables:
+        if table.labels not in begins:
+            begins[table.labels] = len(places)
+            places += [place[label] for label in table.labels]
+    begin = np.array([begins[table.labels] for table in tables], np.intp)
     return labels, np.array(places, np.intp)[begin[part] + label]
 
 

@@ -102,12 +102,12 @@ def joined_poses(parts: Sequence[Poses]) -> Poses:
 
 
 def _joined_frames(parts: Sequence[Frames]) -> Frames:
-    known: dict[str, int] = {}
+    code_of: dict[str, int] = {}
     codes = []
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
+        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
         codes.append(np.array(new, np.uint32)[part.codes])
-    return Frames(np.concatenate(codes), tuple(known))
+    return Frames(np.concatenate(codes), tuple(code_of))
 
 
 def headings(turns: Vectors) -> Floats:

@@ -147,19 +147,19 @@ def silences(
         if (period := usual_period(presence)) is not None
     }
     companions: dict[str, set[str]] = {}
-    for names in {frozenset(periods.keys() & each) for each in together}:
+    for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
             companions.setdefault(topic, set()).update(names)
     on: dict[frozenset[str], list[Span]] = {}
-    found: list[Silence] = []
+    reported: list[Silence] = []
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in on:
-            on[others] = _heard([presences[each].runs for each in sorted(others)])
+            on[others] = _heard([presences[other].runs for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(presences[topic].runs, limit)
-        found += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
-    return sorted(found, key=lambda each: (each.start, each.end, each.topic))
+        reported += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
+    return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
 def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
@@ -214,15 +214,15 @@ def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
     return sum(min(last, until) - max(first, start) for start, until in gaps[begin:end])
 
 
-def _reported(found: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
+def _reported(silences: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
     """Returns those silences of a topic that are not its habit."""
-    if len(found) <= SELDOM:
-        return found
-    lengths = sorted(each.length for each in found)
+    if len(silences) <= SELDOM:
+        return silences
+    lengths = sorted(silence.length for silence in silences)
     heard = sum(last - first for first, last in runs)
     if heard < sum(lengths):
         return ()
-    if heard >= HABIT_NS * len(found):
-        return found
+    if heard >= HABIT_NS * len(silences):
+        return silences
     usual = lengths[(len(lengths) - 1) // 2]
-    return [each for each in found if each.length >= UNUSUAL * usual]
+    return [silence for silence in silences if silence.length >= UNUSUAL * usual]

@@ -72,12 +72,12 @@ def count_messages(
         column = segment.column(topic)
         if column is None:
             continue
-        of, firsts, lasts, messages = column
+        bag_numbers, firsts, lasts, messages = column
         pieces, is_in, is_cut = _told_apart(column, window, edges, shared)
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_cut).tolist():
             # A bag has a row for each type of the topic.
-            to_read.add(segment.bags[of[row]].file)
+            to_read.add(segment.bags[bag_numbers[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     near_those = united(sorted(spans))
     for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
@@ -145,4 +145,4 @@ def _at_positions(
     for time, equal in groupby(there, key=lambda nth: int(times[nth])):
         numbers = {nth - int(np.searchsorted(times, time)) for nth in equal}
         at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
-        yield from (found for nth, found in enumerate(at_once) if nth in numbers)
+        yield from (stored for nth, stored in enumerate(at_once) if nth in numbers)

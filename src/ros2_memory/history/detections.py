@@ -51,12 +51,12 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
     if len(parts) == 1:
         return parts[0]
     log_times, order, places = merged_times([part.log_times for part in parts])
-    found = [
+    detections = [
         part.found._replace(rows=place[part.found.rows])
         for place, part in zip(places, parts, strict=True)
     ]
     times = np.concatenate([part.times for part in parts])[order]
-    return Detected(log_times, times, joined_detections(found))
+    return Detected(log_times, times, joined_detections(detections))
 
 
 class DetectionRows:
@@ -76,45 +76,45 @@ class DetectionRows:
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""
-        found = of_columns(self._view, rows, self._held)
-        return self._decoded(rows) if found is None else joined_detected(found)
+        detected = of_columns(self._view, rows, self._held)
+        return self._decoded(rows) if detected is None else joined_detected(detected)
 
     def _held(self, rows: Rows) -> Detected | None:
         """Returns the detections of some rows; None where their columns leave something open."""
-        known = self._columns.of(rows.table)
-        if known is None:
+        columns = self._columns.of(rows.table)
+        if columns is None:
             return None
-        found, stamps = known
+        detections, stamps = columns
         if rows.index is not None:
-            found = found.at(rows.index)
+            detections = detections.at(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _detected(rows.times, stamps, found)
+        return _detected(rows.times, stamps, detections)
 
     def _decoded(self, rows: Rows) -> Detected:
-        read = [one for found in messages_of(self._view, rows) for one in self._one(found)]
+        read = [row for stored in messages_of(self._view, rows) for row in self._one(stored)]
         # Those of a part come bag after bag, in the order in which bags were stored.
-        read.sort(key=lambda one: one[0])
-        log_times, stamps = (np.array([one[nth] for one in read], np.int64) for nth in (0, 1))
-        return _detected(log_times, stamps, detections_by([one[2] for one in read]))
+        read.sort(key=lambda row: row[0])
+        log_times, stamps = (np.array([row[nth] for row in read], np.int64) for nth in (0, 1))
+        return _detected(log_times, stamps, detections_by([row[2] for row in read]))
 
-    def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
+    def _one(self, stored: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
         """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
-        extractor, message = self._view.extractor, self._view.bags.decode(found)
+        extractor, message = self._view.extractor, self._view.bags.decode(stored)
         if message is None:
             return []
         frame = extractor.frame(message)
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
         detections = [
-            one if one.frame_id else one._replace(frame_id=frame)
-            for one in detections_of(extractor.exact(message, found.type))
+            detection if detection.frame_id else detection._replace(frame_id=frame)
+            for detection in detections_of(extractor.exact(message, stored.type))
         ]
-        return [(found.time, found.time if stamp is None else stamp, detections)]
+        return [(stored.time, stored.time if stamp is None else stamp, detections)]
 
 
-def _detected(log_times: IntArray, stamps: IntArray | None, found: Detections) -> Detected:
+def _detected(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.
         times = np.where(np.abs(stamps - log_times) <= AGREEMENT_NS, stamps, log_times)
-    places = np.rint(found.places * METRES.per_unit) / METRES.per_unit
-    return Detected(log_times, times, found._replace(places=places))
+    places = np.rint(detections.places * METRES.per_unit) / METRES.per_unit
+    return Detected(log_times, times, detections._replace(places=places))

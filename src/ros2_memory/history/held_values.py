@@ -112,11 +112,11 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            found = Held(self._word(message, newest.type), 0, 0, ended=True).exact
-            if isinstance(found, list | dict | None):
-                of = "" if field is None else f"field {field} of "
+            value = Held(self._word(message, newest.type), 0, 0, ended=True).exact
+            if isinstance(value, list | dict | None):
+                of_field = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(
-                    f"{asked}: {of}{topic} ({newest.type}) is no text, number or "
+                    f"{asked}: {of_field}{topic} ({newest.type}) is no text, number or "
                     "boolean, which holds until the next one: ask about a topic that has one, such "
                     "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
                 )
@@ -165,9 +165,9 @@ class HeldValues:
             QueryTimeoutError: the time for reading is over.
         """
         for run in self._runs(TimeWindow(moment, MAX_NS), newest_first=False):
-            found = Held(run.word, run.first, run.last, ended=False)
-            if not found.is_blank:
-                return found
+            held = Held(run.word, run.first, run.last, ended=False)
+            if not held.is_blank:
+                return held
         return None
 
     def _runs(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
@@ -181,7 +181,7 @@ class HeldValues:
             if any(part is None for part in parts):
                 runs = self._read(together, window, newest_first=newest_first)
             else:
-                joined = self._joined([one for part in parts for one in part or ()])
+                joined = self._joined([column for part in parts for column in part or ()])
                 runs = reversed(joined) if newest_first else iter(joined)
             for run in runs:
                 older, newer = (run, waiting) if newest_first else (waiting, run)
@@ -232,12 +232,12 @@ class HeldValues:
         """Yields a run for each message of the times of some rows, one of which may be large."""
         first, last = min(rows.first for rows in together), max(rows.last for rows in together)
         part = window.intersect(TimeWindow(first, last + 1))
-        for found in self._view.stream.messages([self._topic], part, newest_first=newest_first):
-            self._check(found.time)
-            message = self._view.bags.decode(found)
+        for stored in self._view.stream.messages([self._topic], part, newest_first=newest_first):
+            self._check(stored.time)
+            message = self._view.bags.decode(stored)
             if message is not None:
-                word = self._word(message, found.type)
-                yield _Run(word, found.time, found.time)
+                word = self._word(message, stored.type)
+                yield _Run(word, stored.time, stored.time)
 
     def _word(self, message: object, type_name: str) -> str:
         extractor = self._view.extractor

@@ -51,15 +51,17 @@ class MergedStream:
 
         Each with the times of its first and last message of those that reach into the window.
         """
-        found: dict[str, BagSpan] = {}
+        spans: dict[str, BagSpan] = {}
         for topic in topics:
             for bag, first, last in self._timeline.extents(topic, window):
-                known = found.get(bag.file)
+                before = spans.get(bag.file)
                 span = (
-                    (first, last) if known is None else (min(first, known[0]), max(last, known[1]))
+                    (first, last)
+                    if before is None
+                    else (min(first, before[0]), max(last, before[1]))
                 )
-                found[bag.file] = BagSpan(*span, bag)
-        return sorted(found.values(), key=_in_order)
+                spans[bag.file] = BagSpan(*span, bag)
+        return sorted(spans.values(), key=_in_order)
 
     def messages(
         self,
@@ -103,9 +105,9 @@ class MergedStream:
         begin = bisect_right(segments, window.start, key=_begins)
         end = bisect_left(segments, window.stop, begin, key=_begins)
         cuts = [
-            _begins(each)
-            for each in segments[begin:end]
-            if any(topic in each.spans for topic in topics)
+            _begins(segment)
+            for segment in segments[begin:end]
+            if any(topic in segment.spans for topic in topics)
         ]
         edges = [window.start, *dict.fromkeys(cuts), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
@@ -121,18 +123,18 @@ class MergedStream:
         wider = _with_horizon(window)
         bags = self.overlapping_bags(topics, wider) if among is None else among
         spans = bag_overlaps(bags)
-        found: Iterator[StoredMessage]
+        messages: Iterator[StoredMessage]
         if spans:
             merged = self.merged(bags, topics, wider, newest_first=newest_first, since=window.start)
             once = (deduplicate_backward if newest_first else deduplicate_forward)(merged, spans)
-            found = (each for each in once if window.contains(each.time))
+            messages = (message for message in once if window.contains(message.time))
         else:
-            found = self.merged(bags, topics, window, newest_first=newest_first)
+            messages = self.merged(bags, topics, window, newest_first=newest_first)
         if self.may_be_relatched(topics):
-            found = (each for each in found if not self._is_relatched(each))
-        if all(each.bag.state is BagState.CLOSED for each in bags):
-            return found
-        return self.bags.track_sources(found)
+            messages = (message for message in messages if not self._is_relatched(message))
+        if all(span.bag.state is BagState.CLOSED for span in bags):
+            return messages
+        return self.bags.track_sources(messages)
 
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
@@ -141,22 +143,22 @@ class MergedStream:
             for topic in topics
         )
 
-    def find_first_copy(self, found: StoredMessage) -> None:
+    def find_first_copy(self, stored: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        topic, window = found.topic, _since_published(found)
-        if found.record.may_be_relatched and self.may_be_relatched([topic]):
+        topic, window = stored.topic, _since_published(stored)
+        if stored.record.may_be_relatched and self.may_be_relatched([topic]):
             bags = self.overlapping_bags([topic], window)
             copies = self.merged(bags, [topic], window, newest_first=False)
-            key = copy_key(found.record)
-            next((each for each in copies if copy_key(each.record) == key), None)
+            key = copy_key(stored.record)
+            next((copy for copy in copies if copy_key(copy.record) == key), None)
 
-    def _is_relatched(self, found: StoredMessage) -> bool:
-        record = found.record
+    def _is_relatched(self, stored: StoredMessage) -> bool:
+        record = stored.record
         if not record.may_be_relatched:
             return False
-        self._find_first_copies(found)
-        first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
-        return found.time > first[0] and found.bag.recording != first[1]
+        self._find_first_copies(stored)
+        first = self._first_copies.get(copy_key(record), (stored.time, stored.bag.recording))
+        return stored.time > first[0] and stored.bag.recording != first[1]
 
     def _find_first_copies(self, late: StoredMessage) -> None:
         """Records the first reception of every message that a late one may repeat.
@@ -173,8 +175,8 @@ class MergedStream:
         for start, stop in missing:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
-            for each in self.merged(bags, [topic], part, newest_first=False, since=window.start):
-                key, first = copy_key(each.record), (each.time, each.bag.recording)
+            for message in self.merged(bags, [topic], part, newest_first=False, since=window.start):
+                key, first = copy_key(message.record), (message.time, message.bag.recording)
                 self._first_copies[key] = min(first, self._first_copies.get(key, first))
         self._searched[topic] = united([*searched, *missing])
 
@@ -211,16 +213,16 @@ class MergedStream:
                 _, rank, bag = waiting.popleft()
                 source = read(bag)
             else:
-                _, rank, found, source = heapq.heappop(heap)
-                yield found
+                _, rank, stored, source = heapq.heappop(heap)
+                yield stored
             following = next(source, None)
             if following is not None:
                 heapq.heappush(heap, (sign * following.time, rank, following, source))
 
 
-def _since_published(found: StoredMessage) -> TimeWindow:
+def _since_published(stored: StoredMessage) -> TimeWindow:
     """Returns the window in which a late message may have been received before."""
-    return _with_horizon(TimeWindow(found.record.publish_time, found.time + 1))
+    return _with_horizon(TimeWindow(stored.record.publish_time, stored.time + 1))
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:

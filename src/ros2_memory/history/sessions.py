@@ -105,28 +105,28 @@ class Sessions:
         if topics not in self._recordings:
             self._recordings[topics] = self._recordings_with(topics)
         by_folder = self._recordings[topics]
-        every = (by_folder.get(folder, {}) for folder in sorted(session))
-        return {path: span for found in every for path, span in found.items()}
+        held = (by_folder.get(folder, {}) for folder in sorted(session))
+        return {path: span for recordings in held for path, span in recordings.items()}
 
     def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
         """Returns the recordings that hold some topics, by where they were recorded."""
-        found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
+        by_folder: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
         for topic in topics:
             for path, span in self._view.timeline.recordings(topic).items():
-                there = found.setdefault(self.folder(path), {})
+                there = by_folder.setdefault(self.folder(path), {})
                 first, last = there.get(path, span)
                 there[path] = min(first, span[0]), max(last, span[1])
-        return found
+        return by_folder
 
-    def has(self, session: Session, found: StoredMessage) -> bool:
+    def has(self, session: Session, stored: StoredMessage) -> bool:
         """Whether a message is of a session; a carried one that names no recording is of each."""
-        folder = self.folder(found.bag.recording)
+        folder = self.folder(stored.bag.recording)
         if folder != self._carried:
             return folder in session
-        origin = origin_of(found.record.channel)
+        origin = origin_of(stored.record.channel)
         if origin is None or session == {self._carried}:
             return True
-        return any(f"{self._root}/{each}" in session for each in origin.recordings)
+        return any(f"{self._root}/{name}" in session for name in origin.recordings)
 
     def has_all_kinds(self, session: Session) -> bool:
         """Whether a session holds moving and static transforms: then it borrows none."""
@@ -144,12 +144,12 @@ class Sessions:
         """Returns the session of a recording."""
         return self._of(self.folder(recording))
 
-    def are_joined(self, one: Path, other: Path) -> bool:
+    def are_joined(self, first: Path, other: Path) -> bool:
         """Whether two recordings are of one session."""
-        if self.of(one) == self.of(other):
+        if self.of(first) == self.of(other):
             return True
         joined_with = self._view.memory.index.joined_with
-        return other.name in joined_with(one) or one.name in joined_with(other)
+        return other.name in joined_with(first) or first.name in joined_with(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
         """Returns the session whose transforms hold for a message of a recording.
@@ -167,14 +167,16 @@ class Sessions:
         around = self._around(moment)
         if not around:
             return None
-        with_transforms = (each for each in around if self._kinds(each))
-        return [*dict.fromkeys(self._completed(each, moment) for each in with_transforms)]
+        with_transforms = (session for session in around if self._kinds(session))
+        return [*dict.fromkeys(self._completed(session, moment) for session in with_transforms)]
 
     def names(self, session: Session, at: Ns) -> str:
         """Returns the names of a session's recordings at a moment; of all if none went on."""
         recordings = sorted(session - {self._carried})
-        around = [each for each in recordings if each in self._folders_around(at)] or recordings
-        return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
+        around = [
+            folder for folder in recordings if folder in self._folders_around(at)
+        ] or recordings
+        return " and ".join(folder.rpartition("/")[2] for folder in around) or "deleted recordings"
 
     def parts_of(self, session: Session) -> tuple[Session, ...]:
         """Returns the two sessions that were joined by lending into this one; none if it is one."""
@@ -183,39 +185,40 @@ class Sessions:
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
         spans = [span for by_folder in self._recorded.kinds for span in by_folder.items()]
-        near = sorted(spans, key=lambda each: (_distance(each[1], moment), each[0]))
+        near = sorted(spans, key=lambda spanned: (_distance(spanned[1], moment), spanned[0]))
         return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
 
-    def _completed(self, own: Session, at: Ns) -> Session:
+    def _completed(self, session: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
-        kinds = self._kinds(own)
-        if self.has_all_kinds(own) or self._are_two_robots(at):
-            return own if kinds else frozenset()
-        beside = [each for each in self._around(at) if each != own and self._kinds(each)]
+        kinds = self._kinds(session)
+        if self.has_all_kinds(session) or self._are_two_robots(at):
+            return session if kinds else frozenset()
+        beside = [other for other in self._around(at) if other != session and self._kinds(other)]
         if kinds:
-            partners = [each for each in beside if self._complement(own, each)]
+            partners = [other for other in beside if self._complement(session, other)]
         else:
-            partners = [*dict.fromkeys(self._completed(each, at) for each in beside)]
+            partners = [*dict.fromkeys(self._completed(other, at) for other in beside)]
         if len(partners) == 1:
-            completed = own | partners[0]
-            self._parts[completed] = own, partners[0]
+            completed = session | partners[0]
+            self._parts[completed] = session, partners[0]
             return completed
-        return own if kinds else frozenset()
+        return session if kinds else frozenset()
 
     def _are_two_robots(self, at: Ns) -> bool:
         """Whether two sessions near a moment hold poses of the same time."""
-        near = [each for each in self._recorded.poses if _distance(each[1], at) <= _AROUND_NS]
+        near = [
+            spanned for spanned in self._recorded.poses if _distance(spanned[1], at) <= _AROUND_NS
+        ]
         return any(
-            max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
-            for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
+            max(first, begin) <= min(last, end) and self._of(first_folder) != self._of(other)
+            for (first_folder, (first, last)), (other, (begin, end)) in combinations(near, 2)
         )
 
-    def _complement(self, one: Session, other: Session) -> bool:
+    def _complement(self, first: Session, other: Session) -> bool:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
-        if self._kinds(one) & self._kinds(other):
+        if self._kinds(first) & self._kinds(other):
             return False
-        frames_of_one, of_other = (self._children(self._view, each) for each in (one, other))
-        return not frames_of_one & of_other
+        return self._children(self._view, first).isdisjoint(self._children(self._view, other))
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
@@ -257,15 +260,15 @@ class Sessions:
         return _Recorded(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
             [*self._spans_of((pose_topic,)).items()],
-            {folder: frozenset(each | {self._carried}) for folder, each in chains.items()},
+            {folder: frozenset(linked | {self._carried}) for folder, linked in chains.items()},
         )
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     """Returns, by node of an undirected graph, all that are connected with it, itself included."""
     component: dict[str, set[str]] = {}
-    for one, other in pairs:
-        ends = [component.setdefault(node, {node}) for node in (one, other)]
+    for first, other in pairs:
+        ends = [component.setdefault(node, {node}) for node in (first, other)]
         small, large = sorted(ends, key=len)
         if small is not large:
             large |= small

@@ -91,9 +91,9 @@ def driven_inside(
     inside = robot_inside(track, region.region, window)
     totals = totals_inside(way.line, inside)
     waypoints = way_inside(way.line, inside, max_waypoints)
-    waypoints = tuple(_as_turned(view, name, way.line, each) for each in waypoints)
+    waypoints = tuple(_as_turned(view, name, way.line, waypoint) for waypoint in waypoints)
     elapsed = elapsed_in(view, window)
-    spans = [(each.start, each.stop) for each in inside]
+    spans = [(stay.start, stay.stop) for stay in inside]
     duration = elapsed.among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
@@ -165,8 +165,8 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     if not spans:
         return ()
     inside = stacked([_part(line, span) for span in spans])
-    found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
-    return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
+    waypoints, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
+    return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 
 def _as_turned(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
@@ -214,8 +214,10 @@ def farthest_from(
     place = parse_where(view.limits, value, 1.0, _FARTHEST_FROM)
     if place.several:
         raise InvalidArgumentsError(f"{_FARTHEST_FROM} has several places; give one, or x and y")
-    if topic != (known := resolve_path_topic(view)):
-        raise InvalidArgumentsError(f"{_FARTHEST_FROM} is measured along {known}: leave out topic")
+    if topic != (robot_topic := resolve_path_topic(view)):
+        raise InvalidArgumentsError(
+            f"{_FARTHEST_FROM} is measured along {robot_topic}: leave out topic"
+        )
     frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
     min_x, max_x, min_y, max_y = place.region.bounds
     x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
@@ -250,11 +252,11 @@ def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Fl
 
     Without those that the robot jumped to and from.
     """
-    found = []
+    points = []
     for first, last in spans:
         part = cut(track, TimeWindow(first, last + 1))
         jumped = jumps(part)
         fine = ~(jumped & np.roll(jumped, 1))
-        found.append((part.times[fine], part.x[fine], part.y[fine]))
-    times, x, y = (np.concatenate(column) for column in zip(*found, strict=True))
+        points.append((part.times[fine], part.x[fine], part.y[fine]))
+    times, x, y = (np.concatenate(column) for column in zip(*points, strict=True))
     return times, x, y

@@ -378,8 +378,8 @@ def measured_path(times: Times, positions: Rows, fastest_mps: float) -> Measured
             _poses(times, positions, index + 1, index + 2 + _NEARBY),
         )
         # Too few poses do not show what is usual.
-        known = sum(map(len, sides)) >= _NEARBY
-        near = _motion_of(sides[0]).or_more(_motion_of(sides[1])) if known else None
+        are_enough = sum(map(len, sides)) >= _NEARBY
+        near = _motion_of(sides[0]).or_more(_motion_of(sides[1])) if are_enough else None
         here, there = sides[0][-1], sides[1][0]
         before = motion.totals.newest
         usual_ns = _usual_ns(apart, index, None if before is None else before.period_ns)
@@ -404,8 +404,8 @@ def _odd_steps(apart: Times, steps_m: Numbers, fastest_mps: float) -> list[int]:
         np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
     )
     odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
-    found: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
-    return found
+    steps: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
+    return steps
 
 
 def _poses(times: Times, positions: Rows, begin: int, end: int) -> list[TimedPosition]:
@@ -430,18 +430,18 @@ class Motion:
     def add_leg(self, times: Times, positions: Rows) -> Numbers:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
-        found = measured((times - times[0]) / NS_PER_S, positions)
+        piece = measured((times - times[0]) / NS_PER_S, positions)
         ends = (
             _poses(times, positions, 0, _NEARBY + 1),
             _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times)),
         )
         period_ns = int(np.median(apart)) if len(apart) else None
         near = _motion_of(ends[0]), _motion_of(ends[1])
-        leg = Leg(ends[0][0], ends[1][-1], len(times), period_ns, *found[:5], *near)
+        leg = Leg(ends[0][0], ends[1][-1], len(times), period_ns, *piece[:5], *near)
         if len(times) <= SPEED_STEPS:
             self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(ends[0])), 0.0)
-        self._go_on(None, leg, found.speed_mps)
-        return found.steps_m
+        self._go_on(None, leg, piece.speed_mps)
+        return piece.steps_m
 
     def join(self, later: MotionTotals) -> bool:
         """Takes the legs that come next; returns whether a jump or reset led there."""
@@ -471,7 +471,11 @@ class Motion:
             totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
         kind: Link | None = None
         if before is not None:
-            periods = [each for each in (before.period_ns, leg.period_ns) if each is not None]
+            periods = [
+                period_ns
+                for period_ns in (before.period_ns, leg.period_ns)
+                if period_ns is not None
+            ]
             near = None
             if before.poses + leg.poses >= _NEARBY:
                 near = before.near_last.or_more(leg.near_first)
@@ -527,8 +531,8 @@ def _step_mps(step: tuple[TimedPosition, TimedPosition]) -> float:
 def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
     """Returns the usual time between poses around an interval, which itself counts least."""
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
-    own = near.pop(min(index, _NEARBY))
-    return median_low(near or [known or own])
+    own_ns = near.pop(min(index, _NEARBY))
+    return median_low(near or [known or own_ns])
 
 
 def are_places(positions: Rows) -> Marks:

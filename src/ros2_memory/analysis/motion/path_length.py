@@ -247,9 +247,9 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
     lengths[as_plain] = plain[as_plain]
     # A wide slope beside a sudden start counts part of the steps after it, which count already.
     for begin, end in _rows(~as_plain):
-        most, found = plain[begin:end].sum(), lengths[begin:end].sum()
-        if found > most:
-            lengths[begin:end] *= most / found
+        most, summed = plain[begin:end].sum(), lengths[begin:end].sum()
+        if summed > most:
+            lengths[begin:end] *= most / summed
     return lengths, as_plain, unsettled & (energy < _STATIONARY * share)
 
 
@@ -292,15 +292,15 @@ def _rows(marks: Marks) -> Iterator[tuple[int, int]]:
 
 def _creep(places: Rows, reach: Numbers, origin: Vector3) -> Creep:
     """Returns which of the places a robot left: was farther from than its noise explains."""
-    found = [0]
+    left_at = [0]
     while True:
-        at = found[-1]
+        at = left_at[-1]
         off = np.sqrt(row_sums((places[at:] - places[at]) ** 2)) > reach[at:]
         if not off.any():
             break
-        found.append(at + int(off.argmax()))
+        left_at.append(at + int(off.argmax()))
     x, y, z = origin
-    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[found]]
+    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[left_at]]
     middle_m = math.fsum(distance(here, there) for here, there in pairwise(left[1:]))
     second = left[1] if len(left) > 1 else None
     return Creep(left[0], second, middle_m, left[-1], float(reach.max()))

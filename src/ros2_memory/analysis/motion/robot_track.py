@@ -184,12 +184,12 @@ def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, 
 
     With the number of the recording of each vertex. All at once: a week has thousands of them.
     """
-    every = [part for parts in recordings for part in parts]
-    if not every:
+    parts_in_order = [part for parts in recordings for part in parts]
+    if not parts_in_order:
         times, none = np.zeros(0, np.int64), np.zeros(0)
         return track_part(times, none, none, none), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
-    whole, numbers = united_parts(every), np.repeat(np.arange(len(recordings)), sizes)
+    whole, numbers = united_parts(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
@@ -236,9 +236,9 @@ def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.int
         off = np.maximum(off, away * away)
         first = np.flatnonzero(np.append([True], after[1:] != after[:-1]))
         worst = np.maximum.reduceat(off, first)
-        each = np.repeat(worst, np.diff(first, append=waiting.size))
-        is_bent = each > TOLERANCE_M * TOLERANCE_M
-        splits = np.flatnonzero(is_bent & (off == each))
+        worst_here = np.repeat(worst, np.diff(first, append=waiting.size))
+        is_bent = worst_here > TOLERANCE_M * TOLERANCE_M
+        splits = np.flatnonzero(is_bent & (off == worst_here))
         of_step = after[splits]
         splits = splits[np.append([True], of_step[1:] != of_step[:-1])[: splits.size]]
         kept[waiting[splits]] = True
