@@ -137,9 +137,9 @@ def topic_value(
     A latched topic has no tolerance unless one is given: its newest message holds.
     """
     view, at, now = open_moment(memory, call, moment)
-    stored = _found_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
-    value = _value(view, stored, fields, now)
-    return _held(view, value, stored, at)
+    stored = _newest_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
+    value = _as_value(view, stored, fields, now)
+    return _with_latched_age(view, value, stored, at)
 
 
 def topic_range(
@@ -158,7 +158,7 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    chosen = _each_shown(view, picked, fields)
+    chosen = _show_each(view, picked, fields)
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -195,7 +195,7 @@ def position(
     if body is not None:
         return _position_of_body(view, body, (at, tolerance_s, moment.rest_s), now, frame_id)
     _require_kind(view, name, "position", "geodetic")
-    stored = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     return _position_in(view, stored, at, now, frame_id)
 
 
@@ -204,7 +204,7 @@ def _position_in(
 ) -> results.Position:
     """Returns the pose in a message, as that of a moment; see `position`."""
     memory, name = view.memory, stored.topic
-    _note_held(view, stored, at)
+    _note_latched(view, stored, at)
     message, type_name = decode(view, stored), stored.type
     pose, geodetic = memory.extractor.pose(message, type_name), None
     if pose is None:
@@ -263,7 +263,7 @@ def _position_of_body(
         NoDataError: none places it at the moment that is asked, or within the tolerance before.
     """
     limits, extractor = view.limits, view.extractor
-    window, tolerance = _within(view, *asked)
+    window, tolerance = _window_before(view, *asked)
     of_body = newest_of_body(view, body, window, frame_id)
     if of_body is None:
         raise _not_placed(view, body, asked[0], tolerance, frame_id)
@@ -307,8 +307,8 @@ def velocity(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
-    stored = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
-    _note_held(view, stored, at)
+    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    _note_latched(view, stored, at)
     twist = memory.extractor.twist(decode(view, stored), stored.type)
     if twist is None:
         raise InvalidArgumentsError(describe_lack(view, "velocity", stored))
@@ -359,7 +359,7 @@ def find_last_match(
     of a score below `min_score` do not count.
     """
     now = memory.clock.now()
-    until = _before(before_s)
+    until = _search_end(before_s)
 
     def newest(view: View) -> results.Match:
         condition = condition_of(
@@ -373,7 +373,7 @@ def find_last_match(
             notes = _notes_on_never(view, search, until, condition, min_score)
             return results.Match(None, notes=notes)
         note_robots_near(view, stored)
-        note_unread(view, _searched(view, stored, until, now), search=True)
+        note_unread(view, _searched_window(view, stored, until, now), search=True)
         # What the view shows may be some days of long ago.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
@@ -381,7 +381,7 @@ def find_last_match(
         if is_future:
             after = seconds(stored.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-        value_found = _value(view, stored, fields, None if is_future else counted_from)
+        value_found = _as_value(view, stored, fields, None if is_future else counted_from)
         return results.Match(value_found, notes=view.notes.sentences())
 
     reach = min(now, until)
@@ -407,7 +407,7 @@ def value_when(
     With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
     of a score below `min_score` do not count.
     """
-    now, until = memory.clock.now(), _before(before_s)
+    now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
 
@@ -422,9 +422,9 @@ def value_when(
         if match is None:
             notes = _notes_on_never(view, search, until, condition, min_score)
             return results.ValueWhen(None, notes=notes)
-        note_unread(view, _searched(view, match, until, now), search=True)
+        note_unread(view, _searched_window(view, match, until, now), search=True)
         note_robots_near(view, match)
-        matched = _value(view, match, (), None)
+        matched = _as_value(view, match, (), None)
         upto = TimeWindow.until(match.time)
         held = _newest_beside(view, name, upto, match)
         read = upto if held is None else replace(upto, start=held.time)
@@ -436,7 +436,7 @@ def value_when(
         latched = memory.limits.latching.holds(view.snapshot, held)
         if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
             view.notes.add(f"the value is {seconds(distance)} older than the match")
-        held_value = _held(view, _value(view, held, fields, None), held, match.time)
+        held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
         return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
 
     return _going_back(view, now, newest, lambda value: value.matched is not None)
@@ -600,7 +600,7 @@ def trajectory_summary(
     )
 
 
-def _searched(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
+def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
     """Returns what a search went through to reach its match, as far as there can be messages."""
     stop = until if view.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(stored.time, max(stop, stored.time + 1))
@@ -663,14 +663,14 @@ def _notes_on_never(
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 
 
-def _before(before_s: float | None) -> Ns:
+def _search_end(before_s: float | None) -> Ns:
     """Returns the end of a search: just after a moment, with the slack of a float of seconds."""
     if before_s is None:
         return MAX_NS
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
-def _found_at(
+def _newest_at(
     view: View,
     topic: str,
     at: Ns,
@@ -685,12 +685,14 @@ def _found_at(
         NoDataError: there is none within the tolerance.
     """
     limits = view.limits
-    window, tolerance = _within(view, at, tolerance_s, rest_s)
+    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
     stored = view.stream.newest(topic, window)
     if stored is None and tolerance_s is None and is_pose:
         before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
         stored = view.stream.newest(topic, before)
-        if stored is not None and not (is_thinned(stored.bag.file) and _holds(view, stored)):
+        if stored is not None and not (
+            is_thinned(stored.bag.file) and _holds_until_next(view, stored)
+        ):
             stored = None
     if stored is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
         stored = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
@@ -705,13 +707,13 @@ def _found_at(
     return stored
 
 
-def _holds(view: View, stored: StoredMessage) -> bool:
+def _holds_until_next(view: View, stored: StoredMessage) -> bool:
     """Whether a pose of a thinned day holds until the next: farther apart none was recorded."""
     window = TimeWindow(stored.time + 1, stored.time + _THINNED_POSES_NS)
     return view.stream.first([stored.record.channel.topic], window) is not None
 
 
-def _within(
+def _window_before(
     view: View, at: Ns, tolerance_s: float | None, rest_s: float
 ) -> tuple[TimeWindow, Ns | None]:
     """Returns when a message is near enough before a moment, and the tolerance; None for any."""
@@ -741,7 +743,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
         raise InvalidArgumentsError(describe_lack(view, what, newest))
 
 
-def _held(
+def _with_latched_age(
     view: View, value: results.TopicValue, stored: StoredMessage, at: Ns
 ) -> results.TopicValue:
     """Returns a value with whether it is latched, and then how old it is."""
@@ -751,7 +753,7 @@ def _held(
     return replace(value, latched=True, age=age)
 
 
-def _note_held(view: View, stored: StoredMessage, at: Ns) -> None:
+def _note_latched(view: View, stored: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
     if view.limits.latching.holds(view.snapshot, stored):
         topic = stored.topic
@@ -761,18 +763,20 @@ def _note_held(view: View, stored: StoredMessage, at: Ns) -> None:
         )
 
 
-def _decoded(view: View, stored: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
+def _decode_shown(
+    view: View, stored: StoredMessage, fields: Sequence[str]
+) -> tuple[object, Extracted]:
     """Returns a message, and as a reply shows it, with the notes on that message alone."""
     with view.call.stages.timed("extract"):
         message = decode(view, stored)
         return message, view.extractor.shown(message, stored.type, fields)
 
 
-def _value(
+def _as_value(
     view: View, stored: StoredMessage, fields: Sequence[str], now: Ns | None
 ) -> results.TopicValue:
     """Returns a message as a reply shows it, with all notes of the view so far."""
-    message, shown = _decoded(view, stored, fields)
+    message, shown = _decode_shown(view, stored, fields)
     channel = stored.record.channel
     return results.TopicValue(
         channel.topic,
@@ -793,13 +797,13 @@ class _Shown(NamedTuple):
     failure: str = ""
 
 
-def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
+def _show_each(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
     """Returns messages as a reply shows them. None is in memory when the next one is read."""
     shown: list[_Shown] = []
     for message in picked:
         type_name = message.type
         try:
-            shown.append(_Shown(message.time, type_name, _decoded(view, message, fields)[1]))
+            shown.append(_Shown(message.time, type_name, _decode_shown(view, message, fields)[1]))
         except NoDataError as error:
             shown.append(_Shown(message.time, type_name, None, error.detail))
         del message

@@ -351,7 +351,7 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
     """
     nodes: list[JsonValue] = [value]
     for segment in dot_path.split("."):
-        nodes = [target for node in nodes for target in _step(node, segment)]
+        nodes = [target for node in nodes for target in _descend(node, segment)]
     return nodes
 
 
@@ -449,7 +449,7 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
+def _descend(node: JsonValue, segment: str) -> Iterator[JsonValue]:
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]
@@ -460,7 +460,7 @@ def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
                 yield node[index]
         else:
             for element in node:
-                yield from _step(element, segment)
+                yield from _descend(element, segment)
 
 
 def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:

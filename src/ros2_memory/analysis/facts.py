@@ -188,7 +188,7 @@ def _log_entry(value: JsonValue) -> Iterator[Fact]:
 
 
 def _diagnostics(value: JsonValue) -> Iterator[Fact]:
-    for status in _listed(value, "status"):
+    for status in _entries(value, "status"):
         name, level, message = status.get("name"), status.get("level"), status.get("message")
         if not isinstance(level, int):
             continue
@@ -207,7 +207,7 @@ def _error(*parts: JsonValue) -> Word:
 
 
 def _goals(value: JsonValue) -> Iterator[Fact]:
-    for goal in _listed(value, "status_list"):
+    for goal in _entries(value, "status_list"):
         status, info = goal.get("status"), goal.get("goal_info")
         goal_id = info.get("goal_id") if isinstance(info, dict) else None
         uuid = goal_id.get("uuid") if isinstance(goal_id, dict) else None
@@ -216,7 +216,7 @@ def _goals(value: JsonValue) -> Iterator[Fact]:
             yield Word(GOAL, "".join(f"{part:02x}" for part in parts)), status
 
 
-def _listed(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
+def _entries(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
     listed = value.get(key) if isinstance(value, dict) else None
     for entry in listed if isinstance(listed, list) else ():
         if isinstance(entry, dict):
@@ -283,16 +283,16 @@ class Facts(NamedTuple):
     def of_kinds(self, kinds: Collection[str]) -> Facts:
         """Returns those of some kinds."""
         wanted = np.array([word.kind in kinds for word in self.words], np.bool_)
-        return self if wanted.all() else self._chosen(wanted[self.codes])
+        return self if wanted.all() else self._where(wanted[self.codes])
 
     def at(self, rows: Ints) -> Facts:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
         place = np.searchsorted(rows, self.rows)
         kept = place < rows.size
         kept[kept] = rows[place[kept]] == self.rows[kept]
-        return self._replace(rows=place)._chosen(kept)
+        return self._replace(rows=place)._where(kept)
 
-    def _chosen(self, kept: Flags) -> Facts:
+    def _where(self, kept: Flags) -> Facts:
         return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)
 
 

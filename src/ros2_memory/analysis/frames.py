@@ -70,7 +70,7 @@ Localisers date transforms up to a second ahead, and a robot's last second is no
 _MAX_NAMES: Final = 12
 
 
-class Poses(NamedTuple):
+class FramePoses(NamedTuple):
     """Poses of a frame in another at some times; numbers are only meaningful where `valid`."""
 
     translation: Vectors
@@ -180,7 +180,7 @@ class _History:
         self._rotation = joined.rotation[rows]
         self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
 
-    def at(self, times: Times, hold_ns: Ns) -> Poses:
+    def at(self, times: Times, hold_ns: Ns) -> FramePoses:
         """Returns the transforms at some times; beyond those that are known, for so long."""
         before, after, ratio, valid = self._bracket(times, hold_ns)
         x, y, z = self._translation[before].T
@@ -189,7 +189,7 @@ class _History:
         qx, qy, qz, qw = self._rotation[before].T
         to_qx, to_qy, to_qz, to_qw = self._rotation[after].T
         turned = slerp((qx, qy, qz, qw), (to_qx, to_qy, to_qz, to_qw), ratio)
-        return Poses(moved, turned, valid)
+        return FramePoses(moved, turned, valid)
 
     def parents_at(self, times: Times, hold_ns: Ns) -> Times:
         """Returns which of the parents the child is in at some times, by their numbers."""
@@ -255,7 +255,7 @@ class _Bracket(NamedTuple):
     valid: Mask
 
 
-class Frames:
+class FrameTree:
     """Looks frames up in a target frame by the transforms of one session.
 
     Args:
@@ -297,7 +297,7 @@ class Frames:
         """Returns whether transforms connect a frame with the target, at whatever time."""
         return frame.lstrip("/") in connected_with(self.target, self._pairs)
 
-    def poses(self, frame: str, times: Times) -> Poses | None:
+    def poses(self, frame: str, times: Times) -> FramePoses | None:
         """Returns the poses of a frame in the target at some times.
 
         Composed along the tree through their common ancestor, in either direction. None where no
@@ -305,7 +305,7 @@ class Frames:
         """
         name = frame.lstrip("/")
         is_known = name == self.target or self.reaches(name)
-        return self._poses(name, times) if is_known else None
+        return self._compose(name, times) if is_known else None
 
     def lookup(self, frame: str, time: Ns) -> Transform:
         """Returns the pose of a frame in the target at one time (tf2: source and target).
@@ -317,15 +317,15 @@ class Frames:
         frames = {name for pair in self._pairs for name in pair}
         for named in (self.target, name):
             if named not in frames:
-                raise _unknown(named, sorted(frames))
+                raise _unknown_frame(named, sorted(frames))
         # Of damaged bags, times may be centuries apart: they wrap, and are not near.
         with np.errstate(over="ignore"):
-            pose = self._poses(name, np.array(time, np.int64))
+            pose = self._compose(name, np.array(time, np.int64))
             if not pose.valid:
-                raise self._nothing_at(name, time)
+                raise self._no_path_at(name, time)
         return pose.at()
 
-    def _poses(self, name: str, times: Times) -> Poses:
+    def _compose(self, name: str, times: Times) -> FramePoses:
         poses = _identity(times, valid=False)
         waiting = [np.arange(times.size).reshape(times.shape)]
         for rows in waiting:
@@ -333,11 +333,11 @@ class Frames:
             up, down = self._chain(name, then), self._chain(self.target, then)
             common = next((frame for frame in up if frame in down), None)
             if common is None:
-                waiting += self._apart(rows, then, (*up, *down))
+                waiting += self._split_by_parent(rows, then, (*up, *down))
                 continue
-            part = self._below(common, up, then)
+            part = self._pose_in_ancestor(common, up, then)
             if common != self.target:
-                part = _composed(_inverted(self._below(common, down, then)), part)
+                part = _product(_inverted(self._pose_in_ancestor(common, down, then)), part)
             if rows.shape == times.shape:
                 return part
             for whole, part_column in zip(
@@ -356,7 +356,7 @@ class Frames:
             chain[frame] = None
         return chain
 
-    def _apart(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
+    def _split_by_parent(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
         """Returns rows of times apart in which the first frame that has several parents has one."""
         for frame in frames:
             if len(self._parents_at(frame, times)) > 1:
@@ -364,11 +364,11 @@ class Frames:
                 return [rows[numbers == number] for number in np.unique(numbers)]
         return []
 
-    def _below(self, ancestor: str, chain: Iterable[str], times: Times) -> Poses:
+    def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
         """Returns the pose of the first frame of a chain in one of the frames above it."""
         below = takewhile(lambda frame: frame != ancestor, chain)
         steps = [self._histories[frame].at(times, self._hold_ns) for frame in below]
-        return reduce(_composed, reversed(steps)) if steps else _identity(times)
+        return reduce(_product, reversed(steps)) if steps else _identity(times)
 
     def _parents_at(self, child: str, times: Times) -> Sequence[str]:
         """Returns the parents that a frame has at some times; none, if it is a root."""
@@ -386,12 +386,12 @@ class Frames:
             self._histories[child] = _History(child, moving, static, self.clock)
         return self._histories.get(child)
 
-    def _nothing_at(self, name: str, time: Ns) -> NoDataError:
+    def _no_path_at(self, name: str, time: Ns) -> NoDataError:
         """Returns why there is no transform at a time, though both frames are known."""
         tree = connected_with(self.target, self._pairs)
         if name in tree:
             for frame in (name, self.target):
-                lacking = self._lacking(frame, time)
+                lacking = self._missing_link(frame, time)
                 if lacking is not None:
                     return lacking
         roots = self._root_of(self.target), self._root_of(name)
@@ -411,7 +411,7 @@ class Frames:
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
-    def _lacking(self, frame: str, time: Ns) -> NoDataError | None:
+    def _missing_link(self, frame: str, time: Ns) -> NoDataError | None:
         """Returns why a walk from a frame up to its root ends at a time; None if it does not."""
         at = np.array(time, np.int64)
         for above in self._chain(frame, at):
@@ -490,23 +490,23 @@ def unit_quaternions(rotations: Floats) -> Floats:
     return units
 
 
-def _identity(times: Times, *, valid: bool = True) -> Poses:
+def _identity(times: Times, *, valid: bool = True) -> FramePoses:
     x, y, z, qx, qy, qz = np.zeros((6, *times.shape))
-    return Poses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
+    return FramePoses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
 
 
-def _composed(a: Poses, b: Poses) -> Poses:
-    return Poses(a.points(b.translation), multiply(a.rotation, b.rotation), a.valid & b.valid)
+def _product(a: FramePoses, b: FramePoses) -> FramePoses:
+    return FramePoses(a.points(b.translation), multiply(a.rotation, b.rotation), a.valid & b.valid)
 
 
-def _inverted(poses: Poses) -> Poses:
+def _inverted(poses: FramePoses) -> FramePoses:
     x, y, z, w = poses.rotation
     back = (-x, -y, -z, w)
     tx, ty, tz = rotate(back, poses.translation)
-    return Poses((-tx, -ty, -tz), back, poses.valid)
+    return FramePoses((-tx, -ty, -tz), back, poses.valid)
 
 
-def _unknown(name: str, frames: Sequence[str]) -> NoDataError:
+def _unknown_frame(name: str, frames: Sequence[str]) -> NoDataError:
     if not frames:
         detail = f"frame '{name}' is unknown: no transforms are recorded there"
     elif similar := _similar(name, frames):

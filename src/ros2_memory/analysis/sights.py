@@ -144,7 +144,7 @@ TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
 
 
-class Seen(NamedTuple):
+class DetectorMessages(NamedTuple):
     """What the messages of a detector have, in order of log time, in one frame.
 
     Attributes:
@@ -248,12 +248,12 @@ class _Detections:
     is_placed: Flags
 
 
-def sights_of(topic: str, seen: Seen) -> Sights:
+def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     """Returns the sights of the messages of one topic."""
     slices = seen.times // SLICE_NS
     look, looks = _looks(seen, slices)
     detections, labels = _detections(seen, slices)
-    group, together = _groups(detections)
+    group, together = _label_groups(detections)
     near = np.flatnonzero(detections.is_placed)
     near = near[np.argsort(group[near], kind="stable")]
     cluster = np.full(len(detections.message), -1, np.int64)
@@ -263,7 +263,7 @@ def sights_of(topic: str, seen: Seen) -> Sights:
     lost, kept = rows_of(detections, cluster < 0), rows_of(detections, cluster >= 0)
     _, spot = distinct_rows((group[cluster >= 0], cluster[cluster >= 0]))
     scored = ~np.isnan(kept.score)
-    which, other = _beside(kept)
+    which, other = _labels_beside(kept)
     tables = (
         _spots(kept, spot, seen.times, together[group[cluster >= 0]]),
         looks,
@@ -290,7 +290,7 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
     return np.stack(columns, axis=1)
 
 
-def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
+def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
     placed = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
     x, y, yaw = seen.robot[placed].T
@@ -307,7 +307,7 @@ def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
     return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
 
 
-def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
+def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
     # Those that none has are of other messages, which may be forgotten.
     used = np.unique(seen.labels).tolist()
@@ -328,7 +328,7 @@ def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]
     return detections, tuple(names)
 
 
-def _groups(detections: _Detections) -> tuple[Ints, Ints]:
+def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
     """Returns the slice and label of each detection, numbered, and how many are seen at once.
 
     That is how many of the label at least three messages of the slice have, or all.
@@ -364,11 +364,11 @@ def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
         begin, end = np.searchsorted(group, (which, which + 1)).tolist()
         of_group = slice(begin, end)
         places = [*zip(x[of_group].tolist(), y[of_group].tolist(), strict=True)]
-        spots[of_group] = _grown(message[of_group].tolist(), places)
+        spots[of_group] = _cluster_label(message[of_group].tolist(), places)
     return spots
 
 
-class _Growing:
+class _GrowingSpot:
     """A spot while it grows; `x` and `y` are its mean (mm)."""
 
     __slots__ = ("n", "sum_x", "sum_y", "x", "y")
@@ -388,21 +388,21 @@ class _Growing:
         return dx * dx + dy * dy
 
 
-def _grown(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
+def _cluster_label(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
     """Returns the spot of each detection of one label, which are ordered by message."""
-    spots: list[_Growing] = []
+    spots: list[_GrowingSpot] = []
     together: dict[tuple[int, int], int] = {}
     assigned: list[int] = []
     for _, in_message in groupby(range(len(messages)), key=messages.__getitem__):
-        chosen = _assigned(spots, [places[nth] for nth in in_message])
+        chosen = _assign(spots, [places[nth] for nth in in_message])
         assigned += chosen
         for pair in combinations(sorted(spot for spot in chosen if spot >= 0), 2):
             together[pair] = together.get(pair, 0) + 1
-    into = _merged(spots, together)
+    into = _merge_spots(spots, together)
     return [spot if spot < 0 else into[spot] for spot in assigned]
 
 
-def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[int]:
+def _assign(spots: list[_GrowingSpot], places: Sequence[tuple[int, int]]) -> list[int]:
     """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
     pairs = sorted(
         (squared, nth, which)
@@ -419,14 +419,16 @@ def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[
         which = taken.get(nth, -1)
         if which < 0 and len(spots) < _MAX_SPOTS:
             which = len(spots)
-            spots.append(_Growing())
+            spots.append(_GrowingSpot())
         if which >= 0:
             spots[which].add(1, *place)
         chosen.append(which)
     return chosen
 
 
-def _merged(spots: Sequence[_Growing], together: Mapping[tuple[int, int], int]) -> list[int]:
+def _merge_spots(
+    spots: Sequence[_GrowingSpot], together: Mapping[tuple[int, int], int]
+) -> list[int]:
     """Returns into which spot each goes: those that lie together, and no messages have both of."""
     into = [*range(len(spots))]
     for first, other in combinations(range(len(spots)), 2):
@@ -464,7 +466,7 @@ def _unplaced(lost: _Detections, times: Ints) -> Ints:
     return np.stack((rows[:, 0], topic, rows[:, 1], by.sizes, first, last), axis=1)
 
 
-def _beside(detections: _Detections) -> tuple[Ints, Ints]:
+def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
     """Returns detections and another label that is beside each, each pair once."""
     counts = np.bincount(detections.message)
     few = np.flatnonzero(counts[detections.message] <= _MAX_COMPARED)

@@ -158,7 +158,7 @@ def silences(
             on[others] = _heard([presences[other].runs for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(presences[topic].runs, limit)
-        reported += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
+        reported += _without_habit([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
@@ -214,7 +214,7 @@ def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
     return sum(min(last, until) - max(first, start) for start, until in gaps[begin:end])
 
 
-def _reported(silences: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
+def _without_habit(silences: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
     """Returns those silences of a topic that are not its habit."""
     if len(silences) <= SELDOM:
         return silences

@@ -135,15 +135,15 @@ def events_of(stated: Stated) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = stated.facts.of_kinds({LABEL})
     labels = [word.name for word in seen.words]
-    states, changes = _states(stated)
+    states, changes = _states_and_changes(stated)
     return TopicEvents(
         int(times[0]),
         int(times[-1]),
         visible_in(times, seen.rows, seen.codes, seen.values, labels),
         states,
         changes,
-        _errors(_said(stated, ERROR)),
-        _reports(_said(stated, REPORT)),
+        _merge_errors(_reports_of(stated, ERROR)),
+        _merge_log_entries(_reports_of(stated, REPORT)),
         0,
         undecodable,
         stated.beyond,
@@ -168,8 +168,8 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
         visible,
         states,
         changes,
-        _errors(error for part in parts for error in part.errors),
-        _reports(report for part in parts for report in part.reports),
+        _merge_errors(error for part in parts for error in part.errors),
+        _merge_log_entries(report for part in parts for report in part.reports),
         more + sum(part.left_out for part in parts),
         undecodable,
         max(part.beyond for part in parts),
@@ -177,7 +177,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     return whole.limited(MAX_HELD, MAX_SEEN)
 
 
-def _states(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
+def _states_and_changes(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
     """Returns what each state was first and last, and its changes."""
     facts = stated.facts.of_kinds(STATES)
     if not facts.rows.size:
@@ -234,23 +234,23 @@ def _joined_states(
     return tuple(states.values()), tuple(changes), left_out
 
 
-def _said(stated: Stated, kind: str) -> list[Report]:
+def _reports_of(stated: Stated, kind: str) -> list[Report]:
     """Returns each sentence of a kind as a report."""
     facts = stated.facts.of_kinds({kind})
     cells = zip(facts.codes.tolist(), stated.times[facts.rows].tolist(), strict=True)
     return [Report(facts.words[code].name, time, time, 1) for code, time in cells]
 
 
-def _errors(reports: Iterable[Report]) -> tuple[Report, ...]:
-    alike = _joined_reports(reports, str, MAX_NS)
+def _merge_errors(reports: Iterable[Report]) -> tuple[Report, ...]:
+    alike = _merge_reports(reports, str, MAX_NS)
     return tuple(sorted(alike, key=lambda error: (error.first, error.text)))
 
 
-def _reports(reports: Iterable[Report]) -> tuple[Report, ...]:
-    return tuple(_joined_reports(reports, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
+def _merge_log_entries(reports: Iterable[Report]) -> tuple[Report, ...]:
+    return tuple(_merge_reports(reports, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
 
 
-def _joined_reports(
+def _merge_reports(
     reports: Iterable[Report], likeness: Callable[[str], str], apart: Ns
 ) -> list[Report]:
     """Returns reports in order, each joined to the newest one like it, where that is recent."""

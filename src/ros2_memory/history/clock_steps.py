@@ -159,7 +159,9 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
     deleted = (ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back)
-    steps_in_pauses = (_step_in(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:])
+    steps_in_pauses = (
+        _step_of_pause(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:]
+    )
     return sorted({*steps, *deleted, *filter(None, steps_in_pauses)})
 
 
@@ -184,7 +186,7 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
         )
 
 
-def _step_in(view: View, pause: Pause) -> ClockStep | None:
+def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
     """Returns the step that a pause is, which is looked at once if its bags are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
@@ -195,7 +197,7 @@ def _step_in(view: View, pause: Pause) -> ClockStep | None:
     remembered = scanner.caches.clock_steps.get(key)
     if remembered is None:
         with view.notes.isolated():
-            step = _read_step(view, topic, (pause.start, pause.end))
+            step = _find_step(view, topic, (pause.start, pause.end))
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         remembered = () if step is None else (step,)
         if is_final:
@@ -203,7 +205,7 @@ def _step_in(view: View, pause: Pause) -> ClockStep | None:
     return next(iter(remembered), None)
 
 
-def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep | None:
+def _find_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep | None:
     step = _step_by_stamps(view, hole)
     is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
     if step is not None or not is_long or topic is None or _is_late(view, topic, hole):

@@ -451,7 +451,7 @@ class Notes:
         """Records that sentences already have what the summaries of these bags remark."""
         self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
-    def has_remarks(self, bag: BagFile) -> bool:
+    def notes_cover_remarks(self, bag: BagFile) -> bool:
         """Whether notes on what was read of a bag have all that its summary remarks."""
         name = short_name(bag.path)
         if name in self._remarks:

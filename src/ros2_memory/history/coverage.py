@@ -88,7 +88,7 @@ def note_unread(
         bag
         for bag in view.timeline.faulty(window)
         # There is no note about bags that a crash left open.
-        if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
+        if bag.state is BagState.INCOMPLETE or not view.notes.notes_cover_remarks(bag)
     ]
     view.notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ())
     if nothing or search:

@@ -76,10 +76,10 @@ class DetectionRows:
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""
-        detected = of_columns(self._view, rows, self._held)
-        return self._decoded(rows) if detected is None else joined_detected(detected)
+        detected = of_columns(self._view, rows, self._by_columns)
+        return self._by_messages(rows) if detected is None else joined_detected(detected)
 
-    def _held(self, rows: Rows) -> Detected | None:
+    def _by_columns(self, rows: Rows) -> Detected | None:
         """Returns the detections of some rows; None where their columns leave something open."""
         columns = self._columns.of(rows.table)
         if columns is None:
@@ -88,14 +88,14 @@ class DetectionRows:
         if rows.index is not None:
             detections = detections.at(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _detected(rows.times, stamps, detections)
+        return _with_times(rows.times, stamps, detections)
 
-    def _decoded(self, rows: Rows) -> Detected:
+    def _by_messages(self, rows: Rows) -> Detected:
         read = [row for stored in messages_of(self._view, rows) for row in self._one(stored)]
         # Those of a part come bag after bag, in the order in which bags were stored.
         read.sort(key=lambda row: row[0])
         log_times, stamps = (np.array([row[nth] for row in read], np.int64) for nth in (0, 1))
-        return _detected(log_times, stamps, detections_by([row[2] for row in read]))
+        return _with_times(log_times, stamps, detections_by([row[2] for row in read]))
 
     def _one(self, stored: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
         """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
@@ -111,7 +111,7 @@ class DetectionRows:
         return [(stored.time, stored.time if stamp is None else stamp, detections)]
 
 
-def _detected(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:
+def _with_times(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.

@@ -41,7 +41,7 @@ from ros2_memory.history.no_data import (
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
-from ros2_memory.history.robots import beside_path
+from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
 from ros2_memory.history.transforms import (
     decoded_transforms,
@@ -74,7 +74,7 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-class FoundWay(NamedTuple):
+class PathSince(NamedTuple):
     """The path of a window, None where there is no message.
 
     From `since` (log time, ns) on, where older bags were not read.
@@ -84,9 +84,9 @@ class FoundWay(NamedTuple):
     since: Ns | None = None
 
 
-def driven_path(view: View, topic: str, window: TimeWindow) -> FoundWay:
-    """Does as `way_in`; a note says how far back it is known where not all was read."""
-    path = way_in(view, topic, window)
+def driven_path(view: View, topic: str, window: TimeWindow) -> PathSince:
+    """Does as `path_by_poses`; a note says how far back it is known where not all was read."""
+    path = path_by_poses(view, topic, window)
     if path.since is not None:
         view.notes.add_lack(
             f"the path is known back to {unix_text(path.since)}: out of time before older bags "
@@ -95,7 +95,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> FoundWay:
     return path
 
 
-def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
+def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathSince:
     """Returns the path in a window by the poses of one topic.
 
     Messages that cannot be decoded are left out, with a note.
@@ -128,7 +128,7 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return FoundWay(joined_slices(slices[::-1], fastest) if slices else None, since)
+    return PathSince(joined_slices(slices[::-1], fastest) if slices else None, since)
 
 
 def slices_of_path(
@@ -186,10 +186,10 @@ def slices_by_poses(
         poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
         span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
         of_body = [PoseRows(span, lambda: poses)] if len(poses) else []
-        for pose_slice in slices_back(of_body, beside):
+        for pose_slice in pose_slices(of_body, beside):
             yield pose_slice.start, make(pose_slice)
         return
-    twice = () if view.call.stored else beside_path(view, topic, window)
+    twice = () if view.call.stored else parallel_or_twice(view, topic, window)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
     reader = PoseReader(view, failures, twice)
 
@@ -198,7 +198,7 @@ def slices_by_poses(
         rows = opened.rows(newest_first=True, among=around)
         read = map(reader.block, blocks(rows, newest_first=True))
         needs_all = stretch.parts is not None or not view.call.stored
-        for pose_slice in slices_back(
+        for pose_slice in pose_slices(
             (block for block in read if block.parts or needs_all), beside
         ):
             if stretch.window.overlaps(pose_slice.start, pose_slice.stop - 1):
@@ -252,7 +252,7 @@ class PoseSlice:
         return FragmentKey(self.start, settings, tuple(parts))
 
 
-def slices_back(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
     """Yields the slices of the clock in which there may be poses, the newest first.
 
     Args:
@@ -380,15 +380,15 @@ def robot_body(view: View) -> Body | None:
     moving = [edge.child for edge in known_edges if not edge.static]
     if not moving:
         return None
-    above = {child: _above(child, parents) for child in moving}
+    above = {child: _ancestors(child, parents) for child in moving}
     map_frame = view.limits.map_frame
-    body = min(moving, key=lambda child: (_rank(child, map_frame), len(above[child]), child))
+    body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
     others = sorted({child for child in moving if child != body})
     return Body(root, body, tuple(others), tuple(above[body]))
 
 
-def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
+def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
     """Returns the frames above a frame, the nearest first; a loop ends it."""
     frames: list[str] = []
     while frame in parents and parents[frame] not in frames:
@@ -397,7 +397,7 @@ def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
     return frames
 
 
-def _rank(frame: str, map_frame: str | None) -> int:
+def _body_rank(frame: str, map_frame: str | None) -> int:
     name = frame.rpartition("/")[2]
     if name == map_frame or name.startswith("odom"):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected

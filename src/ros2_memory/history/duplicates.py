@@ -118,17 +118,17 @@ def deduplicate_backward(
     newer: list[StoredMessage] = []
     for number, slice_messages in groupby(messages, key=slice_of):
         if number is None:
-            yield from _kept(newer, [], spans)
+            yield from _without_copies(newer, [], spans)
             newer = []
             yield from slice_messages
         else:
             older = [*slice_messages]
-            yield from _kept(newer, older, spans)
+            yield from _without_copies(newer, older, spans)
             newer = older
-    yield from _kept(newer, [], spans)
+    yield from _without_copies(newer, [], spans)
 
 
-def _kept(
+def _without_copies(
     messages: Sequence[StoredMessage],
     older: Sequence[StoredMessage],
     spans: Sequence[tuple[Ns, Ns]],

@@ -112,7 +112,7 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            value = Held(self._word(message, newest.type), 0, 0, ended=True).exact
+            value = Held(self._json_at(message, newest.type), 0, 0, ended=True).exact
             if isinstance(value, list | dict | None):
                 of_field = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(
@@ -177,11 +177,11 @@ class HeldValues:
             self._view, self._topic, window, newest_first=newest_first, reached=self._check
         )
         for together in blocks(scanned, newest_first=newest_first):
-            parts = [of_columns(self._view, rows, self._said) for rows in together]
+            parts = [of_columns(self._view, rows, self._texts_of) for rows in together]
             if any(part is None for part in parts):
-                runs = self._read(together, window, newest_first=newest_first)
+                runs = self._runs_of_messages(together, window, newest_first=newest_first)
             else:
-                joined = self._joined([column for part in parts for column in part or ()])
+                joined = self._runs_of_columns([column for part in parts for column in part or ()])
                 runs = reversed(joined) if newest_first else iter(joined)
             for run in runs:
                 older, newer = (run, waiting) if newest_first else (waiting, run)
@@ -198,7 +198,7 @@ class HeldValues:
         if self._reading.expired():
             raise QueryTimeoutError("out of time")
 
-    def _joined(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
+    def _runs_of_columns(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
         """Returns the runs of rows that overlap in time, in order."""
         times = np.concatenate([part[0] for part in parts])
         if not times.size:
@@ -219,14 +219,14 @@ class HeldValues:
             )
         ]
 
-    def _said(self, rows: Rows) -> tuple[IntArray, Texts] | None:
+    def _texts_of(self, rows: Rows) -> tuple[IntArray, Texts] | None:
         """Returns the log times of some rows, and what each says; None where columns lack it."""
         texts = words_of(rows.table, self._field, self._view.extractor)
         if texts is None:
             return None
         return rows.times, texts if rows.index is None else texts.rows(rows.index)
 
-    def _read(
+    def _runs_of_messages(
         self, together: Sequence[Rows], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[_Run]:
         """Yields a run for each message of the times of some rows, one of which may be large."""
@@ -236,10 +236,10 @@ class HeldValues:
             self._check(stored.time)
             message = self._view.bags.decode(stored)
             if message is not None:
-                word = self._word(message, stored.type)
+                word = self._json_at(message, stored.type)
                 yield _Run(word, stored.time, stored.time)
 
-    def _word(self, message: object, type_name: str) -> str:
+    def _json_at(self, message: object, type_name: str) -> str:
         extractor = self._view.extractor
         if self._field is None:
             return json.dumps(extractor.exact(message, type_name))

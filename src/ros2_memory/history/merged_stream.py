@@ -61,7 +61,7 @@ class MergedStream:
                     else (min(first, before[0]), max(last, before[1]))
                 )
                 spans[bag.file] = BagSpan(*span, bag)
-        return sorted(spans.values(), key=_in_order)
+        return sorted(spans.values(), key=_span_order)
 
     def messages(
         self,
@@ -78,9 +78,9 @@ class MergedStream:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        parts = self._parts(topics, window) if among is None else [window]
+        parts = self._segment_windows(topics, window) if among is None else [window]
         return chain.from_iterable(
-            self._part(topics, part, among, newest_first=newest_first)
+            self._messages_in(topics, part, among, newest_first=newest_first)
             for part in (reversed(parts) if newest_first else parts)
         )
 
@@ -99,20 +99,20 @@ class MergedStream:
         """Returns the newest message of the topic in the window."""
         return self.first([topic], window, newest_first=True)
 
-    def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
+    def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""
         segments = self._timeline.segments
-        begin = bisect_right(segments, window.start, key=_begins)
-        end = bisect_left(segments, window.stop, begin, key=_begins)
+        begin = bisect_right(segments, window.start, key=_start_of)
+        end = bisect_left(segments, window.stop, begin, key=_start_of)
         cuts = [
-            _begins(segment)
+            _start_of(segment)
             for segment in segments[begin:end]
             if any(topic in segment.spans for topic in topics)
         ]
         edges = [window.start, *dict.fromkeys(cuts), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
 
-    def _part(
+    def _messages_in(
         self,
         topics: Sequence[str],
         window: TimeWindow,
@@ -204,7 +204,7 @@ class MergedStream:
         waiting = deque(
             sorted(
                 (-span.last if newest_first else span.first, sign * rank, span.bag)
-                for rank, span in enumerate(sorted(bags, key=_by_recording))
+                for rank, span in enumerate(sorted(bags, key=_recording_order))
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -230,17 +230,17 @@ def _with_horizon(window: TimeWindow) -> TimeWindow:
     return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
 
 
-def _begins(segment: Segment) -> Ns:
+def _start_of(segment: Segment) -> Ns:
     """Returns the log time of a segment's first message; segments are in this order."""
     return segment.bags[0].start
 
 
-def _in_order(span: BagSpan) -> tuple[Ns, Ns, str]:
+def _span_order(span: BagSpan) -> tuple[Ns, Ns, str]:
     return span.first, span.last, span.bag.file
 
 
-def _by_recording(span: BagSpan) -> tuple[str, Ns, Ns, str]:
-    return str(span.bag.recording), *_in_order(span)
+def _recording_order(span: BagSpan) -> tuple[str, Ns, Ns, str]:
+    return str(span.bag.recording), *_span_order(span)
 
 
 def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.poses import Frames, Poses, joined_poses
+from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.fragments import Sized
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.robots import Beside
+    from ros2_memory.history.robots import ParallelRecordings
     from ros2_memory.history.view import View
 
 
@@ -115,7 +115,7 @@ def poses_of(samples: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
         np.array([time for time, *_ in rows], np.int64),
         rounded(places, METRES),
         np.array(turns, np.float64).reshape(-1, 4),
-        Frames(frames.codes, frames.words),
+        FrameCodes(frames.codes, frames.words),
         np.array([math.nan if speed is None else speed for *_, speed in rows], np.float64),
     )
 
@@ -143,7 +143,10 @@ class PoseReader:
     """
 
     def __init__(
-        self, view: View, failures: list[UndecodableError], beside: Sequence[Beside] = ()
+        self,
+        view: View,
+        failures: list[UndecodableError],
+        beside: Sequence[ParallelRecordings] = (),
     ) -> None:
         self._view = view
         self._failures = failures
@@ -158,7 +161,7 @@ class PoseReader:
         )
         part_numbers = [table_rows.part for table_rows in rows]
         numbers = tuple(part for part in part_numbers if part is not None)
-        is_whole = len(numbers) == len(part_numbers) and not any(map(self._left_out, rows))
+        is_whole = len(numbers) == len(part_numbers) and not any(map(self._held_by_others, rows))
         parts = numbers if is_whole else None
         return PoseRows(span, partial(self._joined, rows), parts)
 
@@ -167,12 +170,12 @@ class PoseReader:
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        counting = [self._counting(table_rows) for table_rows in rows]
+        counting = [self._without_others(table_rows) for table_rows in rows]
         return joined_poses([self.poses(table_rows) for table_rows in counting if len(table_rows)])
 
-    def _counting(self, rows: Rows) -> Rows:
+    def _without_others(self, rows: Rows) -> Rows:
         """Returns the rows that others do not have the time of."""
-        for beside in self._left_out(rows):
+        for beside in self._held_by_others(rows):
             out = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
             if beside.bags:
                 positions = [where for bag, where in rows.bag_rows() if bag.file in beside.bags]
@@ -182,7 +185,7 @@ class PoseReader:
             rows = rows.some(np.flatnonzero(~out))
         return rows
 
-    def _left_out(self, rows: Rows) -> list[Beside]:
+    def _held_by_others(self, rows: Rows) -> list[ParallelRecordings]:
         """Returns what has the time of some of these rows first."""
         return [
             beside

@@ -142,7 +142,7 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
     named = [
         f"{', '.join(topic_frames)} ({topic})" for topic, topic_frames in frames if topic_frames
     ]
@@ -162,7 +162,7 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
-    frames = {frame for topic in topics[:_MOST_FRAMES] for frame in _frames_of(view, topic)}
+    frames = {frame for topic in topics[:_MOST_FRAMES] for frame in _frames_of_newest(view, topic)}
     try:
         return any(frame != target and connects(view, (target, frame)) for frame in sorted(frames))
     except QueryTimeoutError:
@@ -178,7 +178,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     test = condition.test
     asked = test.frame_id if isinstance(test, NearPosition) else None
     for topic in topics[:_MOST_FRAMES] if asked else ():
-        frames = _frames_of(view, topic)
+        frames = _frames_of_newest(view, topic)
         if frames and (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
@@ -186,7 +186,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
             )
 
 
-def _frames_of(view: View, topic: str) -> list[str]:
+def _frames_of_newest(view: View, topic: str) -> list[str]:
     """Returns the frames of the positions in a topic's newest message; none where not known."""
     try:
         stored = view.stream.newest(topic, TimeWindow.everything())
@@ -314,7 +314,9 @@ class CandidateRows:
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
         ready, before = self._ready, (MAX_NS, "")
-        tables = heapq.merge(*map(self._of_topic, self._left), key=lambda table: -table[0])
+        tables = heapq.merge(
+            *map(self._candidates_of_topic, self._left), key=lambda table: -table[0]
+        )
         for last, topic, times in chain(tables, [(MIN_NS - 1, "", list[Ns]())]):
             # What is left is no newer than the next table.
             while ready and -ready[0][0] > last:
@@ -325,7 +327,7 @@ class CandidateRows:
             for time in times:
                 heapq.heappush(ready, (-time, topic))
 
-    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, str, list[Ns]]]:
+    def _candidates_of_topic(self, topic: str) -> Iterator[tuple[Ns, str, list[Ns]]]:
         """Yields for each table of a topic its last log time, and when messages may match."""
 
         def reached(last: Ns) -> None:

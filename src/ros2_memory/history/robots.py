@@ -125,7 +125,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     view = View(memory, call)
     parents_by_path = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    for path, bags in _of_different_makers(view):
+    for path, bags in _recordings_to_compare(view):
         try:
             parents = (
                 parents_by_path[path] if path in parents_by_path else _static_parents(view, bags)
@@ -151,11 +151,11 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
     """
     now, described = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
     if not described or abs(now - described[0][0]) > _RECENT_NS:
-        described[:] = [(now, tuple(_described(memory, call)))]
+        described[:] = [(now, tuple(_mixed_sentences(memory, call)))]
     return described[0][1]
 
 
-def _described(memory: Memory, call: Call) -> Iterator[str]:
+def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
     mixed = [
         recordings for recordings in mixed_recordings(memory, call) if recordings.topic is not None
     ]
@@ -185,7 +185,9 @@ def _differing_topic(
     limits = view.limits
     first = [wanted for wanted in (view.pose_topic, *limits.tf_topics) if wanted in shared]
     for topic in islice([*first, *sorted(shared.difference(first))], _MAX_COMPARED):
-        if _differ_in(view, topic, (_spans(first_bags, topic), _spans(other, topic)), both):
+        if _bags_differ(
+            view, topic, (_bag_spans(first_bags, topic), _bag_spans(other, topic)), both
+        ):
             return topic
     return None
 
@@ -194,11 +196,11 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
     return {topic for bag in bags for topic in bag.summary.schema.positions}
 
 
-def _spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
+def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
     return [bag_span_of(bag, (topic,)) for bag in bags if topic in bag.summary.schema.positions]
 
 
-def _of_different_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
+def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     """Returns the newest recordings with static transforms, of this program's one in a folder."""
     topics = view.limits.tf_static_topics
     root = f"{view.bag_dir}/"
@@ -220,7 +222,7 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     parents: dict[str, str] = {}
     window = TimeWindow.everything()
     for topic in view.limits.tf_static_topics:
-        spans = _spans(bags, topic)
+        spans = _bag_spans(bags, topic)
         merged = view.stream.merged(spans, [topic], window, newest_first=False) if spans else ()
         for stored in islice(merged, _MAX_STATIC):
             message = view.bags.decode(stored)
@@ -230,7 +232,7 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     return parents
 
 
-class Beside(NamedTuple):
+class ParallelRecordings(NamedTuple):
     """Two recordings with messages of their own on a topic at the same time.
 
     Or one, with itself, in which the clock was set back.
@@ -261,11 +263,11 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     Raises:
         NoDataError: recordings hold messages of their own on the topic at the same time.
     """
-    beside = recordings_beside(view, topic, window)
-    names = _names([pair for pair in beside if not pair.by_clock])
+    beside = parallel_recordings(view, topic, window)
+    names = _recording_names([pair for pair in beside if not pair.by_clock])
     # Transforms are of all recordings at once, so a path by them is not that of one there.
     if topic in view.limits.tf_topics:
-        names = _names(beside)
+        names = _recording_names(beside)
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
@@ -273,7 +275,7 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
-    for pair in [*beside, *_beside_themselves(view, window)]:
+    for pair in [*beside, *_times_recorded_twice(view, window)]:
         name, start, stop = (
             pair.first.name,
             unix_text(pair.span.start),
@@ -294,8 +296,8 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
 
     Returns these times, without those that a clock made which was set back.
     """
-    beside = recordings_beside(view, topic, window)
-    names = _names(beside)
+    beside = parallel_recordings(view, topic, window)
+    names = _recording_names(beside)
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
@@ -304,16 +306,16 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     return united((pair.span.start, pair.span.stop) for pair in beside if not pair.by_clock)
 
 
-def _names(beside: Sequence[Beside]) -> list[str]:
+def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:
     return sorted({path.name for pair in beside for path in (pair.first, pair.other)})
 
 
-def beside_path(view: View, topic: str, window: TimeWindow) -> list[Beside]:
+def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     """Returns all that would make a path by a topic go to and fro between two times of a robot."""
-    return [*recordings_beside(view, topic, window), *_beside_themselves(view, window)]
+    return [*parallel_recordings(view, topic, window), *_times_recorded_twice(view, window)]
 
 
-def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
+def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     """Returns the recordings that hold messages of their own on a topic at the same time.
 
     None for latched topics, which each recording receives again, or where the time for the answer
@@ -321,7 +323,7 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     """
     if topic in view.timeline.transient_local:
         return []
-    differing: list[Beside] = []
+    differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
     try:
@@ -355,7 +357,7 @@ def note_robots_near(view: View, stored: StoredMessage) -> None:
             note_robots(view, topic, TimeWindow.around(stored.time, _SLOW_NS))
 
 
-def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[Beside]:
+def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
@@ -371,11 +373,11 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[B
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
-                yield Beside(other, path, span, is_edge or is_step)
+                yield ParallelRecordings(other, path, span, is_edge or is_step)
         open_spans.append((first, last, path))
 
 
-def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
+def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields recordings in which the clock was set back, with the bags from after that."""
     for fault in view.snapshot.dating.faults:
         after = split_of(fault.bag.file)
@@ -392,7 +394,7 @@ def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
         bags = frozenset(bag.file for nth, bag in numbered if nth >= number)
         if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
             recording = fault.bag.recording
-            yield Beside(recording, recording, span, by_clock=True, bags=bags)
+            yield ParallelRecordings(recording, recording, span, by_clock=True, bags=bags)
 
 
 def _steps_back(view: View) -> Mapping[Path, Ns]:
@@ -414,7 +416,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)
     first_spans, other = ([span for span in bags if span.bag.recording == path] for path in pair)
-    differ = _differ_in(view, topic, (first_spans, other), both)
+    differ = _bags_differ(view, topic, (first_spans, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
         differing[key] = differ
     return differ
@@ -428,23 +430,23 @@ def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
     return any(window.overlaps(*span) for span in spans)
 
 
-def _differ_in(
+def _bags_differ(
     view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
 ) -> bool:
     """Does as `_differ`, for the bags of each."""
     first_spans, other = bags
-    if next(_messages(view, topic, other, both), None) is None:
+    if next(_merged_messages(view, topic, other, both), None) is None:
         return False
-    tried = list(islice(_messages(view, topic, first_spans, both), _TRIED))
+    tried = list(islice(_merged_messages(view, topic, first_spans, both), _TRIED))
     for stored in tried:
         near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
         key = copy_key(stored.record)
-        if any(copy_key(copy.record) == key for copy in _messages(view, topic, other, near)):
+        if any(copy_key(copy.record) == key for copy in _merged_messages(view, topic, other, near)):
             return False
     return bool(tried)
 
 
-def _messages(
+def _merged_messages(
     view: View, topic: str, bags: Sequence[BagSpan], window: TimeWindow
 ) -> Iterator[StoredMessage]:
     inside = [span for span in bags if window.overlaps(span.first, span.last)]

@@ -38,7 +38,7 @@ _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 
 
-class _Recorded(NamedTuple):
+class _TransformSpans(NamedTuple):
     """What sessions follow from: folders, with the log times of their first and last messages.
 
     Attributes:
@@ -52,7 +52,7 @@ class _Recorded(NamedTuple):
     joined: Mapping[str, Session]
 
 
-_RECORDED: Final[Key[_Recorded]] = Key()
+_RECORDED: Final[Key[_TransformSpans]] = Key()
 """Of a timeline: sidecars are read for it."""
 _RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]]]] = Key()
 """Of a timeline: by topics, then by where they were recorded, the recordings that hold them."""
@@ -82,7 +82,7 @@ class Sessions:
         self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._recorded = view.timeline.memo.of(_RECORDED, self._find_recorded)
+        self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
         self.linked = view.timeline.memo.of(_LINKED, set)
@@ -130,7 +130,7 @@ class Sessions:
 
     def has_all_kinds(self, session: Session) -> bool:
         """Whether a session holds moving and static transforms: then it borrows none."""
-        return len(self._kinds(session)) == len(self._recorded.kinds)
+        return len(self._kinds(session)) == len(self._spans.kinds)
 
     def holds_carried(self, recording: Path) -> bool:
         """Whether a recording is of carried messages."""
@@ -142,7 +142,7 @@ class Sessions:
 
     def of(self, recording: Path) -> Session:
         """Returns the session of a recording."""
-        return self._of(self.folder(recording))
+        return self._session_of(self.folder(recording))
 
     def are_joined(self, first: Path, other: Path) -> bool:
         """Whether two recordings are of one session."""
@@ -159,7 +159,7 @@ class Sessions:
         """
         key = (self.folder(recording), at // _AROUND_NS)
         if key not in self._lending:
-            self._lending[key] = self._completed(self._of(key[0]), at)
+            self._lending[key] = self._with_lender(self._session_of(key[0]), at)
         return self._lending[key]
 
     def recorded_at(self, moment: Ns) -> list[Session] | None:
@@ -168,7 +168,7 @@ class Sessions:
         if not around:
             return None
         with_transforms = (session for session in around if self._kinds(session))
-        return [*dict.fromkeys(self._completed(session, moment) for session in with_transforms)]
+        return [*dict.fromkeys(self._with_lender(session, moment) for session in with_transforms)]
 
     def names(self, session: Session, at: Ns) -> str:
         """Returns the names of a session's recordings at a moment; of all if none went on."""
@@ -184,20 +184,20 @@ class Sessions:
 
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
-        spans = [span for by_folder in self._recorded.kinds for span in by_folder.items()]
+        spans = [span for by_folder in self._spans.kinds for span in by_folder.items()]
         near = sorted(spans, key=lambda spanned: (_distance(spanned[1], moment), spanned[0]))
-        return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
+        return [*dict.fromkeys(self._session_of(folder) for folder, _ in near)]
 
-    def _completed(self, session: Session, at: Ns) -> Session:
+    def _with_lender(self, session: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
         kinds = self._kinds(session)
         if self.has_all_kinds(session) or self._are_two_robots(at):
             return session if kinds else frozenset()
         beside = [other for other in self._around(at) if other != session and self._kinds(other)]
         if kinds:
-            partners = [other for other in beside if self._complement(session, other)]
+            partners = [other for other in beside if self._are_complementary(session, other)]
         else:
-            partners = [*dict.fromkeys(self._completed(other, at) for other in beside)]
+            partners = [*dict.fromkeys(self._with_lender(other, at) for other in beside)]
         if len(partners) == 1:
             completed = session | partners[0]
             self._parts[completed] = session, partners[0]
@@ -206,15 +206,14 @@ class Sessions:
 
     def _are_two_robots(self, at: Ns) -> bool:
         """Whether two sessions near a moment hold poses of the same time."""
-        near = [
-            spanned for spanned in self._recorded.poses if _distance(spanned[1], at) <= _AROUND_NS
-        ]
+        near = [spanned for spanned in self._spans.poses if _distance(spanned[1], at) <= _AROUND_NS]
         return any(
-            max(first, begin) <= min(last, end) and self._of(first_folder) != self._of(other)
+            max(first, begin) <= min(last, end)
+            and self._session_of(first_folder) != self._session_of(other)
             for (first_folder, (first, last)), (other, (begin, end)) in combinations(near, 2)
         )
 
-    def _complement(self, first: Session, other: Session) -> bool:
+    def _are_complementary(self, first: Session, other: Session) -> bool:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
         if self._kinds(first) & self._kinds(other):
             return False
@@ -222,22 +221,22 @@ class Sessions:
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
-        kinds = enumerate(self._recorded.kinds)
+        kinds = enumerate(self._spans.kinds)
         return frozenset(kind for kind, spans in kinds if session & spans.keys())
 
     def _around(self, moment: Ns) -> list[Session]:
         """Returns the sessions that were being recorded at a moment."""
-        return [*dict.fromkeys(map(self._of, sorted(self._folders_around(moment))))]
+        return [*dict.fromkeys(map(self._session_of, sorted(self._folders_around(moment))))]
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Returns the folders of the recordings that went on at a moment."""
         bags = self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
-    def _of(self, folder: str) -> Session:
+    def _session_of(self, folder: str) -> Session:
         if folder == self._carried:
             return frozenset({folder})
-        return self._recorded.joined.get(folder) or frozenset({folder, self._carried})
+        return self._spans.joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         """Returns the log times of the first and the last message of some topics, by folder."""
@@ -247,7 +246,7 @@ class Sessions:
         }
         return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
 
-    def _find_recorded(self) -> _Recorded:
+    def _find_spans(self) -> _TransformSpans:
         limits, pose_topic = self._view.limits, self._view.pose_topic
         topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
         recordings = map(self._view.timeline.recordings, topics)
@@ -257,7 +256,7 @@ class Sessions:
             for folder, path in (paths.items() if len(paths) > 1 else ())
             for name in self._view.memory.index.joined_with(path)
         )
-        return _Recorded(
+        return _TransformSpans(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
             [*self._spans_of((pose_topic,)).items()],
             {folder: frozenset(linked | {self._carried}) for folder, linked in chains.items()},

@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
     Edges,
-    Frames,
+    FrameTree,
     TfClock,
     connected_with,
     edges_of,
@@ -134,18 +134,18 @@ def transform_at(
             or no transform brackets the moment on one of the edges between them.
     """
     limits = view.limits
-    if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
+    if not _recorded_topics(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), sessions_of(view)
     if recording is not None:
         session = lending_to(view, recording, frames, at)
-        return _transform_in(view, session, frames, at, explains=explains)
+        return _transform_of_session(view, session, frames, at, explains=explains)
     recorded = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
     failures: list[NoDataError] = []
     for session in (sessions.nearest_to(at) if recorded is None else recorded) or [frozenset()]:
         try:
-            answer = _transform_in(view, session, frames, at, explains=explains)
+            answer = _transform_of_session(view, session, frames, at, explains=explains)
             answers.append((session, answer))
         except NoDataError as error:
             failures.append(error)
@@ -162,7 +162,7 @@ def transform_at(
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts_of(session)
-    if parts and not any(connected(view, frames, session=part) for part in parts):
+    if parts and not any(connects_in_time(view, frames, session=part) for part in parts):
         view.notes.add(
             f"transforms of {sessions.names(session, at)} are combined, as of one robot: they "
             "were recorded at the same time, but no handover proves that they are of one"
@@ -182,7 +182,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
         return session
     key = (session, own_session, frames)
     if key not in sessions.chosen:
-        borrows = not connected(view, frames, session=own_session) and connected(
+        borrows = not connects_in_time(view, frames, session=own_session) and connects_in_time(
             view, frames, session=session
         )
         sessions.chosen[key] = session if borrows else own_session
@@ -192,7 +192,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
     return sessions.chosen[key]
 
 
-def _transform_in(
+def _transform_of_session(
     view: View, session: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
     """Does as `transform_at`, by the transforms of one session."""
@@ -218,13 +218,13 @@ def _transform_in(
             raise _stamp_failure(error, at, nothing_near=not moving) from error
     if not explains:
         raise failure
-    raise _explained(view, failure, frames, at, session, nothing_near=not moving) from failure
+    raise _explain_failure(view, failure, frames, at, session, nothing_near=not moving) from failure
 
 
 def moving_in(view: View, window: TimeWindow, session: Session) -> list[StampedTransform]:
     """Returns the moving transforms that a session received in a window, in log-time order."""
-    sessions, topics = sessions_of(view), _recorded(view, view.limits.tf_topics)
-    bags = _bags_of(view, topics, window, session)
+    sessions, topics = sessions_of(view), _recorded_topics(view, view.limits.tf_topics)
+    bags = _bags_of_session(view, topics, window, session)
     merged = view.stream.merged(bags, topics, window, newest_first=False)
     tracked = view.bags.track_sources(merged)
     of_session = (stored for stored in tracked if sessions.has(session, stored))
@@ -236,10 +236,10 @@ def frames_of(
     static: Sequence[StampedTransform],
     moving: Iterable[StampedTransform],
     target: str,
-) -> Frames:
+) -> FrameTree:
     """Returns frames in a target frame by some transforms, of which none holds on."""
     clock = view.limits.tf_clock
-    return Frames(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
+    return FrameTree(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
 
 def static_transforms(view: View, session: Session) -> Sequence[StampedTransform]:
@@ -254,7 +254,7 @@ def static_transforms(view: View, session: Session) -> Sequence[StampedTransform
     sessions, timeline, scanner = sessions_of(view), view.timeline, view.memory.columns
     if session in sessions.statics:
         return sessions.statics[session]
-    topics = _recorded(view, view.limits.tf_static_topics)
+    topics = _recorded_topics(view, view.limits.tf_static_topics)
     key = (session, topics)
     cached_timeline, cached = scanner.caches.statics.get(key) or (None, ())
     if cached_timeline is timeline:
@@ -266,9 +266,11 @@ def static_transforms(view: View, session: Session) -> Sequence[StampedTransform
         if session in sessions.statics:
             return sessions.statics[session]
     before = view.notes.added
-    received = [transform for topic in topics for transform in _received(view, topic, session)]
+    received = [
+        transform for topic in topics for transform in _static_received(view, topic, session)
+    ]
     received.sort(key=lambda transform: transform.log_time)
-    static = _changes(received)
+    static = _without_repeats(received)
     sessions.statics[session] = static
     # What was noted must be noted in each answer.
     if view.notes.added == before and not view.call.used_active:
@@ -293,12 +295,12 @@ def _find_all_statics(view: View, topics: Sequence[str]) -> None:
         by_session.pop(session, None)
     for session, received in by_session.items():
         received.sort(key=lambda transform: transform.log_time)
-        sessions.statics[session] = _changes(received)
+        sessions.statics[session] = _without_repeats(received)
 
 
 def make_statics(view: View, window: TimeWindow) -> None:
     """Makes the static transforms of the parts in a window."""
-    for topic in _recorded(view, view.limits.tf_static_topics):
+    for topic in _recorded_topics(view, view.limits.tf_static_topics):
         deque(_statics_back(view, topic, window), maxlen=0)
 
 
@@ -309,30 +311,30 @@ def _statics_back(view: View, topic: str, window: TimeWindow) -> Iterator[Static
     def make(stretch: Stretch) -> Iterator[tuple[Ns, Statics]]:
         for rows in opened.rows(newest_first=True, among=stretch.window):
             if stretch.window.contains(max(rows.first, window.start)):
-                yield rows.first, _changes_in(view, rows)
+                yield rows.first, _static_changes(view, rows)
 
     for _, statics in joined_back(view, opened, STATICS, make):
         yield statics
 
 
-def _received(view: View, topic: str, session: Session) -> Iterator[StampedTransform]:
+def _static_received(view: View, topic: str, session: Session) -> Iterator[StampedTransform]:
     """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
-    for rows in scan(view, topic, _span_of(view, topic, session), copies=True):
+    for rows in scan(view, topic, _span_of_session(view, topic, session), copies=True):
         if sessions.holds_carried(rows.recording):
             yield from decoded_transforms(view, _messages_in(view, rows, session))
         elif sessions.folder(rows.recording) in session:
-            yield from _changes_in(view, rows).transforms
+            yield from _static_changes(view, rows).transforms
 
 
-def _span_of(view: View, topic: str, session: Session) -> TimeWindow:
+def _span_of_session(view: View, topic: str, session: Session) -> TimeWindow:
     """Returns when a session has a topic: mostly some hours of a week."""
     spans = sessions_of(view).recordings_of(session, (topic,)).values()
     first = min((first for first, _ in spans), default=0)
     return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
 
 
-def _changes_in(view: View, rows: Rows) -> Statics:
+def _static_changes(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
 
     def make() -> Statics:
@@ -342,14 +344,16 @@ def _changes_in(view: View, rows: Rows) -> Statics:
             decoded_transforms(view, messages_of(view, new_rows)),
             key=lambda transform: transform.log_time,
         )
-        return Statics(relative(str(rows.recording), str(view.bag_dir)), tuple(_changes(received)))
+        return Statics(
+            relative(str(rows.recording), str(view.bag_dir)), tuple(_without_repeats(received))
+        )
 
     part = rows.part
     key = None if part is None else FragmentKey(rows.first, "", (part,))
     return remembered(view, STATICS, key, make)
 
 
-def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
+def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
     """Returns transforms in log-time order without those equal to the one before of their child."""
     latest: dict[str, StampedTransform] = {}
     changes: list[StampedTransform] = []
@@ -373,7 +377,7 @@ def _children_in(view: View, session: Session) -> set[str]:
     """Returns the child frames of all transforms of a session."""
     limits = view.limits
     topics = (*limits.tf_topics, *limits.tf_static_topics)
-    return {child for _, child in _pairs(view, topics, session=session)}
+    return {child for _, child in _all_pairs(view, topics, session=session)}
 
 
 def newest_in_session(
@@ -388,7 +392,7 @@ def newest_in_session(
     own_session = sessions.of(recording)
     if not any(sessions.folder(path) in own_session for path in view.timeline.recordings(topic)):
         return newest
-    bags = _bags_of(view, (topic,), window, own_session)
+    bags = _bags_of_session(view, (topic,), window, own_session)
     if newest is not None and newest.bag in {span.bag for span in bags}:
         return newest
     return view.stream.first((topic,), window, newest_first=True, among=bags)
@@ -403,8 +407,8 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     limits, sessions = view.limits, sessions_of(view)
     if sessions.edges is not None:
         return sessions.edges
-    pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
-    pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
+    pairs = dict.fromkeys(_all_pairs(view, limits.tf_static_topics), True)
+    pairs |= dict.fromkeys(_all_pairs(view, limits.tf_topics), False)
     named = [pair for pair in sorted(pairs.items()) if is_edge(pair[0])]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
@@ -412,27 +416,27 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     return sessions.edges
 
 
-def _pairs(view: View, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
+def _all_pairs(view: View, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
     """Returns the pairs of these topics; with a `session` those that it received."""
     everything = TimeWindow.everything()
     pair_sets = (
         pairs
-        for topic in _recorded(view, topics)
-        for pairs in _pairs_in(view, topic, everything, session)
+        for topic in _recorded_topics(view, topics)
+        for pairs in _pairs_by_table(view, topic, everything, session)
     )
     return set[Pair]().union(*pair_sets)
 
 
-def _pairs_in(
+def _pairs_by_table(
     view: View, topic: str, window: TimeWindow, session: Session | None
 ) -> Iterator[frozenset[Pair]]:
     """Yields the pairs of a topic in a window, table by table, those of the newest first."""
     scanner = view.memory.columns
     if session is not None:
-        window = window.intersect(_span_of(view, topic, session))
+        window = window.intersect(_span_of_session(view, topic, session))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
         if session is not None and sessions_of(view).holds_carried(rows.recording):
-            yield _pairs_of(view, _messages_in(view, rows, session))
+            yield _pairs_of_messages(view, _messages_in(view, rows, session))
         elif session is None or sessions_of(view).folder(rows.recording) in session:
             part = rows.part
             pairs = None if part is None else scanner.caches.pairs.get(part)
@@ -441,7 +445,7 @@ def _pairs_in(
                     view, rows, lambda part_rows: pairs_in(part_rows.table, part_rows.index)
                 )
                 pairs = (
-                    _pairs_of(view, messages_of(view, rows))
+                    _pairs_of_messages(view, messages_of(view, rows))
                     if pair_sets is None
                     else frozenset[Pair]().union(*pair_sets)
                 )
@@ -450,13 +454,13 @@ def _pairs_in(
             yield pairs
 
 
-def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
+def _pairs_of_messages(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
     return frozenset(
         (transform.parent, transform.child) for transform in decoded_transforms(view, messages)
     )
 
 
-def _explained(
+def _explain_failure(
     view: View,
     failure: NoDataError,
     frames: tuple[str, str],
@@ -469,14 +473,16 @@ def _explained(
 
     A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
     """
-    topics = _recorded(view, view.limits.tf_topics)
+    topics = _recorded_topics(view, view.limits.tf_topics)
     near = TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
         then = _near_failure(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not unknown or not connected(view, frames, TimeWindow.around(at, _LONGER_NS), session):
+        if not unknown or not connects_in_time(
+            view, frames, TimeWindow.around(at, _LONGER_NS), session
+        ):
             return then
         advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
         return NoDataError(between(view, near), f"{then.detail}; {advice}")
@@ -490,7 +496,7 @@ def _explained(
     return NoDataError(between(view, near) if inside else beyond(view, at), failure.detail)
 
 
-def connected(
+def connects_in_time(
     view: View,
     frames: tuple[str, str],
     window: TimeWindow | None = None,
@@ -512,7 +518,7 @@ def connects(
     window: TimeWindow | None = None,
     session: Session | None = None,
 ) -> bool:
-    """Does as `connected`; looks at the newest transforms first, until they do.
+    """Does as `connects_in_time`; looks at the newest transforms first, until they do.
 
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
@@ -523,23 +529,23 @@ def connects(
     pairs: set[Pair] = set()
     everything = TimeWindow.everything()
     by_topic = [
-        _pairs_in(view, topic, within or everything, session)
+        _pairs_by_table(view, topic, within or everything, session)
         for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window))
-        for topic in _recorded(view, topics)
+        for topic in _recorded_topics(view, topics)
     ]
     # Of all topics in turn: mostly the newest table of each is enough.
     for newest_pairs in zip_longest(*by_topic, fillvalue=frozenset[Pair]()):
         fresh = frozenset[Pair]().union(*newest_pairs)
         if not fresh <= pairs:
             pairs |= fresh
-            if _link(pairs, frames):
+            if _are_linked(pairs, frames):
                 if window is None:
                     linked.add((frames, session))
                 return True
     return False
 
 
-def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
+def _are_linked(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
     """Whether pairs of a parent and a child lead from one frame to the other."""
     origin, target = (name.lstrip("/") for name in frames)
     linked = [(parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(is_edge, pairs)]
@@ -579,7 +585,7 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
         stamped = stamped_between(rows.table, rows.index, earliest, latest)
         return None if stamped is None else rows.some(stamped)
 
-    for topic in _recorded(view, view.limits.tf_topics):
+    for topic in _recorded_topics(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
             if sessions.may_hold(session, rows.recording):
@@ -587,12 +593,12 @@ def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTrans
                     yield from decoded_transforms(view, _messages_in(view, near_rows, session))
 
 
-def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
+def _recorded_topics(view: View, topics: Iterable[str]) -> tuple[str, ...]:
     recorded = set(view.timeline.topics())
     return tuple(topic for topic in topics if topic in recorded)
 
 
-def _bags_of(
+def _bags_of_session(
     view: View, topics: Sequence[str], window: TimeWindow, session: Session
 ) -> list[BagSpan]:
     chosen = sessions_of(view).recordings_of(session, tuple(topics))
@@ -651,7 +657,7 @@ def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
     return edges_of(decoded_transforms(view, messages_of(view, rows)))
 
 
-def frames_over(view: View, session: Session, window: TimeWindow, target: str) -> Frames:
+def frames_over(view: View, session: Session, window: TimeWindow, target: str) -> FrameTree:
     """Returns the frames of a session in a window, looked up in a target frame.
 
     They are the same however the history is cut: moving transforms are read from so far around the
@@ -668,4 +674,4 @@ def frames_over(view: View, session: Session, window: TimeWindow, target: str) -
         for rows in scan(view, topic, around, copies=True)
     ]
     static = static_in(static_transforms(view, session), window)
-    return Frames(static, joined_edges(moving), target, limits.tf_clock)
+    return FrameTree(static, joined_edges(moving), target, limits.tf_clock)

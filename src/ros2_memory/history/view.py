@@ -134,12 +134,12 @@ class View:
             return counted[topic]
         before = self.notes.added
         with self.notes.isolated():
-            censuses = self._census(topic)
+            censuses = self._read_census(topic)
             if self.notes.complete and self.notes.added == before and not self.call.used_active:
                 counted[topic] = censuses
         return censuses
 
-    def _census(self, topic: str) -> dict[str, Census]:
+    def _read_census(self, topic: str) -> dict[str, Census]:
         counted = {
             type_name: Census(*stated) for type_name, stated in self.timeline.totals(topic).items()
         }

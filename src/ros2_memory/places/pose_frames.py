@@ -40,8 +40,8 @@ from ros2_memory.history.driven_path import (
     robot_body,
 )
 from ros2_memory.history.transforms import (
-    connected,
     connects,
+    connects_in_time,
     newest_in_session,
     sessions_of,
     transform_at,
@@ -244,7 +244,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
     if frame_id in (frame, *above):
         return MapPlacement(frame_id, frame, frame_id == target, above)
     # No answer is better than one that denies a frame which is asked for, since the time is over.
-    leads = connected if frame_id is None else connects
+    leads = connects_in_time if frame_id is None else connects
     places_frame = frame
     if target and target != frame and leads(view, (target, frame)):
         recordings = view.timeline.recordings(topic).items()
@@ -319,7 +319,7 @@ def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
     return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
 
 
-def tracks_made(view: View, window: TimeWindow) -> Iterator[Ns]:
+def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
     """Makes what the parts in a window say of where the robot was in the frames of places.
 
     Yields a log time (ns) of each, the newest first.

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS, Edges, Floats, Frames, Mask, Times, static_in
+from ros2_memory.analysis.frames import (
+    TF_CACHE_NS,
+    Edges,
+    Floats,
+    FrameTree,
+    Mask,
+    Times,
+    static_in,
+)
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
@@ -151,10 +159,10 @@ class RobotTracks:
         """
         tracks = self._view.memo.of(_JOINED, dict)
         if (self._frame_id, window) not in tracks:
-            tracks[self._frame_id, window] = self._over(window)
+            tracks[self._frame_id, window] = self._read_track(window)
         return tracks[self._frame_id, window]
 
-    def _over(self, window: TimeWindow) -> JoinedTrack:
+    def _read_track(self, window: TimeWindow) -> JoinedTrack:
         view = self._view
         # Whole slices, so that no vertex depends on the window; and what may reach into it.
         around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
@@ -176,7 +184,7 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in parts)
-        whole, numbers, is_beside = _by_robot(parts)
+        whole, numbers, is_beside = _tracks_by_robot(parts)
         fastest = view.limits.max_plausible_speed_mps
 
         def track(index: NDArray[np.intp]) -> RobotTrack:
@@ -209,7 +217,7 @@ class RobotTracks:
                 opened,
                 TRACKS,
                 partial(self._parts_in, opened, moving, window, reading),
-                partial(self._joined_key, opened, moving, window),
+                partial(self._stretch_key, opened, moving, window),
                 trouble=lambda: len(self._failures),
             )
 
@@ -235,8 +243,8 @@ class RobotTracks:
         for rows in opened.rows(newest_first=True, among=searched):
             if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
                 continue
-            groups = self._groups(rows, TimeWindow.everything())
-            key = self._key(rows, groups, scans)
+            groups = self._lent_spans(rows, TimeWindow.everything())
+            key = self._rows_key(rows, groups, scans)
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
@@ -244,12 +252,12 @@ class RobotTracks:
                 continue
             stored = self._known(key)
             if stored is not None and not stored.left_out:
-                yield rows.first, stored.some(_inside(stored.times, window))
-            elif (inside := _inside(rows.times, window)).size:
-                groups = self._groups(rows, window)
+                yield rows.first, stored.some(_positions_in(stored.times, window))
+            elif (inside := _positions_in(rows.times, window)).size:
+                groups = self._lent_spans(rows, window)
                 yield rows.first, self._part(rows.some(inside), None, groups, reading)
 
-    def _joined_key(
+    def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
     ) -> FragmentKey | None:
         """Returns what the track of a stretch follows from; None where that may still change."""
@@ -272,7 +280,7 @@ class RobotTracks:
             return None
         placed_by += [numbers.get(sessions.of(recording)) for recording in moving.values()]
         parts += [part for part in moving if part not in parts]
-        return FragmentKey(start, self._settings(placed_by), tuple(parts))
+        return FragmentKey(start, self._settings_hash(placed_by), tuple(parts))
 
     def _moving_parts(self, scans: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
         """Returns the whole parts that all moving transforms around a time are of.
@@ -288,7 +296,7 @@ class RobotTracks:
         is_mixed = any(map(sessions_of(self._view).holds_carried, paths.values()))
         return None if is_mixed else paths
 
-    def _settings(self, placed_by: Sequence[object]) -> str:
+    def _settings_hash(self, placed_by: Sequence[object]) -> str:
         """Returns what a track depends on besides the poses and transforms in parts, as a text."""
         clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
@@ -298,7 +306,7 @@ class RobotTracks:
         return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
 
     def _part(
-        self, rows: Rows, key: FragmentKey | None, groups: Sequence[_Group], reading: Deadline
+        self, rows: Rows, key: FragmentKey | None, groups: Sequence[_LentSpan], reading: Deadline
     ) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
 
@@ -311,8 +319,8 @@ class RobotTracks:
 
         return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
 
-    def _key(
-        self, rows: Rows, groups: Sequence[_Group], scans: Sequence[Scan]
+    def _rows_key(
+        self, rows: Rows, groups: Sequence[_LentSpan], scans: Sequence[Scan]
     ) -> FragmentKey | None:
         """Returns what the track by some rows follows from; None where that may still change."""
         if rows.part is None:
@@ -328,9 +336,9 @@ class RobotTracks:
             static = static_in(static_transforms(self._view, session), group.span)
             # By their places among the parts: those of one recording have one text.
             placed_by.append((group.since, tuple(static), [parts.index(part) for part in used]))
-        return FragmentKey(rows.first, self._settings(placed_by), tuple(parts))
+        return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
 
-    def _groups(self, rows: Rows, window: TimeWindow) -> list[_Group]:
+    def _lent_spans(self, rows: Rows, window: TimeWindow) -> list[_LentSpan]:
         """Returns by what the poses of some rows in a window are placed; none: by nothing."""
         if self._is_own:
             return []
@@ -338,7 +346,7 @@ class RobotTracks:
         ends = [since for since, _ in lenders[1:]] + [MAX_NS]
         whole = TimeWindow(rows.first, rows.last + 1).intersect(window)
         groups = [
-            _Group(since, whole.intersect(TimeWindow(since, end)), session)
+            _LentSpan(since, whole.intersect(TimeWindow(since, end)), session)
             for (since, session), end in zip(lenders, ends, strict=True)
         ]
         return [group for group in groups if not group.span.empty]
@@ -349,11 +357,11 @@ class RobotTracks:
         session = sessions.of(recording)
         if sessions.has_all_kinds(session):
             return [(MIN_NS, session)]
-        first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
+        first, last = (self._lender_at(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [(MIN_NS, first)]
         slices = (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist()
-        lenders = [(at, self._lending(recording, at)) for at in slices]
+        lenders = [(at, self._lender_at(recording, at)) for at in slices]
         return [
             lender
             for nth, lender in enumerate(lenders)
@@ -369,19 +377,19 @@ class RobotTracks:
         placed = [NOWHERE]
         for topic in self._topics:
             placed += [
-                self._placed(rows, self._groups(rows, window))
+                self._placed(rows, self._lent_spans(rows, window))
                 for rows in scan(self._view, topic, window)
             ]
         return _joined(placed)
 
-    def _lending(self, recording: Path, at: Ns) -> Session:
+    def _lender_at(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none, or another."""
         session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
         if not session:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _placed(self, rows: Rows, groups: Sequence[_Group]) -> Placed:
+    def _placed(self, rows: Rows, groups: Sequence[_LentSpan]) -> Placed:
         """Returns the poses of some rows."""
         if self._body is None:
             poses = self._reader.poses(rows)
@@ -399,7 +407,7 @@ class RobotTracks:
         return _joined(placed)
 
 
-class _Group(NamedTuple):
+class _LentSpan(NamedTuple):
     """By what poses of a span of log time are placed: the transforms of one session.
 
     `since`: from when on it lends them.
@@ -439,7 +447,7 @@ def _joined(parts: Sequence[Placed]) -> Placed:
     return Placed._make((*(column[order] for column in columns), left_out))
 
 
-def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
+def _placed(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
     turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
     x, y, z = (column.copy() for column in poses.positions.T)
@@ -461,7 +469,7 @@ def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> Placed:
+def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     of_body = [edge for (_, child), edge in edges.items() if child == body.child]
     times = np.concatenate([edge.log_times for edge in of_body] or [np.zeros(0, np.int64)])
@@ -488,12 +496,12 @@ def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
     return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
 
 
-def _inside(times: Times, window: TimeWindow) -> Times:
+def _positions_in(times: Times, window: TimeWindow) -> Times:
     """Returns the positions of those times that are in a window."""
     return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
-def _by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
+def _tracks_by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
     """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
 
     Where several recordings place a robot at a time, that which began first is in the track; of

@@ -119,7 +119,7 @@ def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarPoint |
         ]
     )
     tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
-    away = _away(points[tried], other)
+    away = _distances_to(points[tried], other)
     farthest = int(np.argmax(away))
     nth = int(tried[farthest])
     x, y = points[nth].tolist()
@@ -150,7 +150,7 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
         size *= 2
 
 
-def _away(points: Floats, steps: _Steps) -> list[float]:
+def _distances_to(points: Floats, steps: _Steps) -> list[float]:
     """Returns how far (m) each of some points is from the nearest step."""
     along, begin = steps.end - steps.begin, steps.begin
     (along_x, along_y), (begin_x, begin_y) = along.T.copy(), begin.T.copy()

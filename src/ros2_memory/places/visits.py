@@ -278,7 +278,7 @@ class RegionVisits:
         ]
         by_track.sort(key=lambda visit: visit.whole, reverse=True)
         self._looked_at = 0
-        self.every = [visit for visit in map(self._seen, by_track) if visit is not None]
+        self.every = [visit for visit in map(self._confirmed, by_track) if visit is not None]
 
     @property
     def duration(self) -> Ns:
@@ -338,12 +338,12 @@ class RegionVisits:
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = [*self._inside(*poses[:3])]
+        inside = [*self._times_inside(*poses[:3])]
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
 
-    def _seen(self, visit: RegionVisit) -> RegionVisit | None:
+    def _confirmed(self, visit: RegionVisit) -> RegionVisit | None:
         """Returns a visit; None where no pose in the window is inside: the line alone touches.
 
         The newest `_MOST_TRIED` visits without a vertex inside are looked at.
@@ -352,16 +352,18 @@ class RegionVisits:
         # So near to the window's ends, poses decide on which side a visit begins, or ends.
         room = TRACK_SLICE_NS
         if window.start + room <= whole.start and whole.stop < window.stop - room:
-            self._looked_at += not (has_vertex := any(True for _ in self._vertices(track, whole)))
+            self._looked_at += not (
+                has_vertex := any(True for _ in self._vertices_inside(track, whole))
+            )
             if has_vertex or self._looked_at > _MOST_TRIED:
                 return visit
         exact = self._by_poses(visit)
         if exact is None or not window.overlaps(exact.start, exact.stop):
             return None
         cut = exact.within(window)
-        if cut != exact and not any(True for _ in self._vertices(track, cut)):
+        if cut != exact and not any(True for _ in self._vertices_inside(track, cut)):
             poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
-            if not any(True for _ in self._inside(*poses[:3])):
+            if not any(True for _ in self._times_inside(*poses[:3])):
                 return None
         inside = visit.inside._replace(entered=cut.entered, left=cut.left)
         return visit._replace(inside=inside)
@@ -372,33 +374,33 @@ class RegionVisits:
         None where no pose is inside: the robot's line alone touches the region.
         """
         whole = visit.whole
-        within = [*self._vertices(visit.track, whole)]
+        within = [*self._vertices_inside(visit.track, whole)]
         start, stop = whole.start, whole.stop
         if whole.entered:
             poses = self._poses_around(visit.track, whole.start)
-            inside = [time for time in self._inside(*poses) if time <= whole.stop]
+            inside = [time for time in self._times_inside(*poses) if time <= whole.stop]
             others = [back for left, back in _absences(poses[0], inside) if left < whole.start]
             inside = [time for time in inside if time >= max(others, default=MIN_NS)]
             start = min((*inside[:1], *within[:1]), default=MAX_NS)
         if whole.left:
             poses = self._poses_around(visit.track, whole.stop)
-            inside = [time for time in self._inside(*poses) if time >= whole.start]
+            inside = [time for time in self._times_inside(*poses) if time >= whole.start]
             others = [left for left, back in _absences(poses[0], inside) if back > whole.stop]
             inside = [time for time in inside if time <= min(others, default=MAX_NS)]
             stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
         return whole._replace(start=start, stop=stop) if start <= stop else None
 
-    def _inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
+    def _times_inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
         """Yields those of some times at which the robot was in the region."""
         rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
         return (time for time, *place in rows if self._region.contains(*place))
 
-    def _vertices(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
+    def _vertices_inside(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
         """Yields the times of a visit's vertices that are inside."""
         first = int(np.searchsorted(track.times, stay.start, side="left"))
         last = int(np.searchsorted(track.times, stay.stop, side="right"))
         visit = slice(first, last)
-        return self._inside(track.times[visit], track.x[visit], track.y[visit])
+        return self._times_inside(track.times[visit], track.x[visit], track.y[visit])
 
     def _poses_around(self, track: RobotTrack, at: Ns) -> tuple[Times, Floats, Floats]:
         """Returns the poses between the vertices before and after a time, these included."""

@@ -122,15 +122,15 @@ def parse_where(
     Raises:
         InvalidArgumentsError: it is no region, or no place has that name.
     """
-    several = _several(limits, value)
+    several = _places_by_name(limits, value)
     if several is None:
-        return _one(limits, value, default_radius_m, what)
+        return _parse_place(limits, value, default_radius_m, what)
     if len(several) > _MOST_PLACES:
         raise InvalidArgumentsError(
             f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
     by_name = (
-        (name, _one(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}"))
+        (name, _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}"))
         for name, place_value in several.items()
     )
     places = tuple(
@@ -143,7 +143,7 @@ def parse_where(
     return Where(region, _frame_of(places), names, places)
 
 
-def _several(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
+def _places_by_name(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
     """Returns places by name; None of a value that is to be one place."""
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
@@ -172,11 +172,11 @@ def _frame_of(several: Sequence[Where]) -> str | None:
     return next(iter(name_by_frame), None)
 
 
-def _one(
+def _parse_place(
     limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        return _named(limits, value, what)
+        return _place_by_name(limits, value, what)
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - _OF_REGION
@@ -186,9 +186,9 @@ def _one(
     if isinstance(x, list) or isinstance(y, list):
         if "radius_m" in value:
             raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
-        return Where(Rectangle(*_bounds(f"{what}: x", x), *_bounds(f"{what}: y", y)))
+        return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
-    numbers = [_number(number) for number in (x, y, radius)]
+    numbers = [_finite_number(number) for number in (x, y, radius)]
     if None in numbers or not (numbers[2] or 0) > 0:
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     at_x, at_y, size = (number or 0.0 for number in numbers)
@@ -214,7 +214,7 @@ def _place_named(limits: QuerySettings, name: str) -> Place | None:
     return next(same, None)
 
 
-def _named(limits: QuerySettings, name: str, what: str) -> Where:
+def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
     place = _place_named(limits, name)
     if place is not None:
         return Where(place.region, place.frame_id, place.name)
@@ -224,8 +224,8 @@ def _named(limits: QuerySettings, name: str, what: str) -> Where:
     raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(name)}; {listed}")
 
 
-def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
-    ends = [_number(bound) for bound in value] if isinstance(value, list) else []
+def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
+    ends = [_finite_number(bound) for bound in value] if isinstance(value, list) else []
     if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
         raise InvalidArgumentsError(
             f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
@@ -233,7 +233,7 @@ def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
     return ends[0], ends[1]
 
 
-def _number(value: JsonValue) -> float | None:
+def _finite_number(value: JsonValue) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -301,7 +301,7 @@ class Scope:
             mixed = note_robots(view, resolve_path_topic(view), window)
             known = placed_times(joined.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
-        self._states = [_States(view, other) for other in during]
+        self._states = [_ConditionStates(view, other) for other in during]
         for state, condition in zip(self._states, during, strict=True):
             known = state.known_in(window)
             unknown = unknown_times(view, window, known, f"what {condition.topic} said")
@@ -358,7 +358,7 @@ def joined_in_region(view: View, where: Where, window: TimeWindow) -> JoinedTrac
     return joined
 
 
-class _States:
+class _ConditionStates:
     """Whether the newest message of a topic met a condition; moments are asked newest first.
 
     Messages are read bag by bag: those around the moment, and the newest one before.

@@ -19,9 +19,9 @@ from ros2_memory.analysis.motion.path_length import (
     FEWEST,
     SPEED_STEPS,
     End,
-    Marks,
-    Numbers,
-    Rows,
+    Flags,
+    Floats,
+    Vectors,
     measured,
 )
 from ros2_memory.core.arrays import row_sums
@@ -357,10 +357,10 @@ class MeasuredPath(NamedTuple):
     totals: MotionTotals
     step_mps: float
     parted: tuple[int, ...]
-    steps_m: Numbers
+    steps_m: Floats
 
 
-def measured_path(times: Times, positions: Rows, fastest_mps: float) -> MeasuredPath:
+def measured_path(times: Times, positions: Vectors, fastest_mps: float) -> MeasuredPath:
     """Measures poses: the more at a time, the better noise is distinguished from driving.
 
     Args:
@@ -397,7 +397,7 @@ def measured_path(times: Times, positions: Rows, fastest_mps: float) -> Measured
     return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), steps_m)
 
 
-def _odd_steps(apart: Times, steps_m: Numbers, fastest_mps: float) -> list[int]:
+def _odd_steps(apart: Times, steps_m: Floats, fastest_mps: float) -> list[int]:
     """Returns after which poses a gap, a jump or a reset may be."""
     plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
     beside_m = np.maximum(
@@ -408,7 +408,7 @@ def _odd_steps(apart: Times, steps_m: Numbers, fastest_mps: float) -> list[int]:
     return steps
 
 
-def _poses(times: Times, positions: Rows, begin: int, end: int) -> list[TimedPosition]:
+def _poses(times: Times, positions: Vectors, begin: int, end: int) -> list[TimedPosition]:
     places = zip(times[begin:end].tolist(), positions[begin:end].tolist(), strict=True)
     return [TimedPosition(time, (x, y, z)) for time, (x, y, z) in places]
 
@@ -427,7 +427,7 @@ class Motion:
         self.totals = MotionTotals()
         self.step_mps = 0.0
 
-    def add_leg(self, times: Times, positions: Rows) -> Numbers:
+    def add_leg(self, times: Times, positions: Vectors) -> Floats:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
         piece = measured((times - times[0]) / NS_PER_S, positions)
@@ -535,9 +535,9 @@ def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
     return median_low(near or [known or own_ns])
 
 
-def are_places(positions: Rows) -> Marks:
+def are_places(positions: Vectors) -> Flags:
     """Returns which coordinates, as rows, are a place: finite, and on Earth."""
     x, y, z = np.abs(positions).T
     # A comparison with NaN is false, so this one refuses all three kinds.
-    marks: Marks = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
+    marks: Flags = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
     return marks

@@ -129,12 +129,12 @@ def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     Of several of one time the first. They are in order of time, or of recordings and then of time.
     """
     numbers = np.broadcast_to(recordings, times.shape)
-    first = np.flatnonzero(_differ(times, numbers))
-    is_new = _differ(times[first] // _SLOT_NS, numbers[first])
+    first = np.flatnonzero(_is_new(times, numbers))
+    is_new = _is_new(times[first] // _SLOT_NS, numbers[first])
     return first[is_new | _is_last(is_new)]
 
 
-def _differ(*columns: Times) -> Mask:
+def _is_new(*columns: Times) -> Mask:
     """Returns which rows differ from the row before; the first one does."""
     differ = np.ones(len(columns[0]), np.bool_)
     differ[1:] = np.logical_or.reduce([np.diff(column) != 0 for column in columns])
@@ -173,7 +173,7 @@ def track_by(whole: TrackPart, recordings: Times, fastest_mps: float = math.inf)
     """
     order = _in_time(whole.times)
     whole, recordings = whole.some(order), recordings[order]
-    turns = _continuous(whole.turns, ~_differ(recordings))
+    turns = _continuous(whole.turns, ~_is_new(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
@@ -193,7 +193,7 @@ def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, 
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
-    are_known = whole.settled & ~_differ(numbers)
+    are_known = whole.settled & ~_is_new(numbers)
     are_known[1:] &= whole.settled[:-1]
     whole = whole._replace(turns=_continuous(whole.turns, are_known))
     vertices = _vertices(whole, whole.settled, numbers)
@@ -204,7 +204,7 @@ def _in_time(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     """Returns the order of times in each recording, of equal ones the first alone."""
     numbers = np.broadcast_to(recordings, times.shape)
     order = np.lexsort((times, numbers))
-    return order[_differ(times[order], numbers[order])]
+    return order[_is_new(times[order], numbers[order])]
 
 
 def _continuous(turns: Times, are_known: Mask) -> Times:
@@ -219,7 +219,7 @@ def _continuous(turns: Times, are_known: Mask) -> Times:
 def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
     """Returns which poses are vertices: those to keep, and what their slices need besides."""
     times = part.times
-    is_first = _differ(times // TRACK_SLICE_NS, recordings)
+    is_first = _is_new(times // TRACK_SLICE_NS, recordings)
     kept = keeps | is_first | _is_last(is_first)
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
     waiting = np.flatnonzero(~kept)

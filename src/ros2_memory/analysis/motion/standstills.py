@@ -421,7 +421,7 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
         if box.diagonal <= DRIFTED_M:
             stands.append(Standstill(start, end, box))
         else:
-            stands += _in_run(corners, firsts[begin:stop], begin, start, end)
+            stands += _split_by_drift(corners, firsts[begin:stop], begin, start, end)
         until = stands[-1].end
     return tuple(stands)
 
@@ -445,7 +445,7 @@ def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
     return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
 
 
-def _in_run(
+def _split_by_drift(
     corners: tuple[Vectors, Vectors], firsts: Ints, first: int, start: Ns, end: Ns
 ) -> Iterator[Standstill]:
     """Yields the standstills of consecutive still blocks, of a robot that drifts away.

@@ -286,7 +286,7 @@ NO_LINE: Final = Line(
 
 def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     """Joins slices in order, of which there is one at least; see `path_slice`."""
-    slices = [*_together(slices, fastest_mps)]
+    slices = [*_measured_together(slices, fastest_mps)]
     motion = Motion(fastest_mps)
     jumped: list[bool] = []
     added: list[float] = []
@@ -345,7 +345,7 @@ def drawn(line: Line, at_most: int, error_m: float = 0.0) -> tuple[tuple[Waypoin
     return waypoints, error_m + off_m
 
 
-def _together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
+def _measured_together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
     """Yields the slices; of consecutive ones with few poses each one of all these poses."""
     for are_few, run in groupby(slices, key=lambda part: part.few is not None):
         parts = [*run]
