@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
@@ -74,17 +75,17 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-class PathSince(NamedTuple):
+class PathBackTo(NamedTuple):
     """The path of a window, None where there is no message.
 
     From `since` (log time, ns) on, where older bags were not read.
     """
 
-    way: PathSlice | None
+    path: PathSlice | None
     since: Ns | None = None
 
 
-def driven_path(view: View, topic: str, window: TimeWindow) -> PathSince:
+def driven_path(view: View, topic: str, window: TimeWindow) -> PathBackTo:
     """Does as `path_by_poses`; a note says how far back it is known where not all was read."""
     path = path_by_poses(view, topic, window)
     if path.since is not None:
@@ -95,7 +96,7 @@ def driven_path(view: View, topic: str, window: TimeWindow) -> PathSince:
     return path
 
 
-def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathSince:
+def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
     """Returns the path in a window by the poses of one topic.
 
     Messages that cannot be decoded are left out, with a note.
@@ -116,8 +117,10 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathSince:
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        for start, part in slices_of_path(view, topic, window, failures, reached):  # noqa: B007
-            slices += [part] if part.poses or part.invalid else []
+        for at, part in slices_of_path(view, topic, window, failures, reached):
+            start = at
+            if part.poses or part.invalid:
+                slices.append(part)
     except QueryTimeoutError:
         if not slices:
             raise
@@ -128,7 +131,7 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathSince:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return PathSince(joined_slices(slices[::-1], fastest) if slices else None, since)
+    return PathBackTo(joined_slices(slices[::-1], fastest) if slices else None, since)
 
 
 def slices_of_path(
@@ -447,9 +450,8 @@ def newest_of_body(
         own_session = None
     for stored in view.stream.messages(topics, window, newest_first=True):
         for transform in decoded_transforms(view, [stored]):
-            if transform.child.lstrip("/") != body.child or (
-                own_session and not sessions.has(own_session, stored)
-            ):
+            is_of_session = not own_session or sessions.has(own_session, stored)
+            if transform.child.lstrip("/") != body.child or not is_of_session:
                 continue
             clock = frames_of(view, (), [transform], parent).clock
             moment = transform.stamp if clock == "stamp" else transform.log_time
@@ -480,25 +482,34 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions, parent = sessions_of(view), body.parent
+    sessions = sessions_of(view)
     for session in dict.fromkeys(sessions.of(span.bag.recording) for span in bags):
-        moving = moving_in(view, window.widened(TF_CACHE_NS), session)
-        frames = frames_of(view, static_transforms(view, session), moving, parent)
-        of_body = [transform for transform in moving if transform.child.lstrip("/") == body.child]
-        of_body = [transform for transform in of_body if window.contains(transform.log_time)]
-        moments = [
-            transform.stamp if frames.clock == "stamp" else transform.log_time
-            for transform in of_body
-        ]
-        placed = frames.poses(body.child, np.array(moments, np.int64))
-        if placed is None:
-            continue
-        last = MIN_NS
-        # None is before the first transform of the map, or in its gap.
-        for nth in np.flatnonzero(placed.valid).tolist():
-            if of_body[nth].log_time - last >= _STEP_NS:
-                last = of_body[nth].log_time
-                there = placed.at(nth)
-                poses[last] = Pose(there.translation, there.rotation, parent)
+        poses.update(_poses_of_body_in(view, window, session, body))
         view.bags.check_deadline()
     return sorted(poses.items())
+
+
+def _poses_of_body_in(
+    view: View, window: TimeWindow, session: Session, body: Body
+) -> Iterator[tuple[Ns, Pose]]:
+    """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
+    moving = moving_in(view, window.widened(TF_CACHE_NS), session)
+    frames = frames_of(view, static_transforms(view, session), moving, body.parent)
+    of_body = [
+        transform
+        for transform in moving
+        if transform.child.lstrip("/") == body.child and window.contains(transform.log_time)
+    ]
+    log_times = [transform.log_time for transform in of_body]
+    stamps = [transform.stamp for transform in of_body]
+    moments = stamps if frames.clock == "stamp" else log_times
+    placed = frames.poses(body.child, np.array(moments, np.int64))
+    if placed is None:
+        return
+    last = MIN_NS
+    # None is before the first transform of the map, or in its gap.
+    for nth in np.flatnonzero(placed.valid).tolist():
+        if log_times[nth] - last >= _STEP_NS:
+            last = log_times[nth]
+            there = placed.at(nth)
+            yield last, Pose(there.translation, there.rotation, body.parent)

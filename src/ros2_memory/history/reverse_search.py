@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import re
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -271,6 +271,14 @@ class RowCondition:
         return Kept(surely, perhaps)
 
 
+class _TableCandidates(NamedTuple):
+    """A table's last log time (ns), its topic, and when messages of it may match."""
+
+    last: Ns
+    topic: str
+    times: list[Ns]
+
+
 class CandidateRows:
     """Finds the times of messages that may meet a condition, before a moment.
 
@@ -313,22 +321,20 @@ class CandidateRows:
 
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
-        ready, before = self._ready, (MAX_NS, "")
-        tables = heapq.merge(
-            *map(self._candidates_of_topic, self._left), key=lambda table: -table[0]
-        )
-        for last, topic, times in chain(tables, [(MIN_NS - 1, "", list[Ns]())]):
+        ready, newer = self._ready, (MAX_NS, "")
+        tables = heapq.merge(*map(self._tables_of, self._left), key=lambda table: -table.last)
+        for table in chain(tables, [_TableCandidates(MIN_NS - 1, "", [])]):
             # What is left is no newer than the next table.
-            while ready and -ready[0][0] > last:
-                candidate = heapq.heappop(ready)
-                if candidate != before:
-                    yield -candidate[0], candidate[1]
-                before = candidate
-            for time in times:
-                heapq.heappush(ready, (-time, topic))
+            while ready and -ready[0][0] > table.last:
+                negative, topic = heapq.heappop(ready)
+                if (negative, topic) != newer:
+                    yield -negative, topic
+                newer = negative, topic
+            for time in table.times:
+                heapq.heappush(ready, (-time, table.topic))
 
-    def _candidates_of_topic(self, topic: str) -> Iterator[tuple[Ns, str, list[Ns]]]:
-        """Yields for each table of a topic its last log time, and when messages may match."""
+    def _tables_of(self, topic: str) -> Iterator[_TableCandidates]:
+        """Yields what each table of a topic has, the newest first."""
 
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)
@@ -345,7 +351,7 @@ class CandidateRows:
         ):
             times = self._candidates(rows)
             reached(rows.last)
-            yield rows.last, topic, times.tolist()
+            yield _TableCandidates(rows.last, topic, times.tolist())
         self._left[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:

@@ -204,17 +204,18 @@ def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     """Returns the newest recordings with static transforms, of this program's one in a folder."""
     topics = view.limits.tf_static_topics
     root = f"{view.bag_dir}/"
-    newest: dict[str, tuple[str, Sequence[BagFile]]] = {}
+    bags_of: dict[str, Sequence[BagFile]] = {}
+    newest: dict[str, str] = {}
     for path, bags in recordings_of(view.snapshot).items():
         folder, _, name = path.rpartition("/")
         holding = [bag for bag in bags if any(map(bag.summary.schema.positions.get, topics))]
         if holding and not is_kept_apart(path.removeprefix(root)):
-            key = folder if has_own_name(name) else path
-            before = newest.get(key)
-            if before is None or before[1][0].start < holding[0].start:
-                newest[key] = (path, holding)
-    ordered = sorted(newest.values(), key=lambda recording: recording[1][0].start)
-    return ordered[-_MAX_TREES:] if len(ordered) > 1 else []
+            bags_of[path] = holding
+            maker = folder if has_own_name(name) else path
+            if maker not in newest or bags_of[newest[maker]][0].start < holding[0].start:
+                newest[maker] = path
+    ordered = sorted(newest.values(), key=lambda path: bags_of[path][0].start)
+    return [(path, bags_of[path]) for path in ordered[-_MAX_TREES:]] if len(ordered) > 1 else []
 
 
 def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
@@ -364,9 +365,9 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
-    spans = [(*span, path) for path, span in recordings.items()]
-    for first, last, path in sorted(span for span in spans if window.overlaps(span[0], span[1])):
-        open_spans = [span for span in open_spans if span[1] >= first]
+    spans = [(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
+    for first, last, path in sorted(spans):
+        open_spans = [(since, until, other) for since, until, other in open_spans if until >= first]
         for since, until, other in open_spans:
             span = TimeWindow(first, min(last, until) + 1)
             if window.overlaps(span.start, span.stop - 1):
@@ -385,9 +386,10 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
             continue
         series, number = after
         twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        splits = [(split_of(bag.file), bag) for bag in view.timeline.overlapping(twice)]
         numbered = [
-            (split[1], bag) for split, bag in splits if split is not None and split[0] == series
+            (split[1], bag)
+            for bag in view.timeline.overlapping(twice)
+            if (split := split_of(bag.file)) is not None and split[0] == series
         ]
         begin = min((bag.start for nth, bag in numbered if nth < number), default=twice.stop)
         span = TimeWindow(min(max(begin, twice.start), twice.stop), twice.stop)

@@ -243,19 +243,19 @@ class RobotTracks:
         for rows in opened.rows(newest_first=True, among=searched):
             if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
                 continue
-            groups = self._lent_spans(rows, TimeWindow.everything())
-            key = self._rows_key(rows, groups, scans)
+            lent_spans = self._lent_spans(rows, TimeWindow.everything())
+            key = self._rows_key(rows, lent_spans, scans)
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
-                yield rows.first, self._part(rows, key, groups, reading)
+                yield rows.first, self._part(rows, key, lent_spans, reading)
                 continue
             stored = self._known(key)
             if stored is not None and not stored.left_out:
                 yield rows.first, stored.some(_positions_in(stored.times, window))
             elif (inside := _positions_in(rows.times, window)).size:
-                groups = self._lent_spans(rows, window)
-                yield rows.first, self._part(rows.some(inside), None, groups, reading)
+                lent_spans = self._lent_spans(rows, window)
+                yield rows.first, self._part(rows.some(inside), None, lent_spans, reading)
 
     def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
@@ -306,36 +306,40 @@ class RobotTracks:
         return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
 
     def _part(
-        self, rows: Rows, key: FragmentKey | None, groups: Sequence[_LentSpan], reading: Deadline
+        self,
+        rows: Rows,
+        key: FragmentKey | None,
+        lent_spans: Sequence[_LentSpan],
+        reading: Deadline,
     ) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
 
         def make() -> TrackPart:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
-            placed = self._placed(rows, groups)
+            placed = self._poses_of(rows, lent_spans)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
             return track_part(*placed)._replace(recording=recording)
 
         return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
 
     def _rows_key(
-        self, rows: Rows, groups: Sequence[_LentSpan], scans: Sequence[Scan]
+        self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]
     ) -> FragmentKey | None:
         """Returns what the track by some rows follows from; None where that may still change."""
         if rows.part is None:
             return None
         parts, placed_by = [rows.part], []
-        for group in groups:
-            moving = self._moving_parts(scans, group.span)
+        for lent in lent_spans:
+            moving = self._moving_parts(scans, lent.span)
             if moving is None:
                 return None
-            sessions, session = sessions_of(self._view), group.session
+            sessions, session = sessions_of(self._view), lent.session
             used = [part for part, path in moving.items() if sessions.folder(path) in session]
             parts += [part for part in used if part not in parts]
-            static = static_in(static_transforms(self._view, session), group.span)
+            static = static_in(static_transforms(self._view, session), lent.span)
             # By their places among the parts: those of one recording have one text.
-            placed_by.append((group.since, tuple(static), [parts.index(part) for part in used]))
+            placed_by.append((lent.since, tuple(static), [parts.index(part) for part in used]))
         return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
 
     def _lent_spans(self, rows: Rows, window: TimeWindow) -> list[_LentSpan]:
@@ -345,11 +349,11 @@ class RobotTracks:
         lenders = self._lenders(rows)
         ends = [since for since, _ in lenders[1:]] + [MAX_NS]
         whole = TimeWindow(rows.first, rows.last + 1).intersect(window)
-        groups = [
+        lent_spans = [
             _LentSpan(since, whole.intersect(TimeWindow(since, end)), session)
             for (since, session), end in zip(lenders, ends, strict=True)
         ]
-        return [group for group in groups if not group.span.empty]
+        return [lent for lent in lent_spans if not lent.span.empty]
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
@@ -360,13 +364,12 @@ class RobotTracks:
         first, last = (self._lender_at(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [(MIN_NS, first)]
-        slices = (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist()
-        lenders = [(at, self._lender_at(recording, at)) for at in slices]
-        return [
-            lender
-            for nth, lender in enumerate(lenders)
-            if not nth or lender[1] != lenders[nth - 1][1]
-        ]
+        lenders: list[tuple[Ns, Session]] = []
+        for at in (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist():
+            lender = self._lender_at(recording, at)
+            if not lenders or lenders[-1][1] != lender:
+                lenders.append((at, lender))
+        return lenders
 
     def poses(self, window: TimeWindow) -> Placed:
         """Returns all poses in a short window, in order.
@@ -377,10 +380,10 @@ class RobotTracks:
         placed = [NOWHERE]
         for topic in self._topics:
             placed += [
-                self._placed(rows, self._lent_spans(rows, window))
+                self._poses_of(rows, self._lent_spans(rows, window))
                 for rows in scan(self._view, topic, window)
             ]
-        return _joined(placed)
+        return _in_time_order(placed)
 
     def _lender_at(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none, or another."""
@@ -389,22 +392,22 @@ class RobotTracks:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _placed(self, rows: Rows, groups: Sequence[_LentSpan]) -> Placed:
-        """Returns the poses of some rows."""
+    def _poses_of(self, rows: Rows, lent_spans: Sequence[_LentSpan]) -> Placed:
+        """Returns the poses of some rows in the frame; without lent spans as they are."""
         if self._body is None:
             poses = self._reader.poses(rows)
-        if not groups:
-            return _placed(poses, None, self._frame_id)
+        if not lent_spans:
+            return _placed_poses(poses, None, self._frame_id)
         placed: list[Placed] = []
-        for group in groups:
-            frames = frames_over(self._view, group.session, group.span, self._frame_id)
+        for lent in lent_spans:
+            frames = frames_over(self._view, lent.session, lent.span, self._frame_id)
             if self._body is None:
-                of_group = poses.between(group.span.start, group.span.stop)
-                placed.append(_placed(of_group, frames, self._frame_id))
+                of_span = poses.between(lent.span.start, lent.span.stop)
+                placed.append(_placed_poses(of_span, frames, self._frame_id))
             else:
-                edges = edges_of_rows(self._view, rows, group.session)
-                placed.append(_placed_body(edges, self._body, frames, group.span))
-        return _joined(placed)
+                edges = edges_of_rows(self._view, rows, lent.session)
+                placed.append(_placed_body(edges, self._body, frames, lent.span))
+        return _in_time_order(placed)
 
 
 class _LentSpan(NamedTuple):
@@ -439,15 +442,20 @@ class Placed(NamedTuple):
 NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0), 0)
 
 
-def _joined(parts: Sequence[Placed]) -> Placed:
+def _in_time_order(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    columns = [np.concatenate(column) for column in zip(*(part[:4] for part in parts), strict=True)]
-    order = np.argsort(columns[0], kind="stable")
-    left_out = sum(part.left_out for part in parts)
-    return Placed._make((*(column[order] for column in columns), left_out))
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    return Placed(
+        times[order],
+        np.concatenate([part.x for part in parts])[order],
+        np.concatenate([part.y for part in parts])[order],
+        np.concatenate([part.heading for part in parts])[order],
+        sum(part.left_out for part in parts),
+    )
 
 
-def _placed(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
+def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
     turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
     x, y, z = (column.copy() for column in poses.positions.T)

@@ -31,12 +31,13 @@ from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
+    MapPlacement,
     joined_in,
     map_placement,
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Inside, RobotTracks, times_inside
+from ros2_memory.places.robot_tracks import Inside, Placed, RobotTracks, times_inside
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import PlaceVisits, Visit, Visits
 
@@ -85,37 +86,14 @@ def visits(
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
-    asked = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, topic, asked)
+    asked_frame = frame_id if named_frame is None else named_frame
+    placement = map_placement(view, topic, asked_frame)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
-        table = [
-            (place, RegionVisits(view, place.frame_id, place.region, window))
-            for place, _ in places_in(view, memory.limits.places, placement, window)
-        ]
-        rows = (place_visits(region_visits, place.name) for place, region_visits in table)
-        places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
-        tracks = {
-            place.frame_id: region_visits.joined.track for place, region_visits in table
-        }.values()
-        been = any(row.duration for row in places)
-        note_unread(view, window, nothing=not been, gaps=not been)
-        return Visits(
-            frame_id=placement.frame_id,
-            x=None,
-            y=None,
-            radius_m=None,
-            visits=(),
-            more=False,
-            total=sum(row.entries for row in places),
-            now=now,
-            places=places,
-            unknown=_unknown(view, window, tracks, mixed),
-            notes=view.notes.sentences(),
-        )
+        return _visits_of_places(view, window, placement, mixed, now)
     region_visits = RegionVisits(view, placement.frame_id, place.region, window)
     track, all_visits = region_visits.joined.track, region_visits.every
-    newest = _newest(view, topic, track, window, now + FUTURE_NS)
+    newest = _newest_pose_time(view, topic, track, window, now + FUTURE_NS)
     # A newer pose shows where the robot is now.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
     current = newest if newest is not None and newest >= stale else None
@@ -124,21 +102,11 @@ def visits(
     )
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not all_visits and asked is None:
+    if not all_visits and asked_frame is None:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
     view.notes.retract_outside(window)
-    note_unread(view, window, nothing=not shown, gaps=not shown)
-    if newest is not None and any(visit.departed == newest for visit in shown):
-        view.notes.add(
-            f"the newest pose, at {unix_text(newest)}, is too old to know whether the robot is "
-            "there now: departed is the time of that pose"
-        )
-    if any(visit.restarts for visit in shown):
-        view.notes.add(
-            "visits with restarts_since are from before odometry restarted: "
-            "the same coordinates may have been another place"
-        )
+    _note_shown(view, window, shown, newest)
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
         frame_id=placement.frame_id,
@@ -158,6 +126,49 @@ def visits(
         reaches_now=newest is not None,
         notes=view.notes.sentences(),
     )
+
+
+def _visits_of_places(
+    view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, now: Ns
+) -> Visits:
+    """Returns how often and for how long the robot was in each named place, the longest first."""
+    visited = [
+        (place, RegionVisits(view, place.frame_id, place.region, window))
+        for place, _ in places_in(view, view.limits.places, placement, window)
+    ]
+    rows = (place_visits(region_visits, place.name) for place, region_visits in visited)
+    places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
+    tracks = {place.frame_id: region_visits.joined.track for place, region_visits in visited}
+    was_in_one = any(row.duration for row in places)
+    note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
+    return Visits(
+        frame_id=placement.frame_id,
+        x=None,
+        y=None,
+        radius_m=None,
+        visits=(),
+        more=False,
+        total=sum(row.entries for row in places),
+        now=now,
+        places=places,
+        unknown=_unknown(view, window, tracks.values(), mixed),
+        notes=view.notes.sentences(),
+    )
+
+
+def _note_shown(view: View, window: TimeWindow, shown: Sequence[Visit], newest: Ns | None) -> None:
+    """Adds notes on what the visits shown leave open; `newest` is the time of the newest pose."""
+    note_unread(view, window, nothing=not shown, gaps=not shown)
+    if newest is not None and any(visit.departed == newest for visit in shown):
+        view.notes.add(
+            f"the newest pose, at {unix_text(newest)}, is too old to know whether the robot is "
+            "there now: departed is the time of that pose"
+        )
+    if any(visit.restarts for visit in shown):
+        view.notes.add(
+            "visits with restarts_since are from before odometry restarted: "
+            "the same coordinates may have been another place"
+        )
 
 
 def asked_place(
@@ -198,7 +209,9 @@ def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed
     return elapsed_in(view, window).among(united(chain.from_iterable(spans)))
 
 
-def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns) -> Ns | None:
+def _newest_pose_time(
+    view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns
+) -> Ns | None:
     """Returns the time of the newest pose until `last`, where the window reaches as far."""
     message = view.stream.newest(topic, TimeWindow(MIN_NS, last + 1))
     if message is None or window.stop <= message.time:
@@ -268,7 +281,7 @@ class RegionVisits:
         self.joined = joined_in(view, frame_id, window)
         self.elapsed = elapsed_in(view, window)
         self._region, self._window = region, window
-        # What shows that a visit is one shows where it begins, too.
+        # The poses that confirm a visit show where it begins, too.
         self._poses = lru_cache(2 * _MOST_TRIED)(RobotTracks(view, frame_id).poses)
         by_track = [
             RegionVisit(stay.within(window), stay, track)
@@ -338,7 +351,7 @@ class RegionVisits:
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = [*self._times_inside(*poses[:3])]
+        inside = [*self._poses_inside(poses)]
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
@@ -363,7 +376,7 @@ class RegionVisits:
         cut = exact.within(window)
         if cut != exact and not any(True for _ in self._vertices_inside(track, cut)):
             poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
-            if not any(True for _ in self._times_inside(*poses[:3])):
+            if not any(True for _ in self._poses_inside(poses)):
                 return None
         inside = visit.inside._replace(entered=cut.entered, left=cut.left)
         return visit._replace(inside=inside)
@@ -378,17 +391,20 @@ class RegionVisits:
         start, stop = whole.start, whole.stop
         if whole.entered:
             poses = self._poses_around(visit.track, whole.start)
-            inside = [time for time in self._times_inside(*poses) if time <= whole.stop]
-            others = [back for left, back in _absences(poses[0], inside) if left < whole.start]
+            inside = [time for time in self._poses_inside(poses) if time <= whole.stop]
+            others = [back for left, back in _absences(poses.times, inside) if left < whole.start]
             inside = [time for time in inside if time >= max(others, default=MIN_NS)]
             start = min((*inside[:1], *within[:1]), default=MAX_NS)
         if whole.left:
             poses = self._poses_around(visit.track, whole.stop)
-            inside = [time for time in self._times_inside(*poses) if time >= whole.start]
-            others = [left for left, back in _absences(poses[0], inside) if back > whole.stop]
+            inside = [time for time in self._poses_inside(poses) if time >= whole.start]
+            others = [left for left, back in _absences(poses.times, inside) if back > whole.stop]
             inside = [time for time in inside if time <= min(others, default=MAX_NS)]
             stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
         return whole._replace(start=start, stop=stop) if start <= stop else None
+
+    def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
+        return self._times_inside(poses.times, poses.x, poses.y)
 
     def _times_inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
         """Yields those of some times at which the robot was in the region."""
@@ -402,12 +418,12 @@ class RegionVisits:
         visit = slice(first, last)
         return self._times_inside(track.times[visit], track.x[visit], track.y[visit])
 
-    def _poses_around(self, track: RobotTrack, at: Ns) -> tuple[Times, Floats, Floats]:
+    def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
         """Returns the poses between the vertices before and after a time, these included."""
         times = track.times
         before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
         after = min(int(np.searchsorted(times, at, side="right")), len(times) - 1)
-        return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
+        return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))
 
     def _closest(self, track: RobotTrack, stay: Inside, circle: Circle) -> tuple[float, Ns]:
         """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
@@ -428,11 +444,11 @@ class RegionVisits:
         nearest = int(off.argmin())
         lasted = int(inner[nearest + 1] - inner[nearest])
         at = int(inner[nearest] + round(float(along[nearest]) * lasted))
-        times, x, y = self._poses_around(track, at)
-        away_m = np.hypot(x - circle.x, y - circle.y)
-        near = (times >= stay.start) & (times <= stay.stop)
-        poses = zip(away_m[near].tolist(), times[near].tolist(), strict=True)
-        return min(poses, default=(float(min(off[nearest], circle.radius_m)), at))
+        poses = self._poses_around(track, at)
+        away_m = np.hypot(poses.x - circle.x, poses.y - circle.y)
+        near = (poses.times >= stay.start) & (poses.times <= stay.stop)
+        approaches = zip(away_m[near].tolist(), poses.times[near].tolist(), strict=True)
+        return min(approaches, default=(float(min(off[nearest], circle.radius_m)), at))
 
 
 def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
