@@ -193,7 +193,15 @@ def position(
     name = resolve_path_topic(view, topic, degrees=True)
     body = robot_body(view) if name in memory.limits.tf_topics else None
     if body is not None:
-        return _position_of_body(view, body, (at, tolerance_s, moment.rest_s), now, frame_id)
+        return _position_of_body(
+            view,
+            body,
+            at,
+            tolerance_s=tolerance_s,
+            rest_s=moment.rest_s,
+            now=now,
+            frame_id=frame_id,
+        )
     _require_kind(view, name, "position", "geodetic")
     stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
     return _position_in(view, stored, at, now, frame_id)
@@ -253,20 +261,23 @@ def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
 def _position_of_body(
     view: View,
     body: Body,
-    asked: tuple[Ns, float | None, float],
+    at: Ns,
+    *,
+    tolerance_s: float | None,
+    rest_s: float,
     now: Ns | None,
     frame_id: str | None,
 ) -> results.Position:
     """Returns where transforms have the robot's body, and the latitude and longitude beside it.
 
     Raises:
-        NoDataError: none places it at the moment that is asked, or within the tolerance before.
+        NoDataError: none places it at the moment, or within the tolerance before.
     """
     limits, extractor = view.limits, view.extractor
-    window, tolerance = _window_before(view, *asked)
+    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
     of_body = newest_of_body(view, body, window, frame_id)
     if of_body is None:
-        raise _not_placed(view, body, asked[0], tolerance, frame_id)
+        raise _not_placed(view, body, at, tolerance, frame_id)
     stored, pose = of_body
     note_robots_near(view, stored)
     note_unread(view, TimeWindow(stored.time, window.stop))

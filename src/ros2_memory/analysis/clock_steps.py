@@ -90,17 +90,18 @@ def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> 
         log_times: of messages up to `STAMPS_BESIDE_NS` from it, ns.
         stamps: their header stamps, ns.
     """
-    is_before = log_times <= hole[0]
+    last_before, first_after = hole
+    is_before = log_times <= last_before
     delays = log_times - stamps
     sides = [delays[is_before], delays[~is_before]]
     if min(side.size for side in sides) < _FEWEST_STAMPS:
         return None
-    if log_times.max() - hole[1] < _LIVE_NS:
+    if log_times.max() - first_after < _LIVE_NS:
         return None
     if max(float(np.percentile(side, 90) - np.percentile(side, 10)) for side in sides) > ALIKE_NS:
         return None
     passed = int(stamps[~is_before].min()) - int(stamps[is_before].max())
-    if not 0 < passed < (hole[1] - hole[0]) // 2:
+    if not 0 < passed < (first_after - last_before) // 2:
         return None
     before, after = (int(np.median(side)) for side in sides)
     return after - before

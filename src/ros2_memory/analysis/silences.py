@@ -183,28 +183,45 @@ def _silences_of(
     topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
 ) -> Iterator[Silence]:
     """Yields where a topic is absent for longer than a limit while the robot is on."""
-    end = max(runs[-1][1], on[-1][1] if on else runs[-1][1])
+    _, last_heard = runs[-1]
+    end = max(last_heard, on[-1][1] if on else last_heard)
     nexts = [first for first, _ in runs[1:]]
-    at = 0
+    past = 0
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
-        while at < len(on) and on[at][1] <= start:
-            at += 1
-        pieces: list[Span] = []
-        length = 0
-        until, parted = start, False
-        for span in on[at:]:
-            parted = span[0] - until > LONGEST_OFF_NS
-            if span[0] >= stop or parted:
-                break
-            until = span[1]
-            first, last = max(span[0], start), min(span[1], stop)
-            recorded = last - first - length_in(gaps, first, last)
-            if recorded > limit:
-                pieces.append((first, last))
-                length += recorded
-        if pieces:
-            goes_on = start == runs[-1][1] and not parted
-            yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
+        while past < len(on) and on[past][1] <= start:
+            past += 1
+        absence = _absence(start, stop, on[past:], limit, gaps)
+        if absence.pieces:
+            goes_on = start == last_heard and not absence.is_parted
+            (first, _), (_, last) = absence.pieces[0], absence.pieces[-1]
+            yield Silence(topic, first, last, absence.length, goes_on)
+
+
+class _Absence(NamedTuple):
+    """The times between two messages of a topic in which it is missed, and how long they are.
+
+    `is_parted`: the robot was off for more than `LONGEST_OFF_NS` meanwhile; what follows is none.
+    """
+
+    pieces: Sequence[Span]
+    length: Ns
+    is_parted: bool
+
+
+def _absence(start: Ns, stop: Ns, on: Sequence[Span], limit: Ns, gaps: Sequence[Span]) -> _Absence:
+    pieces: list[Span] = []
+    length, until, is_parted = 0, start, False
+    for on_from, on_to in on:
+        is_parted = on_from - until > LONGEST_OFF_NS
+        if on_from >= stop or is_parted:
+            break
+        until = on_to
+        first, last = max(on_from, start), min(on_to, stop)
+        recorded = last - first - length_in(gaps, first, last)
+        if recorded > limit:
+            pieces.append((first, last))
+            length += recorded
+    return _Absence(pieces, length, is_parted)
 
 
 def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:

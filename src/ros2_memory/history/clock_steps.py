@@ -77,7 +77,7 @@ def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[N
     except QueryTimeoutError:
         _note_timeout(view)
         return gaps
-    return [gap for gap in gaps if gap[0] not in steps]
+    return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
@@ -167,7 +167,11 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
     """Returns the pauses that bags show in a window, and those that deleted bags showed."""
-    shown = {pause[:2]: pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])}
+    shown = {
+        (pause.start, pause.end): pause
+        for pause in view.snapshot.suspects
+        if window.overlaps(pause.start, pause.end)
+    }
     deleted = {
         pause: Pause(*pause, (), ran_on=True)
         for pause in read_thinned(view.bag_dir).pauses
@@ -197,7 +201,7 @@ def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
     remembered = scanner.caches.clock_steps.get(key)
     if remembered is None:
         with view.notes.isolated():
-            step = _find_step(view, topic, (pause.start, pause.end))
+            step = _find_step(view, topic, pause)
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
         remembered = () if step is None else (step,)
         if is_final:
@@ -205,44 +209,45 @@ def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
     return next(iter(remembered), None)
 
 
-def _find_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep | None:
-    step = _step_by_stamps(view, hole)
-    is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
-    if step is not None or not is_long or topic is None or _is_late(view, topic, hole):
+def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
+    """Returns the step that a pause is, by header stamps, else by the poses of a topic."""
+    step = _step_by_stamps(view, pause)
+    is_long = pause.end - pause.start >= SHORTEST_STEP_NS
+    if step is not None or not is_long or topic is None or _is_late(view, topic, pause):
         return step
-    before = TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)
-    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+    before = TimeWindow(pause.start - BESIDE_NS, pause.start + 1)
+    after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     bags = [view.timeline.overlapping(window) for window in (before, after)]
-    # A recording that ended before the hole tells nothing about one that began after it.
+    # A recording that ended before the pause tells nothing about one that began after it.
     through = set.intersection(*({bag.recording for bag in side_bags} for side_bags in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
-    return step_over(hole, *sides)
+    return step_over((pause.start, pause.end), *sides)
 
 
-def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
-    """Returns the step that a hole is by the header stamps of topics on both sides of it."""
-    around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
+def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
+    """Returns the step that a pause is by the header stamps of topics on both sides of it."""
+    around = TimeWindow(pause.start - STAMPS_BESIDE_NS, pause.end + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
     for bag in view.timeline.overlapping(around):
         counts.update({info.topic: info.count for info in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
         for times, stamps in _stamps(view, topic, around).values():
-            change = delay_change(hole, times, stamps)
+            change = delay_change((pause.start, pause.end), times, stamps)
             if change is not None:
                 changes.append(change)
                 break
-    return step_by_delays(hole, changes)
+    return step_by_delays((pause.start, pause.end), changes)
 
 
-def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
-    """Returns whether messages that follow a hole were sent in it: the recorder had stalled."""
-    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+def _is_late(view: View, topic: str, pause: Pause) -> bool:
+    """Returns whether messages that follow a pause were sent in it: the recorder had stalled."""
+    after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     first = view.stream.first((topic,), after)
     sent = [] if first is None else [first.record.publish_time]
     for _, stamps in _stamps(view, topic, after).values():
         sent += stamps.tolist()
-    return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
+    return any(pause.start + ALIKE_NS < at < pause.end - ALIKE_NS for at in sent)
 
 
 def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np.int64]]:

@@ -349,7 +349,7 @@ class Latching:
         configured = self._configured(topic)
         if configured is not None or not snapshot.timeline.is_transient_state(topic):
             return bool(configured)
-        last = {path: span[1] for path, span in snapshot.timeline.recordings(topic).items()}
+        last = {path: last for path, (_, last) in snapshot.timeline.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
@@ -452,7 +452,10 @@ class Notes:
         self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
     def notes_cover_remarks(self, bag: BagFile) -> bool:
-        """Whether notes on what was read of a bag have all that its summary remarks."""
+        """Whether the notes on a bag tell all that its summary remarks, so no sentence need do so.
+
+        False for one of which sentences have told it already (`add_remarks`).
+        """
         name = short_name(bag.path)
         if name in self._remarks:
             return False

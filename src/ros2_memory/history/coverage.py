@@ -405,7 +405,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
     for remark, [name, *others] in reversed(shown):
         subject = f"{len(others) + 1} bags ({listed([name, *others])})" if others else name
         yield f"{subject}: {remark}"
-    more = len(bags) - sum(len(names) for _, names in shown)
+    more = len(bags) - sum(len(files) for _, files in shown)
     if more:
         yield f"{counted(more, 'older bag is', 'older bags are')} odd too"
 
@@ -413,7 +413,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
 def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
     """Yields the sentences on bags that are not whole or contradict themselves."""
     remarked = [(bag, "; ".join(bag.summary.remarks)) for bag in bags]
-    left_open = [odd_bag for odd_bag in remarked if odd_bag[0].state is BagState.INCOMPLETE]
+    left_open = [(bag, remark) for bag, remark in remarked if bag.state is BagState.INCOMPLETE]
     if left_open:
         names = [
             f"{short_name(bag.path)} ({shortened(remark)})" if remark else short_name(bag.path)
@@ -425,7 +425,8 @@ def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
             f"{listed(names, len(left_open))}"
         )
     yield from by_remark(
-        [odd_bag for odd_bag in remarked if odd_bag[0].state is not BagState.INCOMPLETE], MAX_NAMED
+        [(bag, remark) for bag, remark in remarked if bag.state is not BagState.INCOMPLETE],
+        MAX_NAMED,
     )
 
 

@@ -46,6 +46,14 @@ class Detected(NamedTuple):
     found: Detections
 
 
+class _DecodedMessage(NamedTuple):
+    """A decoded message: log time and header stamp (ns; the log time if none), and detections."""
+
+    log_time: Ns
+    stamp: Ns
+    detections: list[Detection]
+
+
 def joined_detected(parts: Sequence[Detected]) -> Detected:
     """Returns messages of tables of one topic together; `parts` is not empty."""
     if len(parts) == 1:
@@ -91,24 +99,26 @@ class DetectionRows:
         return _with_times(rows.times, stamps, detections)
 
     def _by_messages(self, rows: Rows) -> Detected:
-        read = [row for stored in messages_of(self._view, rows) for row in self._one(stored)]
+        decoded = (self._decode(stored) for stored in messages_of(self._view, rows))
         # Those of a part come bag after bag, in the order in which bags were stored.
-        read.sort(key=lambda row: row[0])
-        log_times, stamps = (np.array([row[nth] for row in read], np.int64) for nth in (0, 1))
-        return _with_times(log_times, stamps, detections_by([row[2] for row in read]))
+        messages = sorted(filter(None, decoded), key=lambda message: message.log_time)
+        return _with_times(
+            np.array([message.log_time for message in messages], np.int64),
+            np.array([message.stamp for message in messages], np.int64),
+            detections_by([message.detections for message in messages]),
+        )
 
-    def _one(self, stored: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
-        """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
+    def _decode(self, stored: StoredMessage) -> _DecodedMessage | None:
         extractor, message = self._view.extractor, self._view.bags.decode(stored)
         if message is None:
-            return []
+            return None
         frame = extractor.frame(message)
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
         detections = [
             detection if detection.frame_id else detection._replace(frame_id=frame)
             for detection in detections_of(extractor.exact(message, stored.type))
         ]
-        return [(stored.time, stored.time if stamp is None else stamp, detections)]
+        return _DecodedMessage(stored.time, stored.time if stamp is None else stamp, detections)
 
 
 def _with_times(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:

@@ -104,7 +104,7 @@ class HeldValues:
         self._topic = topic
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
-        gaps = {gap[0] for gap in view.gaps(TimeWindow.everything())}
+        gaps = {start for start, _ in view.gaps(TimeWindow.everything())}
         self._gaps = sorted(gaps.union(_ends_of_clocks(view)))
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
@@ -130,10 +130,11 @@ class HeldValues:
         self.reached = until
         later = self._runs(TimeWindow(until, MAX_NS), newest_first=False)
         after = next(later, None)
-        for run in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
-            if after is not None and self._goes_on(run, after):
-                run = run._replace(last=after.last)  # noqa: PLW2901 - it goes on after `until`
-                after = next(later, None)
+        for before in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
+            run = before
+            if after is not None and self._goes_on(before, after):
+                # It goes on after `until`.
+                run, after = before._replace(last=after.last), next(later, None)
             stop, ended = self._end_of(run, after)
             self.reached = run.first
             yield Held(run.word, run.first, stop, ended)
@@ -200,11 +201,11 @@ class HeldValues:
 
     def _runs_of_columns(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
         """Returns the runs of rows that overlap in time, in order."""
-        times = np.concatenate([part[0] for part in parts])
+        times = np.concatenate([part_times for part_times, _ in parts])
         if not times.size:
             return []
         order = np.argsort(times, kind="stable")
-        texts = joined_texts([part[1] for part in parts]).rows(order)
+        texts = joined_texts([part_texts for _, part_texts in parts]).rows(order)
         times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
         breaks |= np.diff(np.searchsorted(self._gaps, times)) > 0

@@ -54,13 +54,8 @@ class MergedStream:
         spans: dict[str, BagSpan] = {}
         for topic in topics:
             for bag, first, last in self._timeline.extents(topic, window):
-                before = spans.get(bag.file)
-                span = (
-                    (first, last)
-                    if before is None
-                    else (min(first, before[0]), max(last, before[1]))
-                )
-                spans[bag.file] = BagSpan(*span, bag)
+                known = spans.get(bag.file, BagSpan(first, last, bag))
+                spans[bag.file] = BagSpan(min(first, known.first), max(last, known.last), bag)
         return sorted(spans.values(), key=_span_order)
 
     def messages(

@@ -153,10 +153,17 @@ def transform_at(
             break
     if not answers:
         raise failures[0]
-    session, answer = answers[0]
-    if not all(
-        alike(answer.transform, found_transform.transform) for _, found_transform in answers
-    ):
+    _note_sessions(view, frames, at, answers)
+    _, answer = answers[0]
+    return answer
+
+
+def _note_sessions(
+    view: View, frames: tuple[str, str], at: Ns, answers: Sequence[tuple[Session, FoundTransform]]
+) -> None:
+    """Notes where sessions differ in a transform, of which the first counts, or are combined."""
+    sessions, (session, counting) = sessions_of(view), answers[0]
+    if not all(alike(counting.transform, answer.transform) for _, answer in answers):
         view.notes.add(
             f"{len(answers)} sessions recorded at that time have different transforms; "
             f"this is that of {sessions.names(session, at)}"
@@ -167,7 +174,6 @@ def transform_at(
             f"transforms of {sessions.names(session, at)} are combined, as of one robot: they "
             "were recorded at the same time, but no handover proves that they are of one"
         )
-    return answer
 
 
 def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:

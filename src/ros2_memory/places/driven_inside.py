@@ -224,27 +224,51 @@ def farthest_from(
     if not spans:
         return None
     window = TimeWindow(spans[0][0], spans[-1][1] + 1)
-    track, tracks = joined_in(view, frame, window).track, RobotTracks(view, frame)
+    track = joined_in(view, frame, window).track
+    pose = _farthest_pose(RobotTracks(view, frame), track, spans, (x, y))
+    if pose is None:
+        return None
+    inside = places_at(view.limits.places, frame, pose.x, pose.y)
+    return FarthestPose((x, y), frame, pose.away_m, pose.time, (pose.x, pose.y), inside)
+
+
+class _DistantPose(NamedTuple):
+    """A pose (m), its log time (ns), and its distance from the point that is asked about."""
+
+    away_m: float
+    time: Ns
+    x: float
+    y: float
+
+
+def _farthest_pose(
+    tracks: RobotTracks,
+    track: RobotTrack,
+    spans: Sequence[tuple[Ns, Ns]],
+    point: tuple[float, float],
+) -> _DistantPose | None:
+    """Returns the pose in some times that is farthest from a point (m).
+
+    Poses are looked up around the places of the track that are farthest away.
+    """
+    x, y = point
     times, at_x, at_y = _along(track, spans)
     off_m = np.hypot(at_x - x, at_y - y)
-    best: tuple[float, Ns, float, float] | None = None
+    farthest: _DistantPose | None = None
     for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
-        if best is not None and off_m[nth] <= best[0] - _OFF_TRACK_M:
+        if farthest is not None and off_m[nth] <= farthest.away_m - _OFF_TRACK_M:
             break
         at = int(times[nth])
-        first, last = next(span for span in spans if span[0] <= at <= span[1])
+        first, last = next((first, last) for first, last in spans if first <= at <= last)
         around = TimeWindow(max(first, at - _AROUND_NS), min(last, at + _AROUND_NS) + 1)
         poses = tracks.poses(around)
-        for time, pose_x, pose_y in zip(*(part.tolist() for part in poses[:3]), strict=True):
+        rows = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
+        for time, pose_x, pose_y in rows:
             away_m = math.hypot(pose_x - x, pose_y - y)
             is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
-            if is_near and (best is None or away_m > best[0]):
-                best = away_m, time, pose_x, pose_y
-    if best is None:
-        return None
-    away_m, time, *there = best
-    inside = places_at(view.limits.places, frame, *there)
-    return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
+            if is_near and (farthest is None or away_m > farthest.away_m):
+                farthest = _DistantPose(away_m, time, pose_x, pose_y)
+    return farthest
 
 
 def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Floats, Floats]:

@@ -294,14 +294,14 @@ class Scope:
         self.unknown: Spans = []
         self._inside: Spans | None = None
         if where is not None:
-            region = parse_where(view.limits, where)
-            joined = joined_in_region(view, region, window)
-            inside = joined.inside(region.region, window)
+            place = parse_where(view.limits, where)
+            joined = joined_in_region(view, place, window)
+            inside = joined.inside(place.region, window)
             self._inside = united((stay.start, stay.stop + 1) for stay in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)
             known = placed_times(joined.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
-        self._states = [_ConditionStates(view, other) for other in during]
+        self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
             known = state.known_in(window)
             unknown = unknown_times(view, window, known, f"what {condition.topic} said")

@@ -431,15 +431,23 @@ class Motion:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
         piece = measured((times - times[0]) / NS_PER_S, positions)
-        ends = (
-            _poses(times, positions, 0, _NEARBY + 1),
-            _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times)),
+        begin = _poses(times, positions, 0, _NEARBY + 1)
+        end = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
+        leg = Leg(
+            begin[0],
+            end[-1],
+            len(times),
+            int(np.median(apart)) if len(apart) else None,
+            piece.length_m,
+            piece.sum_m,
+            piece.head,
+            piece.tail,
+            piece.still,
+            _motion_of(begin),
+            _motion_of(end),
         )
-        period_ns = int(np.median(apart)) if len(apart) else None
-        near = _motion_of(ends[0]), _motion_of(ends[1])
-        leg = Leg(ends[0][0], ends[1][-1], len(times), period_ns, *piece[:5], *near)
         if len(times) <= SPEED_STEPS:
-            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(ends[0])), 0.0)
+            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(begin)), 0.0)
         self._go_on(None, leg, piece.speed_mps)
         return piece.steps_m
 
@@ -469,32 +477,29 @@ class Motion:
         totals = self.totals
         if speed_mps is not None:
             totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
-        kind: Link | None = None
-        if before is not None:
-            periods = [
-                period_ns
-                for period_ns in (before.period_ns, leg.period_ns)
-                if period_ns is not None
-            ]
-            near = None
-            if before.poses + leg.poses >= _NEARBY:
-                near = before.near_last.or_more(leg.near_first)
-            usual_ns = max(periods, default=None)
-            kind = link(before.last, leg.first, usual_ns, self._fastest_mps, near)
-            if kind != "driven":
-                self.count_break(kind, before.last, leg.first)
-            elif totals.tail is not None:
-                totals.tail = before.joined(leg)
+        kind = None if before is None else self._link_between(before, leg)
+        if before is not None and kind is not None:
+            if kind == "driven":
+                if totals.tail is None:
+                    totals.head = before.joined(leg)
+                else:
+                    totals.tail = before.joined(leg)
                 return False
-            else:
-                totals.head = before.joined(leg)
-                return False
+            self.count_break(kind, before.last, leg.first)
         if totals.head is None:
             totals.head = leg
         else:
             self._end_leg()
             totals.tail = leg
         return kind in ("jump", "reset")
+
+    def _link_between(self, before: Leg, after: Leg) -> Link:
+        periods = [leg.period_ns for leg in (before, after) if leg.period_ns is not None]
+        near = None
+        if before.poses + after.poses >= _NEARBY:
+            near = before.near_last.or_more(after.near_first)
+        usual_ns = max(periods, default=None)
+        return link(before.last, after.first, usual_ns, self._fastest_mps, near)
 
     def _end_leg(self) -> None:
         """Adds the last leg to those between."""
