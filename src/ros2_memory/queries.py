@@ -695,22 +695,20 @@ def _newest_at(
     Raises:
         NoDataError: there is none within the tolerance.
     """
-    limits = view.limits
+    latching = view.limits.latching
     window, tolerance = _window_before(view, at, tolerance_s, rest_s)
     stored = view.stream.newest(topic, window)
     if stored is None and tolerance_s is None and is_pose:
         before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
-        stored = view.stream.newest(topic, before)
-        if stored is not None and not (
-            is_thinned(stored.bag.file) and _holds_until_next(view, stored)
-        ):
-            stored = None
-    if stored is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
-        stored = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
-        if stored is None:
+        pose = view.stream.newest(topic, before)
+        if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
+            stored = pose
+    if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
+        newest = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
+        if newest is None:
             tolerance = None
-        elif not limits.latching.holds(view.snapshot, stored):
-            stored = None
+        elif latching.holds(view.snapshot, newest):
+            stored = newest
     if stored is None:
         raise no_data_at(view, (topic,), at, tolerance)
     note_robots_near(view, stored)

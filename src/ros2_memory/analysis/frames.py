@@ -326,9 +326,11 @@ class FrameTree:
         return pose.at()
 
     def _compose(self, name: str, times: Times) -> FramePoses:
+        """Returns the poses by the chains of frames up to the common ancestor at each time."""
         poses = _identity(times, valid=False)
         waiting = [np.arange(times.size).reshape(times.shape)]
-        for rows in waiting:
+        while waiting:
+            rows = waiting.pop()
             then = times.ravel()[rows]
             up, down = self._chain(name, then), self._chain(self.target, then)
             common = next((frame for frame in up if frame in down), None)

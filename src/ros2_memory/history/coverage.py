@@ -478,17 +478,17 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     outside = (min(end, earliest) - start, end - max(start, latest))
     gaps = [last - first for first, last in recording_gaps(view, TimeWindow(start, end))]
     missing = sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
-    whole = end - start
-    window = f"between {unix_text(start)} and {unix_text(end)}"
-    asked_for = TimeWindow(start, end)
-    deleted = deleted_between(view, asked_for)
+    length = end - start
+    when = f"between {unix_text(start)} and {unix_text(end)}"
+    deleted = deleted_between(view, TimeWindow(start, end))
     if gap_around(view, asked) is not None:
-        view.notes.add(why_nothing(window, deleted=bool(deleted)))
+        view.notes.add(why_nothing(when, deleted=bool(deleted)))
     elif gaps or max(outside) > _EDGE_NS:
-        part = unix_from_ns(max(whole - missing, 0))
-        places = 0 if whole >= 100 * NS_PER_S else 1
+        recorded_s = unix_from_ns(max(length - missing, 0))
+        digits = 0 if length >= 100 * NS_PER_S else 1
         what = "here are only" if deleted else "recorded only"
-        view.notes.add(f"{what} {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}")
+        of_s = f"{unix_from_ns(length):.{digits}f} s"
+        view.notes.add(f"{what} {recorded_s:.{digits}f} of {of_s} {when}")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:

@@ -264,24 +264,27 @@ def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[Po
     """
     held: list[PoseRows] = []
     waiting: set[int] = set()
-
-    def done(oldest: Ns) -> Iterator[PoseSlice]:
-        """Yields the slices that reach no poses older than the oldest that is held."""
-        for number in sorted(waiting, reverse=True):
-            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
-            if start - beside < oldest:
-                return
-            waiting.discard(number)
-            near = [block for block in held if block.last >= start - beside]
-            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
-
     for block in newest_first:
         newest = max(waiting, default=block.last // SLICE_NS)
-        held = [block for block in held if block.first < (newest + 1) * SLICE_NS + beside]
+        held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
         held.append(block)
         waiting.update(block.slices(SLICE_NS))
-        yield from done(block.first)
-    yield from done(MIN_NS)
+        yield from _complete_slices(waiting, held, beside, block.first)
+    yield from _complete_slices(waiting, held, beside, MIN_NS)
+
+
+def _complete_slices(
+    waiting: set[int], held: Sequence[PoseRows], beside: Ns, oldest: Ns
+) -> Iterator[PoseSlice]:
+    """Yields the slices that reach no poses older than `oldest`; they wait no longer."""
+    for number in sorted(waiting, reverse=True):
+        start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+        first, last = start - beside, stop + beside
+        if first < oldest:
+            return
+        waiting.discard(number)
+        near = [block for block in reversed(held) if block.last >= first and block.first < last]
+        yield PoseSlice(start, stop, beside, near)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:

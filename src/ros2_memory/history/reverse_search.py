@@ -459,28 +459,23 @@ class ReverseSearch:
 
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
-        stored = self._view.stream.newest(topic, TimeWindow.everything())
-        value = None if stored is None else self._view.value(stored)
-        field = self.condition.field
-        if stored is None or value is None:
+        newest = self._view.stream.newest(topic, TimeWindow.everything())
+        value = None if newest is None else self._view.value(newest)
+        if newest is None or value is None:
             return None
-        if field is not None and is_unknown_below(value, field):
+        field, test = self.condition.field or "", self.condition.test
+        if field and is_unknown_below(value, field):
             # An empty list does not show what its elements have.
-            older = self._view.stream.messages(
-                [topic], TimeWindow(MIN_NS, stored.time), newest_first=True
-            )
+            window = TimeWindow(MIN_NS, newest.time)
+            older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            value = next(
-                (older_value for older_value in values if not is_unknown_below(older_value, field)),
-                value,
-            )
-        schema = stored.record.channel.schema
+            shows_field = (older for older in values if not is_unknown_below(older, field))
+            value = next(shows_field, value)
         refusal = refusal_for(self.condition, value)
-        test = self.condition.test
         if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
             return refusal
-        field = (self.condition.field or "").rpartition(".")[2]
-        constants = _constants_named(schema, field, str(test.value))
+        _, _, name = field.rpartition(".")
+        constants = _constants_named(newest.record.channel.schema, name, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
     def matches(self, stored: StoredMessage) -> bool | None:

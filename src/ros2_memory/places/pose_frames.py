@@ -390,15 +390,17 @@ class RobotPlaces:
             note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
         except QueryTimeoutError:
             self.view.bags.check_deadline()
-            joined = None
-        if joined is None or joined.since is not None:
-            since = "" if joined is None or joined.since is None else unix_text(joined.since)
-            reach = f"known back to {since} alone" if since else "not known"
-            self.view.notes.add(
-                f"where the robot was in {self.map_frame} is {reach}: reading the bags that "
-                "are not stored takes too long"
-            )
-        return empty_track() if joined is None else joined.track
+            self._note_reach("not known")
+            return empty_track()
+        if joined.since is not None:
+            self._note_reach(f"known back to {unix_text(joined.since)} alone")
+        return joined.track
+
+    def _note_reach(self, reach: str) -> None:
+        self.view.notes.add(
+            f"where the robot was in {self.map_frame} is {reach}: reading the bags that are not "
+            "stored takes too long"
+        )
 
 
 def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) -> RobotPlaces | None:

@@ -365,10 +365,10 @@ class RegionVisits:
         # So near to the window's ends, poses decide on which side a visit begins, or ends.
         room = TRACK_SLICE_NS
         if window.start + room <= whole.start and whole.stop < window.stop - room:
-            self._looked_at += not (
-                has_vertex := any(True for _ in self._vertices_inside(track, whole))
-            )
-            if has_vertex or self._looked_at > _MOST_TRIED:
+            if any(True for _ in self._vertices_inside(track, whole)):
+                return visit
+            self._looked_at += 1
+            if self._looked_at > _MOST_TRIED:
                 return visit
         exact = self._by_poses(visit)
         if exact is None or not window.overlaps(exact.start, exact.stop):
@@ -387,21 +387,28 @@ class RegionVisits:
         None where no pose is inside: the robot's line alone touches the region.
         """
         whole = visit.whole
-        within = [*self._vertices_inside(visit.track, whole)]
-        start, stop = whole.start, whole.stop
-        if whole.entered:
-            poses = self._poses_around(visit.track, whole.start)
-            inside = [time for time in self._poses_inside(poses) if time <= whole.stop]
-            others = [back for left, back in _absences(poses.times, inside) if left < whole.start]
-            inside = [time for time in inside if time >= max(others, default=MIN_NS)]
-            start = min((*inside[:1], *within[:1]), default=MAX_NS)
-        if whole.left:
-            poses = self._poses_around(visit.track, whole.stop)
-            inside = [time for time in self._poses_inside(poses) if time >= whole.start]
-            others = [left for left, back in _absences(poses.times, inside) if back > whole.stop]
-            inside = [time for time in inside if time <= min(others, default=MAX_NS)]
-            stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
+        start = self._first_inside(visit) if whole.entered else whole.start
+        stop = self._last_inside(visit) if whole.left else whole.stop
         return whole._replace(start=start, stop=stop) if start <= stop else None
+
+    def _first_inside(self, visit: RegionVisit) -> Ns:
+        """Returns when the first pose of a visit is inside; `MAX_NS` where none is."""
+        whole = visit.whole
+        poses = self._poses_around(visit.track, whole.start)
+        inside = [time for time in self._poses_inside(poses) if time <= whole.stop]
+        # What lies before an absence is of the visit before.
+        returns = [back for left, back in _absences(poses.times, inside) if left < whole.start]
+        own = (time for time in inside if time >= max(returns, default=MIN_NS))
+        return min(chain(own, self._vertices_inside(visit.track, whole)), default=MAX_NS)
+
+    def _last_inside(self, visit: RegionVisit) -> Ns:
+        """Returns when the last pose of a visit is inside; `MIN_NS` where none is."""
+        whole = visit.whole
+        poses = self._poses_around(visit.track, whole.stop)
+        inside = [time for time in self._poses_inside(poses) if time >= whole.start]
+        leaves = [left for left, back in _absences(poses.times, inside) if back > whole.stop]
+        own = (time for time in inside if time <= min(leaves, default=MAX_NS))
+        return max(chain(own, self._vertices_inside(visit.track, whole)), default=MIN_NS)
 
     def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
         return self._times_inside(poses.times, poses.x, poses.y)

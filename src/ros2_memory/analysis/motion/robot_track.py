@@ -106,14 +106,20 @@ class TrackPart(NamedTuple):
         """About how much memory it takes."""
         return 300 + 34 * len(self.times)
 
+    @property
+    def columns(self) -> tuple[Times, Floats, Floats, Times, Mask, Mask]:
+        """The arrays of its vertices."""
+        return self[:6]
+
     def some(self, index: NDArray[np.intp]) -> TrackPart:
         """Returns some vertices of it, in the order given."""
-        return TrackPart._make((*(column[index] for column in self[:6]), *self[6:]))
+        columns = (column[index] for column in self.columns)
+        return TrackPart._make((*columns, self.left_out, self.recording))
 
 
 def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
-    """Returns the vertices of some parts, one at least, in their order; as of the first one."""
-    columns = map(np.concatenate, zip(*(part[:6] for part in parts), strict=True))
+    """Returns the vertices of parts, one at least, in their order, under the first's recording."""
+    columns = map(np.concatenate, zip(*(part.columns for part in parts), strict=True))
     left_out = sum(part.left_out for part in parts)
     return TrackPart._make((*columns, left_out, parts[0].recording))
 

@@ -478,6 +478,21 @@ def _split_by_drift(
 
 def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
+    left = _left_blocks(blocks, chain, still)
+    creeping = np.zeros(len(blocks), np.bool_)
+    since, newest = MIN_NS, 0
+    for here in np.flatnonzero(left >= 0).tolist():
+        there = int(left[here])
+        if chain[here] != newest:
+            newest, since = chain[here], MIN_NS
+        if blocks.numbers[there] > since:
+            creeping[there : here + 1] = True
+            since = int(blocks.numbers[there])
+    return creeping
+
+
+def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
+    """Returns the newest block that each is `LARGEST_M` away from, within `CREEP_NS`; else -1."""
     run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
     low, high = blocks.corners()
     centres, noises = (low + high) / 2, blocks.noises.astype(np.float64)
@@ -487,22 +502,13 @@ def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
     lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
     has_moved = _lengths(highs - lows) > LARGEST_M
     moved = np.flatnonzero(np.repeat(has_moved, _CREEP_BLOCKS)[: len(blocks)])
-    nearest = np.full(len(blocks), -1)
+    left = np.full(len(blocks), -1)
     for lag in range(1, _CREEP_BLOCKS):
-        waiting = moved[(moved >= lag) & (nearest[moved] < 0)]
+        waiting = moved[(moved >= lag) & (left[moved] < 0)]
         waiting = waiting[run[waiting] == run[waiting - lag]]
         before = waiting - lag
         near = blocks.numbers[waiting] - blocks.numbers[before] < _CREEP_BLOCKS
         apart_m = _lengths(centres[waiting] - centres[before])
         far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
-        nearest[waiting[far]] = before[far]
-    creeping = np.zeros(len(blocks), np.bool_)
-    since, newest = MIN_NS, 0
-    for here in np.flatnonzero(nearest >= 0).tolist():
-        there = int(nearest[here])
-        if chain[here] != newest:
-            newest, since = chain[here], MIN_NS
-        if blocks.numbers[there] > since:
-            creeping[there : here + 1] = True
-            since = int(blocks.numbers[there])
-    return creeping
+        left[waiting[far]] = before[far]
+    return left

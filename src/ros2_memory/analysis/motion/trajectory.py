@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_places, measured_path
+from ros2_memory.analysis.motion.odometry import (
+    MeasuredPath,
+    Motion,
+    MotionTotals,
+    are_places,
+    measured_path,
+)
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import headings, joined_poses
 from ros2_memory.core.arrays import rows_of, stacked
@@ -244,26 +250,7 @@ def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
     if len(placed):
         measured = measured_path(placed.times, placed.positions, fastest_mps)
         totals, step_mps = measured.totals, measured.step_mps
-        kept = np.arange(len(placed))
-        if len(placed) > _FEW:
-            parted = np.array(measured.parted, np.intp)
-            ends = np.unique(np.concatenate(([0, len(placed) - 1], parted - 1, parted)))
-            seconds = (placed.times - placed.times[0]) / NS_PER_S
-            kept, error_m = simplified(
-                placed.positions,
-                seconds,
-                ends,
-                tolerance_m=_KEPT_WITHIN_M,
-                at_most=_MOST_VERTICES,
-                of_time=_OF_TIME,
-            )
-        line = Line(
-            placed.times[kept],
-            np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
-            placed.positions[kept],
-            headings(placed.turns[kept]),
-            np.isin(kept, measured.parted),
-        )
+        line, error_m = _line_through(placed, measured)
     return PathSlice(
         int(poses.times[0]) if len(poses) else 0,
         int(poses.times[-1]) if len(poses) else 0,
@@ -277,6 +264,29 @@ def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
         error_m,
         poses if len(placed) <= _FEW else None,
     )
+
+
+def _line_through(poses: Poses, measured: MeasuredPath) -> tuple[Line, float]:
+    """Returns the drawn path of some poses, and how far (m) they may be off it."""
+    kept, error_m = np.arange(len(poses)), 0.0
+    if len(poses) > _FEW:
+        parted = np.array(measured.parted, np.intp)
+        kept, error_m = simplified(
+            poses.positions,
+            (poses.times - poses.times[0]) / NS_PER_S,
+            np.unique(np.concatenate(([0, len(poses) - 1], parted - 1, parted))),
+            tolerance_m=_KEPT_WITHIN_M,
+            at_most=_MOST_VERTICES,
+            of_time=_OF_TIME,
+        )
+    line = Line(
+        poses.times[kept],
+        np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
+        poses.positions[kept],
+        headings(poses.turns[kept]),
+        np.isin(kept, measured.parted),
+    )
+    return line, error_m
 
 
 NO_LINE: Final = Line(
