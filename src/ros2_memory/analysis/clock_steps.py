@@ -111,8 +111,8 @@ def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | No
     """Returns the step that a hole is, by `delay_change` of several topics; None if it is none."""
     if len(changes) < _AGREEING or max(changes) - min(changes) > ALIKE_NS:
         return None
-    by = int(np.median(changes))
-    return ClockStep(hole[0], by) if by >= SHORTEST_BY_STAMPS_NS else None
+    (last_before, _), by = hole, int(np.median(changes))
+    return ClockStep(last_before, by) if by >= SHORTEST_BY_STAMPS_NS else None
 
 
 def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | None:
@@ -130,8 +130,8 @@ def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | N
     moved_m = math.dist(before.positions[-1], after.positions[0])
     if moved_m > _MOVED * speed_mps * unix_from_ns(length):
         return None
-    by = length - ns_from_unix(moved_m / speed_mps)
-    return ClockStep(hole[0], by) if by >= SHORTEST_STEP_NS else None
+    (last_before, _), by = hole, length - ns_from_unix(moved_m / speed_mps)
+    return ClockStep(last_before, by) if by >= SHORTEST_STEP_NS else None
 
 
 def _speed_mps(poses: Poses) -> float:

@@ -271,6 +271,13 @@ class RowCondition:
         return Kept(surely, perhaps)
 
 
+class _Candidate(NamedTuple):
+    """A message that may match: its log time (ns) and its topic."""
+
+    time: Ns
+    topic: str
+
+
 class _TableCandidates(NamedTuple):
     """A table's last log time (ns), its topic, and when messages of it may match."""
 
@@ -293,7 +300,7 @@ class CandidateRows:
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
         self._ready: list[tuple[Ns, str]] = []
-        self._group: list[tuple[Ns, str]] = []
+        self._group: list[_Candidate] = []
         self._view = view
         self._until = until
         self._test = RowCondition(view, condition)
@@ -306,12 +313,12 @@ class CandidateRows:
         most = 1
         for time, topic in chain(self._times(), [(MIN_NS - 1, "")]):
             group = self._group
-            if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
-                window = TimeWindow(group[-1][0], group[0][0] + 1)
-                yield window, sorted({match_topic for _, match_topic in group})
+            if group and (group[-1].time - time > _TOGETHER_NS or len(group) >= most):
+                window = TimeWindow(group[-1].time, group[0].time + 1)
+                yield window, sorted({candidate.topic for candidate in group})
                 # The first that may match mostly does; where many do not, more are read at once.
                 most, self._group = min(2 * most, _MOST_TOGETHER), []
-            self._group.append((time, topic))
+            self._group.append(_Candidate(time, topic))
 
     @property
     def reached(self) -> Ns:

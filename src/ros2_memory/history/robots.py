@@ -150,9 +150,12 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
     now, described = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
-    if not described or abs(now - described[0][0]) > _RECENT_NS:
-        described[:] = [(now, tuple(_mixed_sentences(memory, call)))]
-    return described[0][1]
+    for described_at, sentences in described:
+        if abs(now - described_at) <= _RECENT_NS:
+            return sentences
+    sentences = tuple(_mixed_sentences(memory, call))
+    described[:] = [(now, sentences)]
+    return sentences
 
 
 def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:

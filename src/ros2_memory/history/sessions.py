@@ -114,8 +114,7 @@ class Sessions:
         for topic in topics:
             for path, span in self._view.timeline.recordings(topic).items():
                 there = by_folder.setdefault(self.folder(path), {})
-                first, last = there.get(path, span)
-                there[path] = min(first, span[0]), max(last, span[1])
+                there[path] = enclosing((span, there.get(path, span)))
         return by_folder
 
     def has(self, session: Session, stored: StoredMessage) -> bool:
@@ -157,9 +156,10 @@ class Sessions:
         That is more than the recording's own session where another one lends; empty where none has
         any.
         """
-        key = (self.folder(recording), at // _AROUND_NS)
+        folder = self.folder(recording)
+        key = (folder, at // _AROUND_NS)
         if key not in self._lending:
-            self._lending[key] = self._with_lender(self._session_of(key[0]), at)
+            self._lending[key] = self._with_lender(self._session_of(folder), at)
         return self._lending[key]
 
     def recorded_at(self, moment: Ns) -> list[Session] | None:
@@ -240,11 +240,8 @@ class Sessions:
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         """Returns the log times of the first and the last message of some topics, by folder."""
-        ends = {
-            folder: zip(*held.values(), strict=True)
-            for folder, held in self._recordings_with(topics).items()
-        }
-        return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
+        by_folder = self._recordings_with(topics)
+        return {folder: enclosing(spans.values()) for folder, spans in by_folder.items()}
 
     def _find_spans(self) -> _TransformSpans:
         limits, pose_topic = self._view.limits, self._view.pose_topic
@@ -275,6 +272,13 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     return component
 
 
+def enclosing(spans: Iterable[tuple[Ns, Ns]]) -> tuple[Ns, Ns]:
+    """Returns the earliest begin and the latest end of spans, of which there is one at least."""
+    firsts, lasts = zip(*spans, strict=True)
+    return min(firsts), max(lasts)
+
+
 def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:
     """Returns how far a moment is from a span of time."""
-    return max(span[0] - moment, moment - span[1], 0)
+    first, last = span
+    return max(first - moment, moment - last, 0)

@@ -69,7 +69,7 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.history.sessions import Session, Sessions
+from ros2_memory.history.sessions import Session, Sessions, enclosing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -336,8 +336,10 @@ def _static_received(view: View, topic: str, session: Session) -> Iterator[Stamp
 def _span_of_session(view: View, topic: str, session: Session) -> TimeWindow:
     """Returns when a session has a topic: mostly some hours of a week."""
     spans = sessions_of(view).recordings_of(session, (topic,)).values()
-    first = min((first for first, _ in spans), default=0)
-    return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
+    if not spans:
+        return TimeWindow(0, 0)
+    first, last = enclosing(spans)
+    return TimeWindow(first, last + 1)
 
 
 def _static_changes(view: View, rows: Rows) -> Statics:
@@ -610,7 +612,7 @@ def _bags_of_session(
     chosen = sessions_of(view).recordings_of(session, tuple(topics))
     if not chosen:
         return []
-    first, last = min(span[0] for span in chosen.values()), max(span[1] for span in chosen.values())
+    first, last = enclosing(chosen.values())
     # A session is mostly some minutes of a week, whose bags are many.
     bags = view.stream.overlapping_bags(topics, window.intersect(TimeWindow(first, last + 1)))
     return [span for span in bags if span.bag.recording in chosen]

@@ -120,7 +120,8 @@ class View:
     def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
         first, last = window.asked()
-        touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
+        gaps = self.snapshot.gaps
+        touched = [(start, end) for start, end in gaps if start < last and first < end]
         return without_steps(self, touched) if touched else touched
 
     def census(self, topic: str) -> dict[str, Census]:

@@ -250,7 +250,7 @@ class RobotTracks:
             if window.covers(rows.first, rows.last):
                 yield rows.first, self._part(rows, key, lent_spans, reading)
                 continue
-            stored = self._known(key)
+            stored = None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
             if stored is not None and not stored.left_out:
                 yield rows.first, stored.some(_positions_in(stored.times, window))
             elif (inside := _positions_in(rows.times, window)).size:
@@ -301,9 +301,6 @@ class RobotTracks:
         clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
-
-    def _known(self, key: FragmentKey | None) -> TrackPart | None:
-        return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
 
     def _part(
         self,

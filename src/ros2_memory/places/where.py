@@ -188,11 +188,10 @@ def _parse_place(
             raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
         return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
-    numbers = [_finite_number(number) for number in (x, y, radius)]
-    if None in numbers or not (numbers[2] or 0) > 0:
+    at_x, at_y, radius_m = map(_finite_number, (x, y, radius))
+    if at_x is None or at_y is None or radius_m is None or radius_m <= 0:
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    at_x, at_y, size = (number or 0.0 for number in numbers)
-    return Where(Circle(at_x, at_y, size))
+    return Where(Circle(at_x, at_y, radius_m))
 
 
 def places_asked(
@@ -225,12 +224,12 @@ def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
 
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
-    ends = [_finite_number(bound) for bound in value] if isinstance(value, list) else []
-    if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
-        raise InvalidArgumentsError(
-            f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
-        )
-    return ends[0], ends[1]
+    match [_finite_number(bound) for bound in value] if isinstance(value, list) else []:
+        case [float(low), float(high)] if low <= high:
+            return low, high
+    raise InvalidArgumentsError(
+        f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
+    )
 
 
 def _finite_number(value: JsonValue) -> float | None:
