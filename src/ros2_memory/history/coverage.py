@@ -520,7 +520,10 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
 def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show, by `recorded_reach`."""
     reach = recorded_reach(snapshot, window)
-    return window if reach is None else window.intersect(TimeWindow(reach[0], reach[1] + 1))
+    if reach is None:
+        return window
+    first, last = reach
+    return window.intersect(TimeWindow(first, last + 1))
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:

@@ -206,8 +206,8 @@ def _transform_of_session(
     static = static_at(static_transforms(view, session), at)
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
-        frames = frames_of(view, static, moving, parent)
-        return FoundTransform(frames.lookup(child, at), frames.clock)
+        tree = frames_of(view, static, moving, parent)
+        return FoundTransform(tree.lookup(child, at), tree.clock)
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)

@@ -535,7 +535,7 @@ def _tracks_by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask
 
 
 def _without_jumps(parts: Parts, are_jumps: Mask) -> Parts:
-    """Returns parts of steps, of those that are jumps their ends alone, or both where all is in.
+    """Returns the parts of steps inside of a region; of a jump only those of its ends inside.
 
     Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
     """
