@@ -83,28 +83,28 @@ def driven_inside(
     region = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    way, _ = driven_path(view, name, window)
-    if way is None or not way.poses:
+    path, _ = driven_path(view, name, window)
+    if path is None or not path.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
     track = joined_in_region(view, region, window).track
     inside = robot_inside(track, region.region, window)
-    totals = totals_inside(way.line, inside)
-    waypoints = way_inside(way.line, inside, max_waypoints)
-    waypoints = tuple(_as_turned(view, name, way.line, waypoint) for waypoint in waypoints)
+    totals = totals_inside(path.line, inside)
+    waypoints = way_inside(path.line, inside, max_waypoints)
+    waypoints = tuple(_as_turned(view, name, path.line, waypoint) for waypoint in waypoints)
     elapsed = elapsed_in(view, window)
     spans = [(stay.start, stay.stop) for stay in inside]
     duration = elapsed.among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
-        waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
+        waypoints = placed_waypoints(view, name, waypoints, path.frames[0], frame_id)
     require_one_robot(view, name, window)
     away = None if farthest is None else farthest_from(view, farthest, name, spans, frame_id)
     note_unread(view, window)
     note_edges(view, window)
     return DrivenInside(
         name,
-        frame_id or way.frames[0],
+        frame_id or path.frames[0],
         region.shown,
         len(inside),
         duration,

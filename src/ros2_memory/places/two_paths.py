@@ -206,23 +206,21 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
 
     A place is where it stood longest within `SAME_STAND_M`.
     """
-    stands = [(0, stand) for stand in this] + [(1, stand) for stand in other]
-    stands.sort(key=lambda stand: (-stand[1].duration, stand[1]))
+    stands = [(stand, side) for side, window in enumerate((this, other)) for stand in window]
+    stands.sort(key=lambda sided: (-sided[0].duration, sided[0]))
     middles = np.empty((len(stands), 2))
-    sums: list[list[Ns]] = []
+    durations: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
-    for side, stand in stands:
-        count = len(sums)
+    for stand, side in stands:
+        count = len(durations)
         away = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
         nth = int(away.argmin()) if (away <= SAME_STAND_M**2).any() else count
         if nth == count:
             middles[nth] = stand.x, stand.y
-            sums.append([0, 0])
+            durations.append([0, 0])
             since.append([None, None])
-        sums[nth][side] += stand.duration
+        durations[nth][side] += stand.duration
         earliest = since[nth][side]
         since[nth][side] = stand.start if earliest is None else min(earliest, stand.start)
-    return [
-        StoodAt(x, y, (both[0], both[1]), (first[0], first[1]))
-        for (x, y), both, first in zip(middles[: len(sums)].tolist(), sums, since, strict=True)
-    ]
+    places = zip(middles[: len(durations)].tolist(), durations, since, strict=True)
+    return [StoodAt(x, y, (a, b), (first, second)) for (x, y), (a, b), (first, second) in places]
