@@ -612,7 +612,7 @@ def trajectory_summary(
 
 
 def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
-    """Returns what a search went through to reach its match, as far as there can be messages."""
+    """Returns the window from a match to where its search began, or to now."""
     stop = until if view.limits.now == "latest" else min(until, now + 1)
     return TimeWindow(stored.time, max(stop, stored.time + 1))
 

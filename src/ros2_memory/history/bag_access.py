@@ -109,7 +109,7 @@ class BagAccess:
             self.call.used_active = True
 
     def track_all_sources(self) -> None:
-        """Does as `track_sources` for an answer that is about all bags of the index."""
+        """Records that an answer is about all bags of the index, also those being written."""
         if any(aside.until is not None for aside in self.snapshot.active):
             self.call.used_active = True
 

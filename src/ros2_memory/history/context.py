@@ -142,7 +142,7 @@ class Memory:
         return bags.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
-        """Returns what recordings' metadata.yaml lists and is not there."""
+        """Returns the splits that metadata.yaml of a recording lists and that are missing."""
         return absent_splits(snapshot, self.index.bag_dir, self._listings())
 
     def store_listings(self, snapshot: Snapshot) -> None:

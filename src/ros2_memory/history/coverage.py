@@ -198,7 +198,7 @@ def deleted_between(view: View, window: TimeWindow) -> Spans:
 
 
 def _deleted_near(view: View, window: TimeWindow) -> Spans:
-    """Returns the same, as far as it reaches out of the window."""
+    """Returns the spans of `deleted_between` before they are cut at the ends of the window."""
     snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
         return []

@@ -86,7 +86,10 @@ class PathBackTo(NamedTuple):
 
 
 def driven_path(view: View, topic: str, window: TimeWindow) -> PathBackTo:
-    """Does as `path_by_poses`; a note says how far back it is known where not all was read."""
+    """Returns the path in a window; a note says how far back it is known if not all was read.
+
+    Raises as `path_by_poses`.
+    """
     path = path_by_poses(view, topic, window)
     if path.since is not None:
         view.notes.add_lack(
@@ -164,7 +167,7 @@ def slices_by_poses(
     settings: str = "",
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the robot's poses in slices of the clock, the newest first.
+    """Yields what `make` returns of the robot's poses, slice by slice of the clock, newest first.
 
     Each with a time (log time, ns) that no pose of it is earlier than. Of a topic of transforms
     they are the poses of the robot's body. Where two recordings have poses of their own, or one has

@@ -166,7 +166,7 @@ class PoseReader:
         return PoseRows(span, partial(self._joined, rows), parts)
 
     def trouble(self) -> Hashable:
-        """Returns what differs from before where something could not be read since."""
+        """Returns how many failures and notes there are: more once something could not be read."""
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
@@ -186,7 +186,7 @@ class PoseReader:
         return rows
 
     def _held_by_others(self, rows: Rows) -> list[ParallelRecordings]:
-        """Returns what has the time of some of these rows first."""
+        """Returns the pairs by which another recording holds the time of these rows first."""
         return [
             beside
             for beside in self._beside

@@ -341,7 +341,7 @@ class CandidateRows:
                 heapq.heappush(ready, (-time, table.topic))
 
     def _tables_of(self, topic: str) -> Iterator[_TableCandidates]:
-        """Yields what each table of a topic has, the newest first."""
+        """Yields when messages of a topic may match, table by table, the newest first."""
 
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)

@@ -347,13 +347,19 @@ def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[Para
 
 
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
-    """Does as `note_robots` for the first few of some topics."""
+    """Notes, for the first topics, the recordings that hold messages of their own at one time.
+
+    Returns these times; see `note_robots`.
+    """
     spans_by_topic = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
     return united(chain.from_iterable(spans_by_topic))
 
 
 def note_robots_near(view: View, stored: StoredMessage) -> None:
-    """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
+    """Notes recordings with messages of their own around the time of a message.
+
+    A single recording is of one robot; see `note_robots`.
+    """
     topic = stored.topic
     if len(view.timeline.recordings(topic)) > 1:
         near = TimeWindow.around(stored.time, _NEAR_NS)
@@ -389,17 +395,19 @@ def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRe
             continue
         series, number = after
         twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        numbered = [
-            (split[1], bag)
-            for bag in view.timeline.overlapping(twice)
-            if (split := split_of(bag.file)) is not None and split[0] == series
-        ]
-        begin = min((bag.start for nth, bag in numbered if nth < number), default=twice.stop)
-        span = TimeWindow(min(max(begin, twice.start), twice.stop), twice.stop)
-        bags = frozenset(bag.file for nth, bag in numbered if nth >= number)
+        begins, bags = [twice.stop], set[str]()
+        for bag in view.timeline.overlapping(twice):
+            bag_series, bag_number = split_of(bag.file) or (None, 0)
+            if bag_series == series and bag_number < number:
+                begins.append(bag.start)
+            elif bag_series == series:
+                bags.add(bag.file)
+        span = TimeWindow(max(min(begins), twice.start), twice.stop)
         if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
             recording = fault.bag.recording
-            yield ParallelRecordings(recording, recording, span, by_clock=True, bags=bags)
+            yield ParallelRecordings(
+                recording, recording, span, by_clock=True, bags=frozenset(bags)
+            )
 
 
 def _steps_back(view: View) -> Mapping[Path, Ns]:
@@ -438,7 +446,7 @@ def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
 def _bags_differ(
     view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
 ) -> bool:
-    """Does as `_differ`, for the bags of each."""
+    """Whether two lists of bags hold messages in a window, and the second none of the first's."""
     first_spans, other = bags
     if next(_merged_messages(view, topic, other, both), None) is None:
         return False

@@ -106,7 +106,7 @@ def joined_back(
     beside: Ns = 0,
     trouble: Callable[[], Hashable] = lambda: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what follows from the rows of a scan, the newest first, each with a time.
+    """Yields what `make` returns of the rows of a scan, the newest first, each with a time.
 
     Nothing of it is earlier than that (log time, ns). What follows from whole parts alone is joined
     by stretches of the clock, and remembered.
@@ -155,7 +155,7 @@ def remembered(
     *,
     also_before: Ns = 0,
 ) -> T:
-    """Returns what follows from whole parts: what is known of it, else made now.
+    """Returns what is stored under a key, else what `make` returns.
 
     That is remembered unless something could not be read; see `joined_back`. A key of None stands
     for what may still change. `also_before`: see `Fragments.get`.

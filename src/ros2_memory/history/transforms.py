@@ -201,7 +201,7 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
 def _transform_of_session(
     view: View, session: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
-    """Does as `transform_at`, by the transforms of one session."""
+    """Returns the pose of a child in its parent by one session; raises as `transform_at`."""
     limits, (parent, child) = view.limits, frames
     static = static_at(static_transforms(view, session), at)
 
@@ -526,7 +526,7 @@ def connects(
     window: TimeWindow | None = None,
     session: Session | None = None,
 ) -> bool:
-    """Does as `connects_in_time`; looks at the newest transforms first, until they do.
+    """Whether transforms lead from one frame to the other; the newest are looked at first.
 
     Raises:
         QueryTimeoutError: the call's time is over before that is known.

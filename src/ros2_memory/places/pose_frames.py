@@ -320,7 +320,7 @@ def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
 
 
 def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
-    """Makes what the parts in a window say of where the robot was in the frames of places.
+    """Makes the robot's tracks by the parts in a window, in the frames of places; they are stored.
 
     Yields a log time (ns) of each, the newest first.
     """

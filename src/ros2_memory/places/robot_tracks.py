@@ -260,7 +260,7 @@ class RobotTracks:
     def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
     ) -> FragmentKey | None:
-        """Returns what the track of a stretch follows from; None where that may still change."""
+        """Returns the key of a stretch's track; None where what it follows from may change."""
         start, last = stretch.window.start, stretch.last
         if stretch.parts is None or not window.covers(start, last):
             return None
@@ -268,7 +268,8 @@ class RobotTracks:
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         parts = [*stretch.parts]
-        for recording in () if self._is_own else map(opened.recording_of, stretch.parts):
+        recordings = () if self._is_own else map(opened.recording_of, stretch.parts)
+        for recording in recordings:
             session = sessions.of(recording)
             if not sessions.has_all_kinds(session):
                 return None
@@ -297,7 +298,7 @@ class RobotTracks:
         return None if is_mixed else paths
 
     def _settings_hash(self, placed_by: Sequence[object]) -> str:
-        """Returns what a track depends on besides the poses and transforms in parts, as a text."""
+        """Returns a hash of the settings and transforms that a track depends on, but for parts."""
         clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
@@ -323,7 +324,7 @@ class RobotTracks:
     def _rows_key(
         self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]
     ) -> FragmentKey | None:
-        """Returns what the track by some rows follows from; None where that may still change."""
+        """Returns the key of the track by some rows; None where what it follows from may change."""
         if rows.part is None:
             return None
         parts, placed_by = [rows.part], []

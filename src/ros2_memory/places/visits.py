@@ -273,7 +273,7 @@ class RegionVisits:
     """
 
     def __init__(self, view: View, frame_id: str, region: Region, window: TimeWindow) -> None:
-        """Finds them.
+        """Finds the visits by the tracks, and confirms by poses those that are in doubt.
 
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
