@@ -180,17 +180,15 @@ def _differing_topic(
     view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
 ) -> str | None:
     both = TimeWindow(pair.start, pair.end + 1)
-    first_bags, other = (
+    first_bags, other_bags = (
         [bag for bag in recordings.get(str(path), ()) if both.overlaps(bag.start, bag.end)]
         for path in (pair.first, pair.second)
     )
-    shared = _topics_of(first_bags) & _topics_of(other) - view.timeline.transient_local
-    limits = view.limits
-    first = [wanted for wanted in (view.pose_topic, *limits.tf_topics) if wanted in shared]
-    for topic in islice([*first, *sorted(shared.difference(first))], _MAX_COMPARED):
-        if _bags_differ(
-            view, topic, (_bag_spans(first_bags, topic), _bag_spans(other, topic)), both
-        ):
+    shared = _topics_of(first_bags) & _topics_of(other_bags) - view.timeline.transient_local
+    of_robot = [topic for topic in (view.pose_topic, *view.limits.tf_topics) if topic in shared]
+    for topic in islice([*of_robot, *sorted(shared.difference(of_robot))], _MAX_COMPARED):
+        spans = _bag_spans(first_bags, topic), _bag_spans(other_bags, topic)
+        if _bags_differ(view, topic, spans, both):
             return topic
     return None
 
