@@ -115,11 +115,10 @@ def state_of(value: JsonValue, type_name: str) -> State:
         facts = chain(facts, _labels(value), _flags(value, ""))
     kept: list[Fact] = []
     counts: Counter[str] = Counter()
-    for fact in facts:
-        kind = fact[0].kind
-        counts[kind] += 1
-        if counts[kind] <= MOST.get(kind, math.inf):
-            kept.append(fact)
+    for word, number in facts:
+        counts[word.kind] += 1
+        if counts[word.kind] <= MOST.get(word.kind, math.inf):
+            kept.append((word, number))
     return State(tuple(kept), counts.total() - len(kept))
 
 

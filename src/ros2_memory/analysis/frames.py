@@ -287,10 +287,10 @@ class FrameTree:
         for parent, child in self._pairs:
             self._moving[child][parent] = moving[parent, child]
         for transform in static:
-            pair = transform.parent.lstrip("/"), transform.child.lstrip("/")
-            if is_edge(pair):
-                self._static[pair[1]].append(transform)
-                self._pairs[pair] = None
+            parent, child = transform.parent.lstrip("/"), transform.child.lstrip("/")
+            if is_edge((parent, child)):
+                self._static[child].append(transform)
+                self._pairs[parent, child] = None
         self._histories: dict[str, _History] = {}
 
     def reaches(self, frame: str) -> bool:

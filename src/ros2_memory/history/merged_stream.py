@@ -152,8 +152,9 @@ class MergedStream:
         if not record.may_be_relatched:
             return False
         self._find_first_copies(stored)
-        first = self._first_copies.get(copy_key(record), (stored.time, stored.bag.recording))
-        return stored.time > first[0] and stored.bag.recording != first[1]
+        own = stored.time, stored.bag.recording
+        first_time, first_recording = self._first_copies.get(copy_key(record), own)
+        return stored.time > first_time and stored.bag.recording != first_recording
 
     def _find_first_copies(self, late: StoredMessage) -> None:
         """Records the first reception of every message that a late one may repeat.

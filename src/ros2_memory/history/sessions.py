@@ -184,9 +184,12 @@ class Sessions:
 
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
-        spans = [span for by_folder in self._spans.kinds for span in by_folder.items()]
-        near = sorted(spans, key=lambda spanned: (_distance(spanned[1], moment), spanned[0]))
-        return [*dict.fromkeys(self._session_of(folder) for folder, _ in near)]
+        near = sorted(
+            (_distance(span, moment), folder)
+            for by_folder in self._spans.kinds
+            for folder, span in by_folder.items()
+        )
+        return [*dict.fromkeys(self._session_of(folder) for _, folder in near)]
 
     def _with_lender(self, session: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
@@ -206,7 +209,8 @@ class Sessions:
 
     def _are_two_robots(self, at: Ns) -> bool:
         """Whether two sessions near a moment hold poses of the same time."""
-        near = [spanned for spanned in self._spans.poses if _distance(spanned[1], at) <= _AROUND_NS]
+        poses = self._spans.poses
+        near = [(folder, span) for folder, span in poses if _distance(span, at) <= _AROUND_NS]
         return any(
             max(first, begin) <= min(last, end)
             and self._session_of(first_folder) != self._session_of(other)

@@ -417,7 +417,7 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
         return sessions.edges
     pairs = dict.fromkeys(_all_pairs(view, limits.tf_static_topics), True)
     pairs |= dict.fromkeys(_all_pairs(view, limits.tf_topics), False)
-    named = [pair for pair in sorted(pairs.items()) if is_edge(pair[0])]
+    named = [(pair, is_static) for pair, is_static in sorted(pairs.items()) if is_edge(pair)]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
     sessions.edges = tuple(FrameEdge(*pair, is_static) for pair, is_static in named)

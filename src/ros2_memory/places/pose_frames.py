@@ -108,10 +108,10 @@ def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Pat
     recordings: which of their bags reaches over a time depends on how they were split.
     """
     spans = view.timeline.recordings(topic)
-    if own is not None and own in spans and spans[own][0] <= at <= spans[own][1]:
+    around = {path: last - first for path, (first, last) in spans.items() if first <= at <= last}
+    if own in around or not around:
         return own
-    around = [(last - first, path) for path, (first, last) in spans.items() if first <= at <= last]
-    return min(around)[1] if around else own
+    return min(around, key=lambda path: (around[path], path))
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:

@@ -388,8 +388,8 @@ class _ConditionStates:
         """Returns when the topics said something: without silences, unless that holds on."""
         topics, timeline = self._search.topics, self._view.timeline
         if self._holds_on:
-            begins = [span[0] for topic in topics for span in timeline.recordings(topic).values()]
-            known = [(min(begins, default=MAX_NS), MAX_NS)]
+            spans = (span for topic in topics for span in timeline.recordings(topic).values())
+            known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
         else:
             known = _heard(self._view, topics, window.widened(SILENCE_NS))
         return without(known, note_robots_on(self._view, topics, window))

@@ -373,14 +373,12 @@ def measured_path(times: Times, positions: Vectors, fastest_mps: float) -> Measu
     plain_m = np.sqrt(row_sums(np.diff(positions, axis=0) ** 2))
     begin = 0
     for index in _odd_steps(apart, plain_m, fastest_mps):
-        sides = (
-            _poses(times, positions, max(begin, index - _NEARBY), index + 1),
-            _poses(times, positions, index + 1, index + 2 + _NEARBY),
-        )
+        earlier = _poses(times, positions, max(begin, index - _NEARBY), index + 1)
+        later = _poses(times, positions, index + 1, index + 2 + _NEARBY)
         # Too few poses do not show what is usual.
-        are_enough = sum(map(len, sides)) >= _NEARBY
-        near = _motion_of(sides[0]).or_more(_motion_of(sides[1])) if are_enough else None
-        here, there = sides[0][-1], sides[1][0]
+        are_enough = len(earlier) + len(later) >= _NEARBY
+        near = _motion_of(earlier).or_more(_motion_of(later)) if are_enough else None
+        here, there = earlier[-1], later[0]
         before = motion.totals.newest
         usual_ns = _usual_ns(apart, index, None if before is None else before.period_ns)
         kind = link(here, there, usual_ns, fastest_mps, near)

@@ -237,8 +237,8 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     is_first = np.r_[links, False] & ~np.r_[False, links]
     is_last = np.r_[False, links] & ~np.r_[links, False]
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(is_last)
-    edges = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
+    before, after = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
+    is_long = slots.lasts[after] - slots.firsts[before] >= SHORTEST_NS
     is_inner = np.zeros(len(slots), np.bool_)
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
         is_inner[first + 1 : last] = True
