@@ -137,9 +137,9 @@ def topic_value(
     A latched topic has no tolerance unless one is given: its newest message holds.
     """
     view, at, now = open_moment(memory, call, moment)
-    found = _found_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
-    value = _value(view, found, fields, now)
-    return _held(view, value, found, at)
+    stored = _newest_at(view, resolve_topic(view, topic), at, tolerance_s, moment.rest_s)
+    value = _as_value(view, stored, fields, now)
+    return _with_latched_age(view, value, stored, at)
 
 
 def topic_range(
@@ -158,7 +158,7 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    chosen = _each_shown(view, picked, fields)
+    chosen = _show_each(view, picked, fields)
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
@@ -193,24 +193,32 @@ def position(
     name = resolve_path_topic(view, topic, degrees=True)
     body = robot_body(view) if name in memory.limits.tf_topics else None
     if body is not None:
-        return _position_of_body(view, body, (at, tolerance_s, moment.rest_s), now, frame_id)
+        return _position_of_body(
+            view,
+            body,
+            at,
+            tolerance_s=tolerance_s,
+            rest_s=moment.rest_s,
+            now=now,
+            frame_id=frame_id,
+        )
     _require_kind(view, name, "position", "geodetic")
-    found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
-    return _position_in(view, found, at, now, frame_id)
+    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    return _position_in(view, stored, at, now, frame_id)
 
 
 def _position_in(
-    view: View, found: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
+    view: View, stored: StoredMessage, at: Ns, now: Ns | None, frame_id: str | None
 ) -> results.Position:
     """Returns the pose in a message, as that of a moment; see `position`."""
-    memory, name = view.memory, found.topic
-    _note_held(view, found, at)
-    message, type_name = decode(view, found), found.type
+    memory, name = view.memory, stored.topic
+    _note_latched(view, stored, at)
+    message, type_name = decode(view, stored), stored.type
     pose, geodetic = memory.extractor.pose(message, type_name), None
     if pose is None:
         geodetic = memory.extractor.geodetic(message, type_name)
         if geodetic is None:
-            raise InvalidArgumentsError(describe_lack(view, "position", found))
+            raise InvalidArgumentsError(describe_lack(view, "position", stored))
         pose = Pose((math.nan,) * 3, None, geodetic.frame_id)
         coordinates: tuple[float, ...] = (geodetic.latitude, geodetic.longitude)
     else:
@@ -222,21 +230,21 @@ def _position_in(
     if geodetic is None and pose.orientation is None:
         view.notes.add("the recorded orientation is not a rotation")
     if geodetic is None:
-        recording = found.bag.recording
-        if is_thinned(found.bag.file):
-            _note_reach(view, found, pose)
+        recording = stored.bag.recording
+        if is_thinned(stored.bag.file):
+            _note_reach(view, stored, pose)
         if frame_id is not None:
-            pose = placed(view, pose, found.time, recording, frame_id)
+            pose = placed(view, pose, stored.time, recording, frame_id)
         if memory.limits.places:
-            pose = with_place(view, pose, found.time, recording)
+            pose = with_place(view, pose, stored.time, recording)
     notes = view.notes.sentences()
-    return results.Position(name, found.time, pose, _age(found, now), geodetic, notes=notes)
+    return results.Position(name, stored.time, pose, _age(stored, now), geodetic, notes=notes)
 
 
-def _note_reach(view: View, found: StoredMessage, pose: Pose) -> None:
+def _note_reach(view: View, stored: StoredMessage, pose: Pose) -> None:
     """Notes between which coordinates the robot was, in a second of which one pose stayed."""
-    window = TimeWindow(found.time + 1, found.time + 2 * NS_PER_S)
-    newer = view.stream.first([found.topic], window)
+    window = TimeWindow(stored.time + 1, stored.time + 2 * NS_PER_S)
+    newer = view.stream.first([stored.topic], window)
     message = None if newer is None else view.bags.decode(newer)
     if newer is None or message is None:
         return
@@ -253,32 +261,35 @@ def _note_reach(view: View, found: StoredMessage, pose: Pose) -> None:
 def _position_of_body(
     view: View,
     body: Body,
-    asked: tuple[Ns, float | None, float],
+    at: Ns,
+    *,
+    tolerance_s: float | None,
+    rest_s: float,
     now: Ns | None,
     frame_id: str | None,
 ) -> results.Position:
     """Returns where transforms have the robot's body, and the latitude and longitude beside it.
 
     Raises:
-        NoDataError: none places it at the moment that is asked, or within the tolerance before.
+        NoDataError: none places it at the moment, or within the tolerance before.
     """
     limits, extractor = view.limits, view.extractor
-    window, tolerance = _within(view, *asked)
+    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
     of_body = newest_of_body(view, body, window, frame_id)
     if of_body is None:
-        raise _not_placed(view, body, asked[0], tolerance, frame_id)
-    found, pose = of_body
-    note_robots_near(view, found)
-    note_unread(view, TimeWindow(found.time, window.stop))
+        raise _not_placed(view, body, at, tolerance, frame_id)
+    stored, pose = of_body
+    note_robots_near(view, stored)
+    note_unread(view, TimeWindow(stored.time, window.stop))
     if limits.places:
-        pose = with_place(view, pose, found.time, found.bag.recording)
+        pose = with_place(view, pose, stored.time, stored.bag.recording)
     geodetic, fixes = None, topics_of_robot(view, "geodetic")
-    near = TimeWindow.around(found.time, ns_from_unix(limits.time_tolerance_s))
+    near = TimeWindow.around(stored.time, ns_from_unix(limits.time_tolerance_s))
     fix = view.stream.newest(fixes[0], near) if len(fixes) == 1 else None
     if fix is not None and (message := view.bags.decode(fix)) is not None:
         geodetic = extractor.geodetic(message, fix.type)
-    topic, notes = found.topic, view.notes.sentences()
-    return results.Position(topic, found.time, pose, _age(found, now), geodetic, notes=notes)
+    topic, notes = stored.topic, view.notes.sentences()
+    return results.Position(topic, stored.time, pose, _age(stored, now), geodetic, notes=notes)
 
 
 def _not_placed(
@@ -307,12 +318,14 @@ def velocity(
     view, at, now = open_moment(memory, call, moment)
     name = resolve_pose_topic(view, topic, "velocity")
     _require_kind(view, name, "velocity")
-    found = _found_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
-    _note_held(view, found, at)
-    twist = memory.extractor.twist(decode(view, found), found.type)
+    stored = _newest_at(view, name, at, tolerance_s, moment.rest_s, is_pose=True)
+    _note_latched(view, stored, at)
+    twist = memory.extractor.twist(decode(view, stored), stored.type)
     if twist is None:
-        raise InvalidArgumentsError(describe_lack(view, "velocity", found))
-    return results.Velocity(name, found.time, twist, _age(found, now), notes=view.notes.sentences())
+        raise InvalidArgumentsError(describe_lack(view, "velocity", stored))
+    return results.Velocity(
+        name, stored.time, twist, _age(stored, now), notes=view.notes.sentences()
+    )
 
 
 def transform(
@@ -321,13 +334,13 @@ def transform(
     """Returns the pose of `child` in `parent` at a moment, interpolated by tf2's rules."""
     view, at, now = open_moment(memory, call, moment)
     try:
-        found = frame_history.transform_at(view, parent, child, at)
+        transform = frame_history.transform_at(view, parent, child, at)
     except NoDataError as error:
         raise with_notes(view, TimeWindow.around(at, TF_CACHE_NS), error) from error
-    note_unread(view, TimeWindow.around(at, found.reach))
+    note_unread(view, TimeWindow.around(at, transform.reach))
     age = None if now is None else now - at
     return results.TransformAt(
-        parent, child, at, found.transform, found.clock, age, notes=view.notes.sentences()
+        parent, child, at, transform.transform, transform.clock, age, notes=view.notes.sentences()
     )
 
 
@@ -357,7 +370,7 @@ def find_last_match(
     of a score below `min_score` do not count.
     """
     now = memory.clock.now()
-    until = _before(before_s)
+    until = _search_end(before_s)
 
     def newest(view: View) -> results.Match:
         condition = condition_of(
@@ -366,25 +379,25 @@ def find_last_match(
         search = ReverseSearch(view, topic, condition)
         if before_s is not None:
             require_recorded(view, TimeWindow(MIN_NS, until))
-        found = search.newest(until)
-        if found is None:
+        stored = search.newest(until)
+        if stored is None:
             notes = _notes_on_never(view, search, until, condition, min_score)
             return results.Match(None, notes=notes)
-        note_robots_near(view, found)
-        note_unread(view, _searched(view, found, until, now), search=True)
+        note_robots_near(view, stored)
+        note_unread(view, _searched_window(view, stored, until, now), search=True)
         # What the view shows may be some days of long ago.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
-        is_future = found.time > counted_from + FUTURE_NS
+        is_future = stored.time > counted_from + FUTURE_NS
         if is_future:
-            after = seconds(found.time - counted_from)
+            after = seconds(stored.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-        value_found = _value(view, found, fields, None if is_future else counted_from)
+        value_found = _as_value(view, stored, fields, None if is_future else counted_from)
         return results.Match(value_found, notes=view.notes.sentences())
 
     reach = min(now, until)
     view = View(memory, call, reach)
-    return _going_back(view, reach, newest, lambda each: each.found is not None)
+    return _going_back(view, reach, newest, lambda match: match.found is not None)
 
 
 def value_when(
@@ -405,7 +418,7 @@ def value_when(
     With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
     of a score below `min_score` do not count.
     """
-    now, until = memory.clock.now(), _before(before_s)
+    now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
 
@@ -416,28 +429,28 @@ def value_when(
         search = ReverseSearch(view, condition_topic, condition)
         if before_s is not None:
             require_recorded(view, TimeWindow(MIN_NS, until))
-        found = search.newest(until)
-        if found is None:
+        match = search.newest(until)
+        if match is None:
             notes = _notes_on_never(view, search, until, condition, min_score)
             return results.ValueWhen(None, notes=notes)
-        note_unread(view, _searched(view, found, until, now), search=True)
-        note_robots_near(view, found)
-        matched = _value(view, found, (), None)
-        upto = TimeWindow.until(found.time)
-        held = _newest_beside(view, name, upto, found)
+        note_unread(view, _searched_window(view, match, until, now), search=True)
+        note_robots_near(view, match)
+        matched = _as_value(view, match, (), None)
+        upto = TimeWindow.until(match.time)
+        held = _newest_beside(view, name, upto, match)
         read = upto if held is None else replace(upto, start=held.time)
         note_unread(view, read, nothing=not held)
         if held is None:
-            view.notes.add(f"{name} held no message yet at {unix_text(found.time)}")
+            view.notes.add(f"{name} held no message yet at {unix_text(match.time)}")
             return results.ValueWhen(matched, notes=view.notes.sentences())
-        distance = found.time - held.time
+        distance = match.time - held.time
         latched = memory.limits.latching.holds(view.snapshot, held)
         if distance > ns_from_unix(memory.limits.time_tolerance_s) and not latched:
             view.notes.add(f"the value is {seconds(distance)} older than the match")
-        held_value = _held(view, _value(view, held, fields, None), held, found.time)
+        held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
         return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
 
-    return _going_back(view, now, newest, lambda each: each.matched is not None)
+    return _going_back(view, now, newest, lambda value: value.matched is not None)
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -517,7 +530,9 @@ def data_time_range(
         undecodable=undecodable,
         clock_faults=clock_faults(snapshot),
         silences=tuple(
-            each for each in silences_of(memory, snapshot) if window.overlaps(each.start, each.end)
+            silence
+            for silence in silences_of(memory, snapshot)
+            if window.overlaps(silence.start, silence.end)
         ),
         clock_steps=steps,
     )
@@ -596,10 +611,10 @@ def trajectory_summary(
     )
 
 
-def _searched(view: View, found: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
-    """Returns what a search went through to reach its match, as far as there can be messages."""
+def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> TimeWindow:
+    """Returns the window from a match to where its search began, or to now."""
     stop = until if view.limits.now == "latest" else min(until, now + 1)
-    return TimeWindow(found.time, max(stop, found.time + 1))
+    return TimeWindow(stored.time, max(stop, stored.time + 1))
 
 
 def _going_back(
@@ -618,7 +633,7 @@ def _going_back(
     missed: A | NoDataError | None = None
     while True:
         try:
-            found: A = newest(view)
+            answer: A = newest(view)
         except NoDataError as error:
             missed = missed or error
         except QueryTimeoutError as error:
@@ -626,11 +641,13 @@ def _going_back(
                 raise
             raise out_of_time(view, reach + 1) from error
         else:
-            if is_found(found):
-                return found
-            known: tuple[str, ...]
-            known = () if missed is None or isinstance(missed, NoDataError) else missed.notes
-            missed = replace(found, notes=tuple(dict.fromkeys((*known, *found.notes))))
+            if is_found(answer):
+                return answer
+            earlier_notes: tuple[str, ...]
+            earlier_notes = (
+                () if missed is None or isinstance(missed, NoDataError) else missed.notes
+            )
+            missed = replace(answer, notes=tuple(dict.fromkeys((*earlier_notes, *answer.notes))))
         older = view.snapshot.older
         if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
             if isinstance(missed, NoDataError):
@@ -657,14 +674,14 @@ def _notes_on_never(
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()
 
 
-def _before(before_s: float | None) -> Ns:
+def _search_end(before_s: float | None) -> Ns:
     """Returns the end of a search: just after a moment, with the slack of a float of seconds."""
     if before_s is None:
         return MAX_NS
     return min(ns_argument("before", before_s) + AT_OR_BEFORE_SLACK_NS + 1, MAX_NS)
 
 
-def _found_at(
+def _newest_at(
     view: View,
     topic: str,
     at: Ns,
@@ -678,34 +695,34 @@ def _found_at(
     Raises:
         NoDataError: there is none within the tolerance.
     """
-    limits = view.limits
-    window, tolerance = _within(view, at, tolerance_s, rest_s)
-    found = view.stream.newest(topic, window)
-    if found is None and tolerance_s is None and is_pose:
+    latching = view.limits.latching
+    window, tolerance = _window_before(view, at, tolerance_s, rest_s)
+    stored = view.stream.newest(topic, window)
+    if stored is None and tolerance_s is None and is_pose:
         before = TimeWindow(max(window.stop - _THINNED_POSES_NS, MIN_NS), window.stop)
-        found = view.stream.newest(topic, before)
-        if found is not None and not (is_thinned(found.bag.file) and _holds(view, found)):
-            found = None
-    if found is None and tolerance_s is None and limits.latching.may_hold(view.snapshot, topic):
-        found = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
-        if found is None:
+        pose = view.stream.newest(topic, before)
+        if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
+            stored = pose
+    if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
+        newest = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
+        if newest is None:
             tolerance = None
-        elif not limits.latching.holds(view.snapshot, found):
-            found = None
-    if found is None:
+        elif latching.holds(view.snapshot, newest):
+            stored = newest
+    if stored is None:
         raise no_data_at(view, (topic,), at, tolerance)
-    note_robots_near(view, found)
-    note_unread(view, TimeWindow(found.time, window.stop))
-    return found
+    note_robots_near(view, stored)
+    note_unread(view, TimeWindow(stored.time, window.stop))
+    return stored
 
 
-def _holds(view: View, found: StoredMessage) -> bool:
+def _holds_until_next(view: View, stored: StoredMessage) -> bool:
     """Whether a pose of a thinned day holds until the next: farther apart none was recorded."""
-    window = TimeWindow(found.time + 1, found.time + _THINNED_POSES_NS)
-    return view.stream.first([found.record.channel.topic], window) is not None
+    window = TimeWindow(stored.time + 1, stored.time + _THINNED_POSES_NS)
+    return view.stream.first([stored.record.channel.topic], window) is not None
 
 
-def _within(
+def _window_before(
     view: View, at: Ns, tolerance_s: float | None, rest_s: float
 ) -> tuple[TimeWindow, Ns | None]:
     """Returns when a message is near enough before a moment, and the tolerance; None for any."""
@@ -726,8 +743,8 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
     """
     extractor, types = view.extractor, view.timeline.types_of(topic)
     if any(
-        not extractor.is_mapped(each) or extractor.kinds_of(each) & {what, *or_else}
-        for each in types
+        not extractor.is_mapped(type_name) or extractor.kinds_of(type_name) & {what, *or_else}
+        for type_name in types
     ):
         return
     newest = view.stream.newest(topic, TimeWindow.everything())
@@ -735,44 +752,46 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
         raise InvalidArgumentsError(describe_lack(view, what, newest))
 
 
-def _held(
-    view: View, value: results.TopicValue, found: StoredMessage, at: Ns
+def _with_latched_age(
+    view: View, value: results.TopicValue, stored: StoredMessage, at: Ns
 ) -> results.TopicValue:
     """Returns a value with whether it is latched, and then how old it is."""
-    if not view.limits.latching.holds(view.snapshot, found):
+    if not view.limits.latching.holds(view.snapshot, stored):
         return value
-    age = max(at - found.time, 0) if value.age is None else value.age
+    age = max(at - stored.time, 0) if value.age is None else value.age
     return replace(value, latched=True, age=age)
 
 
-def _note_held(view: View, found: StoredMessage, at: Ns) -> None:
+def _note_latched(view: View, stored: StoredMessage, at: Ns) -> None:
     """Notes of an answer that does not show its age that it is latched, and how old it is."""
-    if view.limits.latching.holds(view.snapshot, found):
-        topic = found.topic
+    if view.limits.latching.holds(view.snapshot, stored):
+        topic = stored.topic
         view.notes.add(
-            f"{topic} is latched: its value of {seconds(max(at - found.time, 0))} before is still "
+            f"{topic} is latched: its value of {seconds(max(at - stored.time, 0))} before is still "
             "valid"
         )
 
 
-def _decoded(view: View, found: StoredMessage, fields: Sequence[str]) -> tuple[object, Extracted]:
+def _decode_shown(
+    view: View, stored: StoredMessage, fields: Sequence[str]
+) -> tuple[object, Extracted]:
     """Returns a message, and as a reply shows it, with the notes on that message alone."""
     with view.call.stages.timed("extract"):
-        message = decode(view, found)
-        return message, view.extractor.shown(message, found.type, fields)
+        message = decode(view, stored)
+        return message, view.extractor.shown(message, stored.type, fields)
 
 
-def _value(
-    view: View, found: StoredMessage, fields: Sequence[str], now: Ns | None
+def _as_value(
+    view: View, stored: StoredMessage, fields: Sequence[str], now: Ns | None
 ) -> results.TopicValue:
     """Returns a message as a reply shows it, with all notes of the view so far."""
-    message, shown = _decoded(view, found, fields)
-    channel = found.record.channel
+    message, shown = _decode_shown(view, stored, fields)
+    channel = stored.record.channel
     return results.TopicValue(
         channel.topic,
         channel.type,
-        Sample(found.time, shown.value),
-        _age(found, now),
+        Sample(stored.time, shown.value),
+        _age(stored, now),
         frame_id=view.extractor.frame(message),
         notes=(*view.notes.sentences(), *shown.notes),
     )
@@ -787,17 +806,17 @@ class _Shown(NamedTuple):
     failure: str = ""
 
 
-def _each_shown(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
+def _show_each(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
     """Returns messages as a reply shows them. None is in memory when the next one is read."""
-    found: list[_Shown] = []
-    for each in picked:
-        type_name = each.type
+    shown: list[_Shown] = []
+    for message in picked:
+        type_name = message.type
         try:
-            found.append(_Shown(each.time, type_name, _decoded(view, each, fields)[1]))
+            shown.append(_Shown(message.time, type_name, _decode_shown(view, message, fields)[1]))
         except NoDataError as error:
-            found.append(_Shown(each.time, type_name, None, error.detail))
-        del each
-    return found
+            shown.append(_Shown(message.time, type_name, None, error.detail))
+        del message
+    return shown
 
 
 def _samples(
@@ -826,8 +845,8 @@ def _samples(
     return tuple(samples), list(types)
 
 
-def _age(found: StoredMessage, now: Ns | None) -> Ns | None:
-    return None if now is None else now - found.time
+def _age(stored: StoredMessage, now: Ns | None) -> Ns | None:
+    return None if now is None else now - stored.time
 
 
 def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
@@ -848,4 +867,4 @@ def _notes_by_topic(snapshot: Snapshot) -> dict[str, tuple[str, ...]]:
 
 def _topics_of(bag: BagFile) -> frozenset[str]:
     """Returns the topics that a bag declares; one may be declared under several types."""
-    return frozenset(each.topic for each in bag.summary.schema.topics)
+    return frozenset(declared.topic for declared in bag.summary.schema.topics)

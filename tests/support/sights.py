@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import TABLES, Ints, Seen, Sights, sights_of
+from ros2_memory.analysis.sights import TABLES, DetectorMessages, Ints, Sights, sights_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.columns.table import Texts
 
@@ -45,13 +45,13 @@ def sights_of_messages(messages: Sequence[Message]) -> Sights:
     return sights_of(messages[0].topic, seen_in(messages)) if messages else no_sights()
 
 
-def seen_in(messages: Sequence[Message]) -> Seen:
+def seen_in(messages: Sequence[Message]) -> DetectorMessages:
     """Messages of one topic as arrays."""
     nowhere = (math.nan, math.nan, math.nan)
     every = [(row, one) for row, message in enumerate(messages) for one in message.things]
     scores = [math.nan if one.score is None else one.score for _, one in every]
     labels = Texts.of([one.label for _, one in every])
-    return Seen(
+    return DetectorMessages(
         np.array([message.time for message in messages], np.int64),
         np.array([message.robot or nowhere for message in messages], np.float64).reshape(-1, 3),
         np.array([row for row, _ in every], np.int64),

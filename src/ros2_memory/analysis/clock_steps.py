@@ -90,17 +90,18 @@ def delay_change(hole: tuple[Ns, Ns], log_times: IntArray, stamps: IntArray) -> 
         log_times: of messages up to `STAMPS_BESIDE_NS` from it, ns.
         stamps: their header stamps, ns.
     """
-    is_before = log_times <= hole[0]
+    last_before, first_after = hole
+    is_before = log_times <= last_before
     delays = log_times - stamps
     sides = [delays[is_before], delays[~is_before]]
     if min(side.size for side in sides) < _FEWEST_STAMPS:
         return None
-    if log_times.max() - hole[1] < _LIVE_NS:
+    if log_times.max() - first_after < _LIVE_NS:
         return None
     if max(float(np.percentile(side, 90) - np.percentile(side, 10)) for side in sides) > ALIKE_NS:
         return None
     passed = int(stamps[~is_before].min()) - int(stamps[is_before].max())
-    if not 0 < passed < (hole[1] - hole[0]) // 2:
+    if not 0 < passed < (first_after - last_before) // 2:
         return None
     before, after = (int(np.median(side)) for side in sides)
     return after - before
@@ -110,8 +111,8 @@ def step_by_delays(hole: tuple[Ns, Ns], changes: Sequence[Ns]) -> ClockStep | No
     """Returns the step that a hole is, by `delay_change` of several topics; None if it is none."""
     if len(changes) < _AGREEING or max(changes) - min(changes) > ALIKE_NS:
         return None
-    by = int(np.median(changes))
-    return ClockStep(hole[0], by) if by >= SHORTEST_BY_STAMPS_NS else None
+    (last_before, _), by = hole, int(np.median(changes))
+    return ClockStep(last_before, by) if by >= SHORTEST_BY_STAMPS_NS else None
 
 
 def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | None:
@@ -129,8 +130,8 @@ def step_over(hole: tuple[Ns, Ns], before: Poses, after: Poses) -> ClockStep | N
     moved_m = math.dist(before.positions[-1], after.positions[0])
     if moved_m > _MOVED * speed_mps * unix_from_ns(length):
         return None
-    by = length - ns_from_unix(moved_m / speed_mps)
-    return ClockStep(hole[0], by) if by >= SHORTEST_STEP_NS else None
+    (last_before, _), by = hole, length - ns_from_unix(moved_m / speed_mps)
+    return ClockStep(last_before, by) if by >= SHORTEST_STEP_NS else None
 
 
 def _speed_mps(poses: Poses) -> float:

@@ -132,7 +132,7 @@ class Contains:
 
         Elements of nested lists count too, fields of objects in them do not.
         """
-        return any(self.equal.is_leaf(each) for each in leaves(target, in_objects=False))
+        return any(self.equal.is_leaf(leaf) for leaf in leaves(target, in_objects=False))
 
 
 def _has_words(text: str, words: str) -> bool:
@@ -302,13 +302,13 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
         return ()
     targets = [value] if condition.field is None else at_field(value, condition.field)
     # `leaves` goes through a value from its end.
-    found = [
+    texts = [
         leaf
         for target in targets
         for leaf in reversed([*leaves(target)])
         if isinstance(leaf, str) and test.matches(leaf)
     ]
-    return tuple(dict.fromkeys(found))
+    return tuple(dict.fromkeys(texts))
 
 
 def parse_condition(
@@ -349,10 +349,10 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
     selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
     the first.
     """
-    found: list[JsonValue] = [value]
+    nodes: list[JsonValue] = [value]
     for segment in dot_path.split("."):
-        found = [target for node in found for target in _step(node, segment)]
-    return found
+        nodes = [target for node in nodes for target in _descend(node, segment)]
+    return nodes
 
 
 def positions(value: JsonValue) -> Iterator[Vector3]:
@@ -450,7 +450,7 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
+def _descend(node: JsonValue, segment: str) -> Iterator[JsonValue]:
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]
@@ -461,7 +461,7 @@ def _step(node: JsonValue, segment: str) -> Iterator[JsonValue]:
                 yield node[index]
         else:
             for element in node:
-                yield from _step(element, segment)
+                yield from _descend(element, segment)
 
 
 def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
@@ -558,8 +558,8 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
             return None
         targets = at_field(value, condition.field)
         if not targets:
-            known = ", ".join(_paths(value)) or "none"
-            return f"the values have no field {condition.field!r}; their fields are: {known}"
+            paths = ", ".join(_paths(value)) or "none"
+            return f"the values have no field {condition.field!r}; their fields are: {paths}"
     elif isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
@@ -585,10 +585,10 @@ def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> s
     if not isinstance(test, Contains) or not test.is_number:
         return None
     if condition.field is not None and any(
-        True for each in targets for _ in leaves(each, in_objects=False)
+        True for target in targets for _ in leaves(target, in_objects=False)
     ):
         return None
-    kinds = {type(leaf) for each in targets for leaf in leaves(each)}
+    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
     if str in kinds or not kinds & {int, float}:
         return None
     return (
@@ -603,7 +603,7 @@ def _refusal_for_text(condition: Condition, targets: Sequence[JsonValue]) -> str
     is_narrow = condition.field is not None or isinstance(condition.test, Equals)
     if text is None or not is_narrow or any(map(_has_unknown_part, targets)):
         return None
-    kinds = {type(leaf) for each in targets for leaf in leaves(each)}
+    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
     if not kinds or not kinds <= {bool, int, float}:
         return None
     where = "the values" if condition.field is None else f"the values of field {condition.field!r}"
@@ -636,9 +636,9 @@ def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
 
 def _has_unknown_part(value: JsonValue) -> bool:
     if isinstance(value, dict):
-        return any(_has_unknown_part(each) for each in value.values())
+        return any(_has_unknown_part(inner) for inner in value.values())
     if isinstance(value, list):
-        return not value or any(_has_unknown_part(each) for each in value)
+        return not value or any(_has_unknown_part(inner) for inner in value)
     return value is None
 
 

@@ -115,11 +115,10 @@ def state_of(value: JsonValue, type_name: str) -> State:
         facts = chain(facts, _labels(value), _flags(value, ""))
     kept: list[Fact] = []
     counts: Counter[str] = Counter()
-    for fact in facts:
-        kind = fact[0].kind
-        counts[kind] += 1
-        if counts[kind] <= MOST.get(kind, math.inf):
-            kept.append(fact)
+    for word, number in facts:
+        counts[word.kind] += 1
+        if counts[word.kind] <= MOST.get(word.kind, math.inf):
+            kept.append((word, number))
     return State(tuple(kept), counts.total() - len(kept))
 
 
@@ -154,10 +153,12 @@ def is_still(numbers: Floats, error: float = 0.0) -> Flags:
 def _labels(value: JsonValue) -> Iterator[Fact]:
     """Yields the labels of detections, in order, with the best score of each."""
     best: dict[str, float] = {}
-    for each in detections_of(value):
-        score = math.nan if each.score is None else each.score
-        known = best.get(each.label, math.nan)
-        best[each.label] = score if math.isnan(known) or score > known else known
+    for detection in detections_of(value):
+        score = math.nan if detection.score is None else detection.score
+        best_so_far = best.get(detection.label, math.nan)
+        best[detection.label] = (
+            score if math.isnan(best_so_far) or score > best_so_far else best_so_far
+        )
     return ((Word(LABEL, label), score) for label, score in best.items())
 
 
@@ -186,8 +187,8 @@ def _log_entry(value: JsonValue) -> Iterator[Fact]:
 
 
 def _diagnostics(value: JsonValue) -> Iterator[Fact]:
-    for each in _listed(value, "status"):
-        name, level, message = each.get("name"), each.get("level"), each.get("message")
+    for status in _entries(value, "status"):
+        name, level, message = status.get("name"), status.get("level"), status.get("message")
         if not isinstance(level, int):
             continue
         if isinstance(name, str):
@@ -205,8 +206,8 @@ def _error(*parts: JsonValue) -> Word:
 
 
 def _goals(value: JsonValue) -> Iterator[Fact]:
-    for each in _listed(value, "status_list"):
-        status, info = each.get("status"), each.get("goal_info")
+    for goal in _entries(value, "status_list"):
+        status, info = goal.get("status"), goal.get("goal_info")
         goal_id = info.get("goal_id") if isinstance(info, dict) else None
         uuid = goal_id.get("uuid") if isinstance(goal_id, dict) else None
         if isinstance(status, int) and isinstance(uuid, list):
@@ -214,11 +215,11 @@ def _goals(value: JsonValue) -> Iterator[Fact]:
             yield Word(GOAL, "".join(f"{part:02x}" for part in parts)), status
 
 
-def _listed(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
+def _entries(value: JsonValue, key: str) -> Iterator[dict[str, JsonValue]]:
     listed = value.get(key) if isinstance(value, dict) else None
-    for each in listed if isinstance(listed, list) else ():
-        if isinstance(each, dict):
-            yield each
+    for entry in listed if isinstance(listed, list) else ():
+        if isinstance(entry, dict):
+            yield entry
 
 
 def _charge(value: JsonValue) -> Iterator[Fact]:
@@ -268,29 +269,29 @@ class Facts(NamedTuple):
     words: Sequence[Word]
 
     @classmethod
-    def of(cls, found: Sequence[tuple[int, Fact]]) -> Facts:
+    def of(cls, facts: Sequence[tuple[int, Fact]]) -> Facts:
         """Returns facts, each given with its row."""
-        known: dict[Word, int] = {}
+        code_of: dict[Word, int] = {}
         return cls(
-            np.array([row for row, _ in found], np.int64),
-            np.array([known.setdefault(word, len(known)) for _, (word, _) in found], np.int64),
-            np.array([value for _, (_, value) in found], np.float64),
-            tuple(known),
+            np.array([row for row, _ in facts], np.int64),
+            np.array([code_of.setdefault(word, len(code_of)) for _, (word, _) in facts], np.int64),
+            np.array([value for _, (_, value) in facts], np.float64),
+            tuple(code_of),
         )
 
     def of_kinds(self, kinds: Collection[str]) -> Facts:
         """Returns those of some kinds."""
         wanted = np.array([word.kind in kinds for word in self.words], np.bool_)
-        return self if wanted.all() else self._chosen(wanted[self.codes])
+        return self if wanted.all() else self._where(wanted[self.codes])
 
     def at(self, rows: Ints) -> Facts:
         """Returns those of some messages, which ascend and become the messages 0, 1, 2, ..."""
         place = np.searchsorted(rows, self.rows)
         kept = place < rows.size
         kept[kept] = rows[place[kept]] == self.rows[kept]
-        return self._replace(rows=place)._chosen(kept)
+        return self._replace(rows=place)._where(kept)
 
-    def _chosen(self, kept: Flags) -> Facts:
+    def _where(self, kept: Flags) -> Facts:
         return Facts(self.rows[kept], self.codes[kept], self.values[kept], self.words)
 
 
@@ -302,15 +303,15 @@ def joined_facts(parts: Sequence[Facts]) -> Facts:
     parts = [part for part in parts if part.rows.size]
     if len(parts) <= 1:
         return parts[0] if parts else NOTHING
-    known: dict[Word, int] = {}
+    code_of: dict[Word, int] = {}
     codes = []
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
+        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
         codes.append(np.array(new, np.int64)[part.codes])
     rows = np.concatenate([part.rows for part in parts])
     order = np.argsort(rows, kind="stable")
     values = np.concatenate([part.values for part in parts])
-    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(known))
+    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(code_of))
 
 
 class Stated(NamedTuple):
@@ -335,14 +336,14 @@ class Stated(NamedTuple):
 
 def stated_by(times: Sequence[Ns], states: Sequence[State | None]) -> Stated:
     """Returns what messages state, one by one; None is one that cannot be decoded."""
-    known = [state for state in states if state is not None]
+    decodable = [state for state in states if state is not None]
     decoded = np.array([state is not None for state in states], np.bool_)
     all_times = np.array(times, np.int64)
     return Stated(
         all_times[decoded],
-        Facts.of([(row, fact) for row, state in enumerate(known) for fact in state.facts]),
+        Facts.of([(row, fact) for row, state in enumerate(decodable) for fact in state.facts]),
         all_times[~decoded],
-        max((state.beyond for state in known), default=0),
+        max((state.beyond for state in decodable), default=0),
     )
 
 

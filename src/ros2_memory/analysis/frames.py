@@ -70,7 +70,7 @@ Localisers date transforms up to a second ahead, and a robot's last second is no
 _MAX_NAMES: Final = 12
 
 
-class Poses(NamedTuple):
+class FramePoses(NamedTuple):
     """Poses of a frame in another at some times; numbers are only meaningful where `valid`."""
 
     translation: Vectors
@@ -110,10 +110,10 @@ class Edge:
     def of(cls, transforms: Sequence[StampedTransform]) -> Edge:
         """Returns transforms, of which there is at least one, as arrays."""
         return cls(
-            np.array([each.stamp for each in transforms], np.int64),
-            np.array([each.log_time for each in transforms], np.int64),
-            np.array([each.transform.translation for each in transforms], np.float64),
-            np.array([each.transform.rotation for each in transforms], np.float64),
+            np.array([transform.stamp for transform in transforms], np.int64),
+            np.array([transform.log_time for transform in transforms], np.int64),
+            np.array([transform.transform.translation for transform in transforms], np.float64),
+            np.array([transform.transform.rotation for transform in transforms], np.float64),
         )
 
 
@@ -123,10 +123,10 @@ Edges: TypeAlias = "Mapping[tuple[str, str], Edge]"
 
 def edges_of(transforms: Iterable[StampedTransform]) -> dict[tuple[str, str], Edge]:
     """Returns transforms by their edges."""
-    found: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
-    for one in transforms:
-        found[one.parent.lstrip("/"), one.child.lstrip("/")].append(one)
-    return {pair: Edge.of(some) for pair, some in found.items() if is_edge(pair)}
+    by_pair: dict[tuple[str, str], list[StampedTransform]] = defaultdict(list)
+    for transform in transforms:
+        by_pair[transform.parent.lstrip("/"), transform.child.lstrip("/")].append(transform)
+    return {pair: Edge.of(transforms) for pair, transforms in by_pair.items() if is_edge(pair)}
 
 
 def is_edge(pair: tuple[str, str]) -> bool:
@@ -137,11 +137,11 @@ def is_edge(pair: tuple[str, str]) -> bool:
 
 def joined_edges(parts: Sequence[Edges]) -> Edges:
     """Returns the transforms of several tables, each edge in the order of the tables."""
-    found: dict[tuple[str, str], list[Edge]] = defaultdict(list)
+    by_pair: dict[tuple[str, str], list[Edge]] = defaultdict(list)
     for part in parts:
         for pair, edge in part.items():
-            found[pair].append(edge)
-    return {pair: stacked(some) for pair, some in found.items()}
+            by_pair[pair].append(edge)
+    return {pair: stacked(edges) for pair, edges in by_pair.items()}
 
 
 class _History:
@@ -162,38 +162,38 @@ class _History:
         clock: TfClock,
     ) -> None:
         self._child = child
-        names = [*moving, *(each.parent.lstrip("/") for each in static)]
+        names = [*moving, *(transform.parent.lstrip("/") for transform in static)]
         counts = [*(len(edge.stamps) for edge in moving.values()), *(1 for _ in static)]
         self.parents = list(dict.fromkeys(names))
-        every = stacked([*moving.values(), *([Edge.of(static)] if static else [])])
-        count = len(every.stamps) - len(static)
-        times = (every.stamps if clock == "stamp" else every.log_times)[:count]
-        order = np.lexsort((every.log_times[:count], times))
+        joined = stacked([*moving.values(), *([Edge.of(static)] if static else [])])
+        count = len(joined.stamps) - len(static)
+        times = (joined.stamps if clock == "stamp" else joined.log_times)[:count]
+        order = np.lexsort((joined.log_times[:count], times))
         # Of several for one time the last received counts.
         is_last = np.ones(count, np.bool_)
         is_last[:-1] = times[order[1:]] != times[order[:-1]]
         order = order[is_last]
         self._times = times[order]
-        self._since = every.log_times[count:] - AT_OR_BEFORE_SLACK_NS
-        rows = np.concatenate((order, np.arange(count, len(every.stamps))))
-        self._translation = every.translation[rows]
-        self._rotation = every.rotation[rows]
+        self._since = joined.log_times[count:] - AT_OR_BEFORE_SLACK_NS
+        rows = np.concatenate((order, np.arange(count, len(joined.stamps))))
+        self._translation = joined.translation[rows]
+        self._rotation = joined.rotation[rows]
         self._parent = np.repeat([self.parents.index(name) for name in names], counts)[rows]
 
-    def at(self, times: Times, hold_ns: Ns) -> Poses:
+    def at(self, times: Times, hold_ns: Ns) -> FramePoses:
         """Returns the transforms at some times; beyond those that are known, for so long."""
-        one, other, ratio, valid = self._rows(times, hold_ns)
-        x, y, z = self._translation[one].T
-        to_x, to_y, to_z = self._translation[other].T
+        before, after, ratio, valid = self._bracket(times, hold_ns)
+        x, y, z = self._translation[before].T
+        to_x, to_y, to_z = self._translation[after].T
         moved = x + (to_x - x) * ratio, y + (to_y - y) * ratio, z + (to_z - z) * ratio
-        qx, qy, qz, qw = self._rotation[one].T
-        to_qx, to_qy, to_qz, to_qw = self._rotation[other].T
+        qx, qy, qz, qw = self._rotation[before].T
+        to_qx, to_qy, to_qz, to_qw = self._rotation[after].T
         turned = slerp((qx, qy, qz, qw), (to_qx, to_qy, to_qz, to_qw), ratio)
-        return Poses(moved, turned, valid)
+        return FramePoses(moved, turned, valid)
 
     def parents_at(self, times: Times, hold_ns: Ns) -> Times:
         """Returns which of the parents the child is in at some times, by their numbers."""
-        return self._parent[self._rows(times, hold_ns).one]
+        return self._parent[self._bracket(times, hold_ns).before]
 
     def newest_parent(self) -> str:
         """Returns the parent where no time is given."""
@@ -223,36 +223,39 @@ class _History:
             " extrapolated; ask for a time in that range",
         )
 
-    def _rows(self, times: Times, hold_ns: Ns) -> _Rows:
+    def _bracket(self, times: Times, hold_ns: Ns) -> _Bracket:
         count = len(self._times)
         # The first static transform holds before it was received, too.
         static = count - 1 + np.maximum(self._since.searchsorted(times, "right"), 1)
         if not count:
-            return _Rows(static, static, 0.0 * static, static >= 0)
+            return _Bracket(static, static, 0.0 * static, static >= 0)
         after = self._times.searchsorted(times, "right")
         before, after = np.maximum(after - 1, 0), np.minimum(after, count - 1)
         start, stop = self._times[before], self._times[after]
         since, until = abs(times - start), abs(stop - times)
         is_between = (after > before) & (stop - start <= TF_CACHE_NS)
         valid = is_between | (np.minimum(since, until) <= hold_ns)
-        one = np.where(is_between | (since <= until), before, after)
+        nearest = np.where(is_between | (since <= until), before, after)
         is_mixed = is_between & (since > 0) & (self._parent[before] == self._parent[after])
         ratio = is_mixed * since / np.maximum(stop - start, 1)
         if len(self._since):
-            one, valid = np.where(valid, one, static), static >= 0
-        return _Rows(one, np.where(is_mixed, after, one), ratio, valid)
+            nearest, valid = np.where(valid, nearest, static), static >= 0
+        return _Bracket(nearest, np.where(is_mixed, after, nearest), ratio, valid)
 
 
-class _Rows(NamedTuple):
-    """Which rows of a history are valid at some times: two, the other one with this weight."""
+class _Bracket(NamedTuple):
+    """The rows of a history between which each of some times lies; `ratio` 0 is at the former.
 
-    one: Times
-    other: Times
+    Where nothing is interpolated, both are the row that counts. `valid`: whether one does.
+    """
+
+    before: Times
+    after: Times
     ratio: Floats
     valid: Mask
 
 
-class Frames:
+class FrameTree:
     """Looks frames up in a target frame by the transforms of one session.
 
     Args:
@@ -283,18 +286,18 @@ class Frames:
         self._pairs = dict.fromkeys(filter(is_edge, moving))
         for parent, child in self._pairs:
             self._moving[child][parent] = moving[parent, child]
-        for each in static:
-            pair = each.parent.lstrip("/"), each.child.lstrip("/")
-            if is_edge(pair):
-                self._static[pair[1]].append(each)
-                self._pairs[pair] = None
+        for transform in static:
+            parent, child = transform.parent.lstrip("/"), transform.child.lstrip("/")
+            if is_edge((parent, child)):
+                self._static[child].append(transform)
+                self._pairs[parent, child] = None
         self._histories: dict[str, _History] = {}
 
     def reaches(self, frame: str) -> bool:
         """Returns whether transforms connect a frame with the target, at whatever time."""
         return frame.lstrip("/") in connected_with(self.target, self._pairs)
 
-    def poses(self, frame: str, times: Times) -> Poses | None:
+    def poses(self, frame: str, times: Times) -> FramePoses | None:
         """Returns the poses of a frame in the target at some times.
 
         Composed along the tree through their common ancestor, in either direction. None where no
@@ -302,7 +305,7 @@ class Frames:
         """
         name = frame.lstrip("/")
         is_known = name == self.target or self.reaches(name)
-        return self._poses(name, times) if is_known else None
+        return self._compose(name, times) if is_known else None
 
     def lookup(self, frame: str, time: Ns) -> Transform:
         """Returns the pose of a frame in the target at one time (tf2: source and target).
@@ -311,39 +314,41 @@ class Frames:
             NoDataError: `FRAME_UNKNOWN`, `FRAMES_NOT_CONNECTED`, `OUTSIDE_RANGE` or `GAP`.
         """
         name = frame.lstrip("/")
-        known = {name for pair in self._pairs for name in pair}
-        for one in (self.target, name):
-            if one not in known:
-                raise _unknown(one, sorted(known))
+        frames = {name for pair in self._pairs for name in pair}
+        for named in (self.target, name):
+            if named not in frames:
+                raise _unknown_frame(named, sorted(frames))
         # Of damaged bags, times may be centuries apart: they wrap, and are not near.
         with np.errstate(over="ignore"):
-            found = self._poses(name, np.array(time, np.int64))
-            if not found.valid:
-                raise self._nothing_at(name, time)
-        return found.at()
+            pose = self._compose(name, np.array(time, np.int64))
+            if not pose.valid:
+                raise self._no_path_at(name, time)
+        return pose.at()
 
-    def _poses(self, name: str, times: Times) -> Poses:
-        found = _identity(times, valid=False)
+    def _compose(self, name: str, times: Times) -> FramePoses:
+        """Returns the poses by the chains of frames up to the common ancestor at each time."""
+        poses = _identity(times, valid=False)
         waiting = [np.arange(times.size).reshape(times.shape)]
-        for rows in waiting:
+        while waiting:
+            rows = waiting.pop()
             then = times.ravel()[rows]
             up, down = self._chain(name, then), self._chain(self.target, then)
             common = next((frame for frame in up if frame in down), None)
             if common is None:
-                waiting += self._apart(rows, then, (*up, *down))
+                waiting += self._split_by_parent(rows, then, (*up, *down))
                 continue
-            part = self._below(common, up, then)
+            part = self._pose_in_ancestor(common, up, then)
             if common != self.target:
-                part = _composed(_inverted(self._below(common, down, then)), part)
+                part = _product(_inverted(self._pose_in_ancestor(common, down, then)), part)
             if rows.shape == times.shape:
                 return part
-            for whole, some in zip(
-                (*found.translation, *found.rotation, found.valid),
+            for whole, part_column in zip(
+                (*poses.translation, *poses.rotation, poses.valid),
                 (*part.translation, *part.rotation, part.valid),
                 strict=True,
             ):
-                whole[rows] = some
-        return found
+                whole[rows] = part_column
+        return poses
 
     def _chain(self, frame: str, times: Times) -> dict[str, None]:
         """Returns the frames from one upwards, as far as they are the same at some times."""
@@ -353,7 +358,7 @@ class Frames:
             chain[frame] = None
         return chain
 
-    def _apart(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
+    def _split_by_parent(self, rows: Times, times: Times, frames: Iterable[str]) -> list[Times]:
         """Returns rows of times apart in which the first frame that has several parents has one."""
         for frame in frames:
             if len(self._parents_at(frame, times)) > 1:
@@ -361,11 +366,11 @@ class Frames:
                 return [rows[numbers == number] for number in np.unique(numbers)]
         return []
 
-    def _below(self, ancestor: str, chain: Iterable[str], times: Times) -> Poses:
+    def _pose_in_ancestor(self, ancestor: str, chain: Iterable[str], times: Times) -> FramePoses:
         """Returns the pose of the first frame of a chain in one of the frames above it."""
         below = takewhile(lambda frame: frame != ancestor, chain)
         steps = [self._histories[frame].at(times, self._hold_ns) for frame in below]
-        return reduce(_composed, reversed(steps)) if steps else _identity(times)
+        return reduce(_product, reversed(steps)) if steps else _identity(times)
 
     def _parents_at(self, child: str, times: Times) -> Sequence[str]:
         """Returns the parents that a frame has at some times; none, if it is a root."""
@@ -383,12 +388,12 @@ class Frames:
             self._histories[child] = _History(child, moving, static, self.clock)
         return self._histories.get(child)
 
-    def _nothing_at(self, name: str, time: Ns) -> NoDataError:
+    def _no_path_at(self, name: str, time: Ns) -> NoDataError:
         """Returns why there is no transform at a time, though both frames are known."""
         tree = connected_with(self.target, self._pairs)
         if name in tree:
             for frame in (name, self.target):
-                lacking = self._lacking(frame, time)
+                lacking = self._missing_link(frame, time)
                 if lacking is not None:
                     return lacking
         roots = self._root_of(self.target), self._root_of(name)
@@ -408,11 +413,11 @@ class Frames:
             )
         return NoDataError(NoDataReason.FRAMES_NOT_CONNECTED, detail)
 
-    def _lacking(self, frame: str, time: Ns) -> NoDataError | None:
+    def _missing_link(self, frame: str, time: Ns) -> NoDataError | None:
         """Returns why a walk from a frame up to its root ends at a time; None if it does not."""
         at = np.array(time, np.int64)
-        for each in self._chain(frame, at):
-            history = self._history(each)
+        for above in self._chain(frame, at):
+            history = self._history(above)
             if history is not None and not history.at(at, self._hold_ns).valid:
                 return history.nothing_at(time)
         return None
@@ -445,13 +450,13 @@ def connected_with(frame: str, pairs: Iterable[tuple[str, str]]) -> set[str]:
     for parent, child in pairs:
         beside[parent].add(child)
         beside[child].add(parent)
-    found: set[str] = set()
+    frames: set[str] = set()
     waiting = [frame]
     while waiting:
-        fresh = beside[waiting.pop()] - found
-        found |= fresh
+        fresh = beside[waiting.pop()] - frames
+        frames |= fresh
         waiting += fresh
-    return found
+    return frames
 
 
 def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransform]:
@@ -461,16 +466,16 @@ def static_at(static: Iterable[StampedTransform], at: Ns) -> list[StampedTransfo
     later, the first of them holds.
     """
     newest: dict[str, StampedTransform] = {}
-    for each in static:
-        child = each.child.lstrip("/")
-        if child not in newest or each.log_time <= at + AT_OR_BEFORE_SLACK_NS:
-            newest[child] = each
+    for transform in static:
+        child = transform.child.lstrip("/")
+        if child not in newest or transform.log_time <= at + AT_OR_BEFORE_SLACK_NS:
+            newest[child] = transform
     return list(newest.values())
 
 
 def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[StampedTransform]:
     """Returns, of static transforms in log-time order, those that hold in a window."""
-    received = (each for each in static if window.contains(each.log_time))
+    received = (transform for transform in static if window.contains(transform.log_time))
     return [*static_at(static, window.start), *received]
 
 
@@ -482,42 +487,42 @@ def unit_quaternions(rotations: Floats) -> Floats:
         return rotations
     scaled = rotations[off] / row_maxima(np.abs(rotations[off]))[:, None]
     x, y, z, w = scaled.T
-    made = rotations.copy()
-    made[off] = scaled / np.sqrt(x * x + y * y + z * z + w * w)[:, None]
-    return made
+    units = rotations.copy()
+    units[off] = scaled / np.sqrt(x * x + y * y + z * z + w * w)[:, None]
+    return units
 
 
-def _identity(times: Times, *, valid: bool = True) -> Poses:
+def _identity(times: Times, *, valid: bool = True) -> FramePoses:
     x, y, z, qx, qy, qz = np.zeros((6, *times.shape))
-    return Poses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
+    return FramePoses((x, y, z), (qx, qy, qz, np.ones(times.shape)), np.full(times.shape, valid))
 
 
-def _composed(a: Poses, b: Poses) -> Poses:
-    return Poses(a.points(b.translation), multiply(a.rotation, b.rotation), a.valid & b.valid)
+def _product(a: FramePoses, b: FramePoses) -> FramePoses:
+    return FramePoses(a.points(b.translation), multiply(a.rotation, b.rotation), a.valid & b.valid)
 
 
-def _inverted(poses: Poses) -> Poses:
+def _inverted(poses: FramePoses) -> FramePoses:
     x, y, z, w = poses.rotation
     back = (-x, -y, -z, w)
     tx, ty, tz = rotate(back, poses.translation)
-    return Poses((-tx, -ty, -tz), back, poses.valid)
+    return FramePoses((-tx, -ty, -tz), back, poses.valid)
 
 
-def _unknown(name: str, known: Sequence[str]) -> NoDataError:
-    if not known:
+def _unknown_frame(name: str, frames: Sequence[str]) -> NoDataError:
+    if not frames:
         detail = f"frame '{name}' is unknown: no transforms are recorded there"
-    elif similar := _similar(name, known):
+    elif similar := _similar(name, frames):
         detail = f"no transform names a frame '{name}'; similar: {listed(similar)}"
     else:
-        names = listed(known, at_most=_MAX_NAMES)
+        names = listed(frames, at_most=_MAX_NAMES)
         detail = f"no transform names a frame '{name}'; there are: {names}"
     return NoDataError(NoDataReason.FRAME_UNKNOWN, detail)
 
 
-def _similar(name: str, known: Sequence[str]) -> list[str]:
+def _similar(name: str, frames: Sequence[str]) -> list[str]:
     """Returns names that contain this one or are part of it, then those spelled alike."""
     asked = name.casefold()
-    by_fold = {frame.casefold(): frame for frame in known}
+    by_fold = {frame.casefold(): frame for frame in frames}
     parts = [frame for fold, frame in by_fold.items() if asked and (asked in fold or fold in asked)]
     alike = difflib.get_close_matches(asked, list(by_fold), n=3, cutoff=0.6)
     return list(dict.fromkeys([*parts[:3], *(by_fold[fold] for fold in alike)]))[:3]

@@ -47,7 +47,7 @@ ROW: Final = np.dtype(
     ]
 )
 """A row of an `IntervalTable`."""
-Rows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
+IntervalRows: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.void]]"
 
 _NO_SCORE: Final = -(2**31)
 _SCORES: Final = 10_000
@@ -100,7 +100,7 @@ class IntervalTable(NamedTuple):
 
     def intervals(self) -> tuple[VisibleInterval, ...]:
         """Returns each of them."""
-        rows = _rows(self.rows).tolist()
+        rows = _unpacked(self.rows).tolist()
         return tuple(
             VisibleInterval(
                 self.labels[label], first, last, None if best == _NO_SCORE else best / _SCORES
@@ -110,35 +110,38 @@ class IntervalTable(NamedTuple):
 
     def spans(self) -> dict[str, tuple[Ints, Ints]]:
         """Returns by label the first and the last time of each of its intervals, in order."""
-        rows = _rows(self.rows)
-        of = [rows[rows["label"] == place] for place in range(len(self.labels))]
+        rows = _unpacked(self.rows)
+        rows_of_label = [rows[rows["label"] == place] for place in range(len(self.labels))]
         return {
-            label: (its["first"], its["last"]) for label, its in zip(self.labels, of, strict=True)
+            label: (its["first"], its["last"])
+            for label, its in zip(self.labels, rows_of_label, strict=True)
         }
 
     def most_lasting(self, at_most: int) -> IntervalTable:
         """Returns the longest intervals, in order of time; of equally long ones the earliest."""
         if self.size <= at_most:
             return self
-        rows = _rows(self.rows)
+        rows = _unpacked(self.rows)
         rows = rows[np.sort(_by_length(rows)[:at_most])]
         used, rows["label"] = np.unique(rows["label"], return_inverse=True)
         return IntervalTable(tuple(self.labels[place] for place in used.tolist()), rows.tobytes())
 
     def throughout(self, start: Ns, end: Ns) -> list[str]:
         """Returns the labels seen at their usual rate all the time from `start` to `end`."""
-        rows = _rows(self.rows)
+        rows = _unpacked(self.rows)
         pause = _longest_pause(rows)
         chosen = (rows["longest"] <= pause) & (rows["count"] > 1)
         chosen &= (rows["first"] <= start + pause) & (rows["last"] >= end - pause)
-        return self._named(rows[chosen])
+        return self._labels_in(rows[chosen])
 
     def at_end(self, last: Ns, known_to: Ns) -> list[str]:
         """Returns labels of the last message, at `last`, that may be visible until `known_to`."""
-        rows = _rows(self.rows)
-        return self._named(rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))])
+        rows = _unpacked(self.rows)
+        return self._labels_in(
+            rows[(rows["last"] == last) & (known_to - last <= _longest_pause(rows))]
+        )
 
-    def _named(self, rows: Rows) -> list[str]:
+    def _labels_in(self, rows: IntervalRows) -> list[str]:
         return [self.labels[place] for place in rows["label"].tolist()]
 
     def without(self, labels: Collection[str]) -> IntervalTable:
@@ -146,33 +149,33 @@ class IntervalTable(NamedTuple):
         places = [place for place, label in enumerate(self.labels) if label in labels]
         if not places:
             return self
-        return self._some(~np.isin(_rows(self.rows)["label"], places))
+        return self._select(~np.isin(_unpacked(self.rows)["label"], places))
 
     def scoring(self, least: float) -> IntervalTable:
         """Returns the intervals with a best score of so much at least, or without any."""
-        best = _rows(self.rows)["best"]
-        return self._some((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
+        best = _unpacked(self.rows)["best"]
+        return self._select((best == _NO_SCORE) | (best >= _stored_scores(np.array([least]))))
 
     def during(self, spans: Iterable[tuple[Ns, Ns]]) -> IntervalTable:
         """Returns the intervals some of which is in one of these times (inclusive)."""
-        rows = _rows(self.rows)
+        rows = _unpacked(self.rows)
         chosen = np.zeros(rows.size, np.bool_)
         for start, stop in spans:
             chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
-        return self._some(chosen)
+        return self._select(chosen)
 
     def under_one_label(self, label: str) -> IntervalTable:
         """Returns the intervals of all labels under one label; these may overlap."""
-        rows = _rows(self.rows).copy()
+        rows = _unpacked(self.rows).copy()
         rows["label"] = 0
         return IntervalTable((label,) if rows.size else (), rows.tobytes())
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
-        return self._some(_by_length(_rows(self.rows))[:at_most]).intervals()
+        return self._select(_by_length(_unpacked(self.rows))[:at_most]).intervals()
 
-    def _some(self, which: Flags | NDArray[np.intp]) -> IntervalTable:
-        return IntervalTable(self.labels, _rows(self.rows)[which].tobytes())
+    def _select(self, which: Flags | NDArray[np.intp]) -> IntervalTable:
+        return IntervalTable(self.labels, _unpacked(self.rows)[which].tobytes())
 
 
 class IntervalPart(NamedTuple):
@@ -217,7 +220,7 @@ def visible_in(
     silent = np.cumsum(np.diff(times, prepend=times[0]) > SILENCE_NS)
     goes_on = (np.diff(row + silent[row]) <= 1) | (np.diff(at) <= FLICKER_NS)
     goes_on &= np.diff(label) == 0
-    return IntervalTable(tuple(sorted(names)), _continued(seen, at, goes_on))
+    return IntervalTable(tuple(sorted(names)), _merge_runs(seen, at, goes_on))
 
 
 def _stored_scores(scores: NDArray[np.float64]) -> Ints:
@@ -231,69 +234,69 @@ def _stored_scores(scores: NDArray[np.float64]) -> Ints:
 def joined(parts: Sequence[IntervalPart]) -> IntervalPart:
     """Merges parts that follow each other: an object may stay visible from one to the next."""
     follow = [after.first - before.last <= SILENCE_NS for before, after in pairwise(parts)]
-    seen = _merged([part.visible for part in parts], np.array([False, *follow]))
+    seen = _merge_tables([part.visible for part in parts], np.array([False, *follow]))
     return IntervalPart(parts[0].first, parts[-1].last, seen)
 
 
 def united(tables: Sequence[IntervalTable]) -> IntervalTable:
     """Merges the tables of several topics of one time: visible on one of them is visible."""
-    return _merged(tables, np.zeros(len(tables), np.bool_))
+    return _merge_tables(tables, np.zeros(len(tables), np.bool_))
 
 
-def _merged(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTable:
+def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTable:
     """Merges tables: joins intervals of one label that overlap, or that go on in the next part."""
-    rows = _rows(b"".join([each.rows for each in tables]))
+    rows = _unpacked(b"".join([table.rows for table in tables]))
     if not rows.size:
         return IntervalTable()
-    part = np.repeat(np.arange(len(tables)), [each.size for each in tables])
+    part = np.repeat(np.arange(len(tables)), [table.size for table in tables])
     labels, label = _shared_labels(tables, part, rows["label"])
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
-    first, ends, reach = rows["first"], rows["ends"], _reach(label, rows["last"])
+    first, ends, reach = rows["first"], rows["ends"], _running_end(label, rows["last"])
     goes_on = (ends[:-1] & _TO_END > 0) & (ends[1:] & _FROM_START > 0)
     goes_on &= (part[1:] - part[:-1] == 1) & follow[part[1:]]
     goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
     goes_on &= label[1:] == label[:-1]
     rows["label"] = label
     rows["ends"] = ends & ((part == 0) * _FROM_START + (part == len(tables) - 1) * _TO_END)
-    return IntervalTable(labels, _continued(rows, reach, goes_on))
+    return IntervalTable(labels, _merge_runs(rows, reach, goes_on))
 
 
-def _continued(rows: Rows, reach: Ints, goes_on: Flags) -> bytes:
+def _merge_runs(rows: IntervalRows, reach: Ints, goes_on: Flags) -> bytes:
     """Returns rows, sorted by label, as those of an `IntervalTable`: some go on in the next one.
 
     `reach` is the latest end of each and of those of its label before it.
     """
     begins = np.flatnonzero(np.append(True, ~goes_on))
     stops = np.append(begins[1:], len(rows)) - 1
-    found = rows[begins]
-    found["last"] = reach[stops]
-    found["count"] = np.add.reduceat(rows["count"], begins)
+    intervals = rows[begins]
+    intervals["last"] = reach[stops]
+    intervals["count"] = np.add.reduceat(rows["count"], begins)
     # Times may be as far apart as any two can be: only those of one interval are subtracted.
     pauses = np.append(0, np.where(goes_on, np.maximum(rows["first"][1:] - reach[:-1], 0), 0))
-    found["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
-    found["best"] = np.maximum.reduceat(rows["best"], begins)
-    found["ends"] = rows["ends"][begins] & _FROM_START | rows["ends"][stops] & _TO_END
-    return found[np.lexsort((found["label"], found["first"]))].tobytes()
+    intervals["longest"] = np.maximum.reduceat(np.maximum(rows["longest"], pauses), begins)
+    intervals["best"] = np.maximum.reduceat(rows["best"], begins)
+    intervals["ends"] = rows["ends"][begins] & _FROM_START | rows["ends"][stops] & _TO_END
+    return intervals[np.lexsort((intervals["label"], intervals["first"]))].tobytes()
 
 
 def _shared_labels(
     tables: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
 ) -> tuple[tuple[str, ...], NDArray[np.intp]]:
     """Returns the labels of all tables, sorted, and for each row the index of its label in them."""
-    labels = tuple(sorted({label for each in tables for label in each.labels}))
+    labels = tuple(sorted({label for table in tables for label in table.labels}))
     place = {label: at for at, label in enumerate(labels)}
     places: list[int] = []
     begins: dict[tuple[str, ...], int] = {}
-    for each in tables:
-        if each.labels not in begins:
-            begins[each.labels] = len(places)
-            places += [place[label] for label in each.labels]
-    begin = np.array([begins[each.labels] for each in tables], np.intp)
+    for table in tables:
+        if table.labels not in begins:
+            begins[table.labels] = len(places)
+            places += [place[label] for label in table.labels]
+    begin = np.array([begins[table.labels] for table in tables], np.intp)
     return labels, np.array(places, np.intp)[begin[part] + label]
 
 
-def _reach(label: NDArray[np.intp], last: Ints) -> Ints:
+def _running_end(label: NDArray[np.intp], last: Ints) -> Ints:
     """Returns the latest end of each row and of those before it of its label; sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last
@@ -306,7 +309,7 @@ def _reach(label: NDArray[np.intp], last: Ints) -> Ints:
     return latest
 
 
-def _longest_pause(rows: Rows) -> Ints:
+def _longest_pause(rows: IntervalRows) -> Ints:
     """Returns, for each row, the longest pause between messages at the detector's usual rate."""
     spans = rows["last"] - rows["first"]
     # An object seen once has no known rate: it may have been missed for a moment, at most.
@@ -316,10 +319,10 @@ def _longest_pause(rows: Rows) -> Ints:
     return longest
 
 
-def _by_length(rows: Rows) -> NDArray[np.intp]:
+def _by_length(rows: IntervalRows) -> NDArray[np.intp]:
     """Returns the indices of the rows, the longest interval first; of equal ones the earliest."""
     return np.argsort(rows["first"] - rows["last"], kind="stable")
 
 
-def _rows(packed: bytes) -> Rows:
+def _unpacked(packed: bytes) -> IntervalRows:
     return np.frombuffer(packed, ROW)

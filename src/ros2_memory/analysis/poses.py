@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 
-class Frames(NamedTuple):
+class FrameCodes(NamedTuple):
     """The frames of poses: `words[code]` for each; there may be words that no pose has."""
 
     codes: np.ndarray[tuple[int], np.dtype[np.uint32]]
@@ -50,7 +50,7 @@ class Poses:
     times: IntArray
     positions: Vectors
     turns: Vectors
-    frames: Frames
+    frames: FrameCodes
     speeds: Floats
 
     def __len__(self) -> int:
@@ -63,7 +63,7 @@ class Poses:
             self.times[which],
             self.positions[which],
             self.turns[which],
-            Frames(self.frames.codes[which], self.frames.words),
+            FrameCodes(self.frames.codes[which], self.frames.words),
             self.speeds[which],
         )
 
@@ -79,7 +79,7 @@ NO_POSES: Final = Poses(
     np.empty(0, np.int64),
     np.empty((0, 3)),
     np.empty((0, 4)),
-    Frames(np.empty(0, np.uint32), ()),
+    FrameCodes(np.empty(0, np.uint32), ()),
     np.empty(0),
 )
 
@@ -101,13 +101,13 @@ def joined_poses(parts: Sequence[Poses]) -> Poses:
     return whole.rows(np.argsort(whole.times, kind="stable"))
 
 
-def _joined_frames(parts: Sequence[Frames]) -> Frames:
-    known: dict[str, int] = {}
+def _joined_frames(parts: Sequence[FrameCodes]) -> FrameCodes:
+    code_of: dict[str, int] = {}
     codes = []
     for part in parts:
-        new = [known.setdefault(word, len(known)) for word in part.words]
+        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
         codes.append(np.array(new, np.uint32)[part.codes])
-    return Frames(np.concatenate(codes), tuple(known))
+    return FrameCodes(np.concatenate(codes), tuple(code_of))
 
 
 def headings(turns: Vectors) -> Floats:

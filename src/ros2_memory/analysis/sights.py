@@ -144,7 +144,7 @@ TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
 
 
-class Seen(NamedTuple):
+class DetectorMessages(NamedTuple):
     """What the messages of a detector have, in order of log time, in one frame.
 
     Attributes:
@@ -185,9 +185,11 @@ class Sights:
 
     def only(self, *kinds: type[IntEnum]) -> Sights:
         """Returns these sights with the rows of some tables alone."""
-        every = zip(TABLES, self.tables, strict=True)
-        tables = (table if kind in kinds else table[:0].copy() for kind, table in every)
-        return replace(self, tables=tuple(tables))
+        tables = tuple(
+            table if kind in kinds else table[:0].copy()
+            for kind, table in zip(TABLES, self.tables, strict=True)
+        )
+        return replace(self, tables=tables)
 
     def with_scores_from(self, lowest: int) -> Sights:
         """Returns these sights without the scores in lower bins."""
@@ -246,20 +248,22 @@ class _Detections:
     is_placed: Flags
 
 
-def sights_of(topic: str, seen: Seen) -> Sights:
+def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     """Returns the sights of the messages of one topic."""
     slices = seen.times // SLICE_NS
     look, looks = _looks(seen, slices)
-    found, labels = _detections(seen, slices)
-    group, together = _groups(found)
-    near = np.flatnonzero(found.is_placed)
+    detections, labels = _detections(seen, slices)
+    group, together = _label_groups(detections)
+    near = np.flatnonzero(detections.is_placed)
     near = near[np.argsort(group[near], kind="stable")]
-    cluster = np.full(len(found.message), -1, np.int64)
-    cluster[near] = _clusters(group[near], found.message[near], found.x[near], found.y[near])
-    lost, kept = rows_of(found, cluster < 0), rows_of(found, cluster >= 0)
+    cluster = np.full(len(detections.message), -1, np.int64)
+    cluster[near] = _clusters(
+        group[near], detections.message[near], detections.x[near], detections.y[near]
+    )
+    lost, kept = rows_of(detections, cluster < 0), rows_of(detections, cluster >= 0)
     _, spot = distinct_rows((group[cluster >= 0], cluster[cluster >= 0]))
     scored = ~np.isnan(kept.score)
-    which, other = _beside(kept)
+    which, other = _labels_beside(kept)
     tables = (
         _spots(kept, spot, seen.times, together[group[cluster >= 0]]),
         looks,
@@ -286,24 +290,24 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
     return np.stack(columns, axis=1)
 
 
-def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
+def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
-    known = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
-    x, y, yaw = seen.robot[known].T
+    placed = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
+    x, y, yaw = seen.robot[placed].T
     columns = (_mm(x), _mm(y), _decideg(yaw) % 3600)
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
-    _, number = distinct_rows((slices[known], *cells))
+    _, number = distinct_rows((slices[placed], *cells))
     look = np.full(len(seen.times), -1, np.int64)
-    look[known] = number
+    look[placed] = number
     by = Groups.of(number)
     means = [by.sums(column) // by.sizes for column in columns]
-    first, last = by.ends(_rounded(seen.times[known]))
-    slices = slices[known][by.firsts]
+    first, last = by.ends(_rounded(seen.times[placed]))
+    slices = slices[placed][by.firsts]
     topic = np.zeros(len(slices), np.int64)
     return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
 
 
-def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
+def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
     # Those that none has are of other messages, which may be forgotten.
     used = np.unique(seen.labels).tolist()
@@ -315,22 +319,22 @@ def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
-    found = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
+    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
     if len(names) > _MAX_LABELS:
-        rows, nth = distinct_rows((found.slice, label))
+        rows, nth = distinct_rows((detections.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
         before = np.repeat(begins, np.diff(begins, append=len(rows)))
-        found = rows_of(found, (np.arange(len(rows)) - before < _MAX_LABELS)[nth])
-    return found, tuple(names)
+        detections = rows_of(detections, (np.arange(len(rows)) - before < _MAX_LABELS)[nth])
+    return detections, tuple(names)
 
 
-def _groups(found: _Detections) -> tuple[Ints, Ints]:
+def _label_groups(detections: _Detections) -> tuple[Ints, Ints]:
     """Returns the slice and label of each detection, numbered, and how many are seen at once.
 
     That is how many of the label at least three messages of the slice have, or all.
     """
-    _, group = distinct_rows((found.slice, found.label))
-    rows, nth = distinct_rows((group, found.message))
+    _, group = distinct_rows((detections.slice, detections.label))
+    rows, nth = distinct_rows((group, detections.message))
     counts = np.bincount(nth, minlength=len(rows))
     order = np.lexsort((-counts, rows[:, 0]))
     begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
@@ -355,16 +359,16 @@ def _clusters(group: Ints, message: Ints, x: Ints, y: Ints) -> Ints:
         away += (off - (before - before[start]) / np.maximum(nth, 1)) ** 2
     is_hard = (nth > 0) & (away > _GATE_SQUARED)
     is_hard[1:] |= (group[1:] == group[:-1]) & (message[1:] == message[:-1])
-    found = np.zeros(len(group), np.int64)
+    spots = np.zeros(len(group), np.int64)
     for which in np.unique(group[is_hard]).tolist():
         begin, end = np.searchsorted(group, (which, which + 1)).tolist()
-        some = slice(begin, end)
-        places = [*zip(x[some].tolist(), y[some].tolist(), strict=True)]
-        found[some] = _grown(message[some].tolist(), places)
-    return found
+        of_group = slice(begin, end)
+        places = [*zip(x[of_group].tolist(), y[of_group].tolist(), strict=True)]
+        spots[of_group] = _cluster_label(message[of_group].tolist(), places)
+    return spots
 
 
-class _Growing:
+class _GrowingSpot:
     """A spot while it grows; `x` and `y` are its mean (mm)."""
 
     __slots__ = ("n", "sum_x", "sum_y", "x", "y")
@@ -384,21 +388,21 @@ class _Growing:
         return dx * dx + dy * dy
 
 
-def _grown(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
+def _cluster_label(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[int]:
     """Returns the spot of each detection of one label, which are ordered by message."""
-    spots: list[_Growing] = []
+    spots: list[_GrowingSpot] = []
     together: dict[tuple[int, int], int] = {}
-    found: list[int] = []
-    for _, some in groupby(range(len(messages)), key=messages.__getitem__):
-        chosen = _assigned(spots, [places[nth] for nth in some])
-        found += chosen
+    assigned: list[int] = []
+    for _, in_message in groupby(range(len(messages)), key=messages.__getitem__):
+        chosen = _assign(spots, [places[nth] for nth in in_message])
+        assigned += chosen
         for pair in combinations(sorted(spot for spot in chosen if spot >= 0), 2):
             together[pair] = together.get(pair, 0) + 1
-    into = _merged(spots, together)
-    return [spot if spot < 0 else into[spot] for spot in found]
+    into = _merge_spots(spots, together)
+    return [spot if spot < 0 else into[spot] for spot in assigned]
 
 
-def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[int]:
+def _assign(spots: list[_GrowingSpot], places: Sequence[tuple[int, int]]) -> list[int]:
     """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
     pairs = sorted(
         (squared, nth, which)
@@ -415,41 +419,43 @@ def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[
         which = taken.get(nth, -1)
         if which < 0 and len(spots) < _MAX_SPOTS:
             which = len(spots)
-            spots.append(_Growing())
+            spots.append(_GrowingSpot())
         if which >= 0:
             spots[which].add(1, *place)
         chosen.append(which)
     return chosen
 
 
-def _merged(spots: Sequence[_Growing], together: Mapping[tuple[int, int], int]) -> list[int]:
+def _merge_spots(
+    spots: Sequence[_GrowingSpot], together: Mapping[tuple[int, int], int]
+) -> list[int]:
     """Returns into which spot each goes: those that lie together, and no messages have both of."""
     into = [*range(len(spots))]
-    for one, other in combinations(range(len(spots)), 2):
-        if into[one] != one or into[other] != other:
+    for first, other in combinations(range(len(spots)), 2):
+        if into[first] != first or into[other] != other:
             continue
-        a, b = spots[one], spots[other]
-        both = together.get((one, other), 0)
+        a, b = spots[first], spots[other]
+        both = together.get((first, other), 0)
         if both <= _TOGETHER_SHARE * min(a.n, b.n) and a.squared_to(b.x, b.y) < _SAME_SQUARED:
             a.add(b.n, b.sum_x, b.sum_y)
-            into[other] = one
+            into[other] = first
     return into
 
 
-def _spots(found: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
+def _spots(detections: _Detections, spot: Ints, times: Ints, together: Ints) -> Ints:
     by = Groups.of(spot)
-    n, of = by.sizes, by.firsts
-    x, y, z = (by.sums(column) // n for column in (found.x, found.y, found.z))
+    n, firsts = by.sizes, by.firsts
+    x, y, z = (by.sums(column) // n for column in (detections.x, detections.y, detections.z))
     # From the first of each: squares of far places are more than 63 bits.
-    dx, dy = (column - column[of][spot] for column in (found.x, found.y))
+    dx, dy = (column - column[firsts][spot] for column in (detections.x, detections.y))
     spread = n * by.sums(dx * dx + dy * dy) - by.sums(dx) ** 2 - by.sums(dy) ** 2
     dev = np.sqrt(np.maximum(spread, 0)).astype(np.int64) // n
-    first, last = by.ends(_rounded(times[found.message]))
-    score = np.where(np.isnan(found.score), -1, _thousandths(found.score))
+    first, last = by.ends(_rounded(times[detections.message]))
+    score = np.where(np.isnan(detections.score), -1, _thousandths(detections.score))
     best = by.ends(score)[1]
     topic = np.zeros(len(n), np.int64)
-    columns = (n, x, y, z, dev, first, last, best, together[of])
-    return np.stack((found.slice[of], topic, found.label[of], *columns), axis=1)
+    columns = (n, x, y, z, dev, first, last, best, together[firsts])
+    return np.stack((detections.slice[firsts], topic, detections.label[firsts], *columns), axis=1)
 
 
 def _unplaced(lost: _Detections, times: Ints) -> Ints:
@@ -460,30 +466,30 @@ def _unplaced(lost: _Detections, times: Ints) -> Ints:
     return np.stack((rows[:, 0], topic, rows[:, 1], by.sizes, first, last), axis=1)
 
 
-def _beside(found: _Detections) -> tuple[Ints, Ints]:
+def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
     """Returns detections and another label that is beside each, each pair once."""
-    counts = np.bincount(found.message)
-    few = np.flatnonzero(counts[found.message] <= _MAX_COMPARED)
+    counts = np.bincount(detections.message)
+    few = np.flatnonzero(counts[detections.message] <= _MAX_COMPARED)
     ones, others = [few[:0]], [few[:0]]
     for step in range(1, int(counts.max(initial=0))):
         a, b = few[:-step], few[step:]
-        near = found.message[a] == found.message[b]
+        near = detections.message[a] == detections.message[b]
         if not near.any():
             break
-        near &= found.label[a] != found.label[b]
-        for column in (found.x, found.y):
+        near &= detections.label[a] != detections.label[b]
+        for column in (detections.x, detections.y):
             near &= np.abs(column[a] - column[b]) < _BESIDE_MM
         ones += [a[near], b[near]]
         others += [b[near], a[near]]
-    rows, _ = distinct_rows((np.concatenate(ones), found.label[np.concatenate(others)]))
+    rows, _ = distinct_rows((np.concatenate(ones), detections.label[np.concatenate(others)]))
     return rows[:, 0], rows[:, 1]
 
 
-def _tallied(one: Ints, other: Ints) -> Ints:
+def _tallied(first: Ints, other: Ints) -> Ints:
     """Returns the distinct pairs, and how often there is each."""
-    rows, nth = distinct_rows((one, other))
-    found: Ints = np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
-    return found
+    rows, nth = distinct_rows((first, other))
+    tally: Ints = np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
+    return tally
 
 
 def _mm(metres: Floats) -> Ints:
@@ -491,8 +497,8 @@ def _mm(metres: Floats) -> Ints:
 
 
 def _decideg(radians: Floats) -> Ints:
-    found: Ints = np.rint(np.degrees(radians) * 10).astype(np.int64)
-    return found
+    tenths: Ints = np.rint(np.degrees(radians) * 10).astype(np.int64)
+    return tenths
 
 
 def _thousandths(scores: Floats) -> Ints:

@@ -147,19 +147,19 @@ def silences(
         if (period := usual_period(presence)) is not None
     }
     companions: dict[str, set[str]] = {}
-    for names in {frozenset(periods.keys() & each) for each in together}:
+    for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
             companions.setdefault(topic, set()).update(names)
     on: dict[frozenset[str], list[Span]] = {}
-    found: list[Silence] = []
+    reported: list[Silence] = []
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in on:
-            on[others] = _heard([presences[each].runs for each in sorted(others)])
+            on[others] = _heard([presences[other].runs for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(presences[topic].runs, limit)
-        found += _reported([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
-    return sorted(found, key=lambda each: (each.start, each.end, each.topic))
+        reported += _without_habit([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
+    return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
 def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
@@ -183,28 +183,45 @@ def _silences_of(
     topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
 ) -> Iterator[Silence]:
     """Yields where a topic is absent for longer than a limit while the robot is on."""
-    end = max(runs[-1][1], on[-1][1] if on else runs[-1][1])
+    _, last_heard = runs[-1]
+    end = max(last_heard, on[-1][1] if on else last_heard)
     nexts = [first for first, _ in runs[1:]]
-    at = 0
+    past = 0
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
-        while at < len(on) and on[at][1] <= start:
-            at += 1
-        pieces: list[Span] = []
-        length = 0
-        until, parted = start, False
-        for span in on[at:]:
-            parted = span[0] - until > LONGEST_OFF_NS
-            if span[0] >= stop or parted:
-                break
-            until = span[1]
-            first, last = max(span[0], start), min(span[1], stop)
-            recorded = last - first - length_in(gaps, first, last)
-            if recorded > limit:
-                pieces.append((first, last))
-                length += recorded
-        if pieces:
-            goes_on = start == runs[-1][1] and not parted
-            yield Silence(topic, pieces[0][0], pieces[-1][1], length, goes_on)
+        while past < len(on) and on[past][1] <= start:
+            past += 1
+        absence = _absence(start, stop, on[past:], limit, gaps)
+        if absence.pieces:
+            goes_on = start == last_heard and not absence.is_parted
+            (first, _), (_, last) = absence.pieces[0], absence.pieces[-1]
+            yield Silence(topic, first, last, absence.length, goes_on)
+
+
+class _Absence(NamedTuple):
+    """The times between two messages of a topic in which it is missed, and how long they are.
+
+    `is_parted`: the robot was off for more than `LONGEST_OFF_NS` meanwhile; what follows is none.
+    """
+
+    pieces: Sequence[Span]
+    length: Ns
+    is_parted: bool
+
+
+def _absence(start: Ns, stop: Ns, on: Sequence[Span], limit: Ns, gaps: Sequence[Span]) -> _Absence:
+    pieces: list[Span] = []
+    length, until, is_parted = 0, start, False
+    for on_from, on_to in on:
+        is_parted = on_from - until > LONGEST_OFF_NS
+        if on_from >= stop or is_parted:
+            break
+        until = on_to
+        first, last = max(on_from, start), min(on_to, stop)
+        recorded = last - first - length_in(gaps, first, last)
+        if recorded > limit:
+            pieces.append((first, last))
+            length += recorded
+    return _Absence(pieces, length, is_parted)
 
 
 def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
@@ -214,15 +231,15 @@ def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:
     return sum(min(last, until) - max(first, start) for start, until in gaps[begin:end])
 
 
-def _reported(found: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
+def _without_habit(silences: Sequence[Silence], runs: Sequence[Span]) -> Sequence[Silence]:
     """Returns those silences of a topic that are not its habit."""
-    if len(found) <= SELDOM:
-        return found
-    lengths = sorted(each.length for each in found)
+    if len(silences) <= SELDOM:
+        return silences
+    lengths = sorted(silence.length for silence in silences)
     heard = sum(last - first for first, last in runs)
     if heard < sum(lengths):
         return ()
-    if heard >= HABIT_NS * len(found):
-        return found
+    if heard >= HABIT_NS * len(silences):
+        return silences
     usual = lengths[(len(lengths) - 1) // 2]
-    return [each for each in found if each.length >= UNUSUAL * usual]
+    return [silence for silence in silences if silence.length >= UNUSUAL * usual]

@@ -106,8 +106,8 @@ class TopicEvents:
     def of_kind(self, kind: str) -> tuple[Sequence[KnownState], Sequence[Change]]:
         """Returns the states of a kind, and their changes."""
         return (
-            [each for each in self.known if each.kind == kind],
-            [each for each in self.changes if each.kind == kind],
+            [state for state in self.known if state.kind == kind],
+            [change for change in self.changes if change.kind == kind],
         )
 
     def without_sights(self) -> TopicEvents:
@@ -117,7 +117,7 @@ class TopicEvents:
     def limited(self, at_most: int, intervals: int) -> TopicEvents:
         """Returns these with so many intervals, and so many of each other kind, at most."""
         lists = (self.changes, self.errors, self.reports)
-        left_out = sum(max(0, len(each) - at_most) for each in lists)
+        left_out = sum(max(0, len(events) - at_most) for events in lists)
         return replace(
             self,
             visible=self.visible.most_lasting(intervals),
@@ -135,15 +135,15 @@ def events_of(stated: Stated) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = stated.facts.of_kinds({LABEL})
     labels = [word.name for word in seen.words]
-    known, changes = _states(stated)
+    states, changes = _states_and_changes(stated)
     return TopicEvents(
         int(times[0]),
         int(times[-1]),
         visible_in(times, seen.rows, seen.codes, seen.values, labels),
-        known,
+        states,
         changes,
-        _errors(_said(stated, ERROR)),
-        _reports(_said(stated, REPORT)),
+        _merge_errors(_reports_of(stated, ERROR)),
+        _merge_log_entries(_reports_of(stated, REPORT)),
         0,
         undecodable,
         stated.beyond,
@@ -161,15 +161,15 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
         return TopicEvents(1, 0, undecodable=undecodable) if undecodable else None
     seen = [IntervalPart(part.first, part.last, part.visible) for part in parts]
     visible = (seen[0] if len(seen) == 1 else joined(seen)).visible
-    known, changes, more = _joined_states(parts)
+    states, changes, more = _joined_states(parts)
     whole = TopicEvents(
         parts[0].first,
         parts[-1].last,
         visible,
-        known,
+        states,
         changes,
-        _errors(error for part in parts for error in part.errors),
-        _reports(report for part in parts for report in part.reports),
+        _merge_errors(error for part in parts for error in part.errors),
+        _merge_log_entries(report for part in parts for report in part.reports),
         more + sum(part.left_out for part in parts),
         undecodable,
         max(part.beyond for part in parts),
@@ -177,7 +177,7 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
     return whole.limited(MAX_HELD, MAX_SEEN)
 
 
-def _states(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
+def _states_and_changes(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
     """Returns what each state was first and last, and its changes."""
     facts = stated.facts.of_kinds(STATES)
     if not facts.rows.size:
@@ -198,9 +198,11 @@ def _states(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]
 
     first = order[begins]
     last = values[order[np.append(begins[1:], order.size) - 1]][np.argsort(first)].tolist()
-    known = zip(listed(np.sort(first)), last, strict=True)
+    states = zip(listed(np.sort(first)), last, strict=True)
     return (
-        tuple(KnownState(*word[:2], at, value, end, word.text) for (word, at, value), end in known),
+        tuple(
+            KnownState(*word[:2], at, value, end, word.text) for (word, at, value), end in states
+        ),
         tuple(
             Change(*word[:2], at, value, word.text)
             for word, at, value in listed(np.sort(order[is_change]))
@@ -215,52 +217,52 @@ def _joined_states(
 
     The changes are in order of time, part by part. With them how much more was held than is kept.
     """
-    known: dict[tuple[str, str], KnownState] = {}
-    found: list[Change] = []
+    states: dict[tuple[str, str], KnownState] = {}
+    changes: list[Change] = []
     left_out = 0
     for part in parts:
         between: list[Change] = []
         for held in part.known:
-            before = known.get(held[:2])
-            if before is None and len(known) >= MAX_HELD:
+            before = states.get(held[:2])
+            if before is None and len(states) >= MAX_HELD:
                 left_out += 1
                 continue
-            known[held[:2]] = held if before is None else before._replace(last=held.last)
+            states[held[:2]] = held if before is None else before._replace(last=held.last)
             if before is not None and before.last != held.first:
                 between.append(Change(held.kind, held.name, held.at, held.first, held.text))
-        found += sorted([*between, *part.changes], key=lambda change: change.time)
-    return tuple(known.values()), tuple(found), left_out
+        changes += sorted([*between, *part.changes], key=lambda change: change.time)
+    return tuple(states.values()), tuple(changes), left_out
 
 
-def _said(stated: Stated, kind: str) -> list[Report]:
+def _reports_of(stated: Stated, kind: str) -> list[Report]:
     """Returns each sentence of a kind as a report."""
     facts = stated.facts.of_kinds({kind})
     cells = zip(facts.codes.tolist(), stated.times[facts.rows].tolist(), strict=True)
     return [Report(facts.words[code].name, time, time, 1) for code, time in cells]
 
 
-def _errors(found: Iterable[Report]) -> tuple[Report, ...]:
-    alike = _joined_reports(found, str, MAX_NS)
+def _merge_errors(reports: Iterable[Report]) -> tuple[Report, ...]:
+    alike = _merge_reports(reports, str, MAX_NS)
     return tuple(sorted(alike, key=lambda error: (error.first, error.text)))
 
 
-def _reports(found: Iterable[Report]) -> tuple[Report, ...]:
-    return tuple(_joined_reports(found, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
+def _merge_log_entries(reports: Iterable[Report]) -> tuple[Report, ...]:
+    return tuple(_merge_reports(reports, lambda text: _DIGITS.sub("#", text), REPEATED_NS))
 
 
-def _joined_reports(
+def _merge_reports(
     reports: Iterable[Report], likeness: Callable[[str], str], apart: Ns
 ) -> list[Report]:
     """Returns reports in order, each joined to the newest one like it, where that is recent."""
-    found: list[Report] = []
+    joined: list[Report] = []
     newest: dict[str, int] = {}
     for report in reports:
         alike = likeness(report.text)
         nth = newest.get(alike)
-        if nth is not None and report.first - found[nth].last <= apart:
-            before = found[nth]
-            found[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
+        if nth is not None and report.first - joined[nth].last <= apart:
+            before = joined[nth]
+            joined[nth] = before._replace(last=report.last, reports=before.reports + report.reports)
         else:
-            newest[alike] = len(found)
-            found.append(report)
-    return found
+            newest[alike] = len(joined)
+            joined.append(report)
+    return joined

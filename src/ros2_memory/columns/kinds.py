@@ -11,7 +11,7 @@ from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
 from ros2_memory.analysis.motion.speed_drops import SpeedDrop
 from ros2_memory.analysis.motion.standstills import Blocks, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
-from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.analysis.poses import FrameCodes, Poses
 from ros2_memory.analysis.topic_events import (
     Change,
     KnownState,
@@ -46,7 +46,7 @@ def _joined_tracks(parts: Sequence[TrackPart]) -> Sequence[TrackPart]:
 
 
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
-PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, Frames))
+PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, FrameCodes))
 """The path of the poses of a topic in a slice of the clock."""
 STANDS: Final = FragmentKind("stands", (Stands, Blocks, SpeedDrop), _joined_stands)
 """Where the robot may have stood in a slice of the clock, by the poses of a topic."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
-from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.analysis.poses import FrameCodes, Poses
 from ros2_memory.columns.plan import fields_at
 from ros2_memory.columns.shown import ByType, UnknownShapeError
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
@@ -282,7 +282,7 @@ def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:
         for path in columns.velocity[1:]:
             speeds = np.hypot(speeds, rows.floats(path, VELOCITY))
     turns, frames = _turns(rows, columns, times.size), _frames_of(rows, columns, times.size)
-    return Poses(times, positions, turns, Frames(frames.codes, frames.words), speeds)
+    return Poses(times, positions, turns, FrameCodes(frames.codes, frames.words), speeds)
 
 
 def _turns(rows: _RoundedRows, columns: _Columns, count: int) -> Vectors:

@@ -14,7 +14,7 @@ import numpy as np
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.history.coverage import unknown_times
-from ros2_memory.history.driven_path import resolve_path_topic, way_in
+from ros2_memory.history.driven_path import path_by_poses, resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
 from ros2_memory.history.robots import note_robots, require_one_robot
 from ros2_memory.history.view import TimeRange, clamped, open_span, open_view, search_window
@@ -67,7 +67,7 @@ def count_path(
     view, asked = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
     binned = BinnedWindow(view, asked, by, (name,), region)
-    way, since = way_in(view, name, binned.counted)
+    way, since = path_by_poses(view, name, binned.counted)
     if way is None:
         raise no_data_between(view, (name,), asked)
     binned.count_since(since)

@@ -98,9 +98,9 @@ class BagAccess:
         A bag that a crash left open makes the answer incomplete; of one that is still being
         written the reply has to report that it was used.
         """
-        for each in messages:
-            self._track_source(each.bag)
-            yield each
+        for message in messages:
+            self._track_source(message.bag)
+            yield message
 
     def _track_source(self, bag: BagFile) -> None:
         if bag.state is BagState.INCOMPLETE:
@@ -109,7 +109,7 @@ class BagAccess:
             self.call.used_active = True
 
     def track_all_sources(self) -> None:
-        """Does as `track_sources` for an answer that is about all bags of the index."""
+        """Records that an answer is about all bags of the index, also those being written."""
         if any(aside.until is not None for aside in self.snapshot.active):
             self.call.used_active = True
 
@@ -123,14 +123,14 @@ class BagAccess:
             return ()
 
     def decode(
-        self, found: StoredMessage, failures: list[UndecodableError] | None = None
+        self, stored: StoredMessage, failures: list[UndecodableError] | None = None
     ) -> object | None:
         """Returns the decoded message; None where its type or its bytes are not understood.
 
         Why is added to `failures`.
         """
         try:
-            return self.memory.reader.decode(found.record)
+            return self.memory.reader.decode(stored.record)
         except UndecodableError as error:
             if failures is not None:
                 # A new one, since the one that was raised keeps the message by its traceback.
@@ -223,7 +223,7 @@ class BagAccess:
         remembered = self.memory.columns.caches.decoded
         key = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
-        known = remembered.get(key) if is_lasting else None
+        remembered_tables = remembered.get(key) if is_lasting else None
         read_now = decoded(
             self.memory.reader,
             bag.path,
@@ -232,7 +232,7 @@ class BagAccess:
             hashed=lambda channel: hashed or channel.latched,
             columns=columns,
         )
-        groups = read_now if known is None else iter(known)
+        groups = read_now if remembered_tables is None else iter(remembered_tables)
         read: list[list[Table]] = []
         size = 0
         while True:
@@ -253,7 +253,7 @@ class BagAccess:
                 read.append(tables)
             yield from tables
             self.check_deadline()
-        if is_lasting and known is None:
+        if is_lasting and remembered_tables is None:
             remembered.put(key, read, size)
 
 

@@ -65,7 +65,7 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
     """
     window = TimeWindow.everything() if window is None else window
     _note_pauses(view, window)
-    return tuple(each for each in _steps_around(view, window) if window.contains(each.at))
+    return tuple(step for step in _steps_around(view, window) if window.contains(step.at))
 
 
 def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
@@ -77,16 +77,16 @@ def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[N
     except QueryTimeoutError:
         _note_timeout(view)
         return gaps
-    return [gap for gap in gaps if gap[0] not in steps]
+    return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     """Returns how much time passed between moments of a window; notes name the steps in it."""
     try:
         steps = [
-            each
-            for each in _steps_around(view, window)
-            if window.overlaps(each.at, each.at + max(each.by - 1, 0))
+            step
+            for step in _steps_around(view, window)
+            if window.overlaps(step.at, step.at + max(step.by - 1, 0))
         ]
     except QueryTimeoutError:
         _note_timeout(view)
@@ -108,31 +108,33 @@ def _note_timeout(view: View) -> None:
     )
 
 
-def across_steps(found: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
+def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
     """Returns the trajectory of a path on which a step of the clock is no gap, and takes no time.
 
     A step is a gap among poses that are often enough for it; see `odometry`.
     """
-    duration_s = found.totals.duration_s
+    duration_s = trajectory.totals.duration_s
     skipped = elapsed.skipped_between(path.first, path.last)
-    if not skipped or found.poses < 2:
-        return found
-    least = GAP_PERIODS * duration_s / (found.poses - 1)
+    if not skipped or trajectory.poses < 2:
+        return trajectory
+    least = GAP_PERIODS * duration_s / (trajectory.poses - 1)
     crossed = sum(
         path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
         for begin, stop in elapsed.skipped
     )
-    gaps = max(0, found.totals.gaps - crossed)
+    gaps = max(0, trajectory.totals.gaps - crossed)
     elapsed_s = duration_s - unix_from_ns(skipped)
     return replace(
-        found,
-        totals=replace(found.totals, gaps=gaps, gap_m=found.totals.gap_m if gaps else 0.0),
-        avg_speed=mean_speed(found.totals.distance_m, elapsed_s) or found.avg_speed,
+        trajectory,
+        totals=replace(
+            trajectory.totals, gaps=gaps, gap_m=trajectory.totals.gap_m if gaps else 0.0
+        ),
+        avg_speed=mean_speed(trajectory.totals.distance_m, elapsed_s) or trajectory.avg_speed,
     )
 
 
 def while_recorded(
-    found: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
+    trajectory: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
 ) -> Trajectory:
     """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
 
@@ -140,13 +142,13 @@ def while_recorded(
     """
     recorded = elapsed.between(path.first, path.last) - unrecorded
     if not unrecorded or recorded <= 0:
-        return found
-    avg_speed, fastest = mean_speed(found.totals.distance_m, unix_from_ns(recorded)), None
-    if found.max_speed_from == "twist":
-        fastest = found.max_speed
+        return trajectory
+    avg_speed, fastest = mean_speed(trajectory.totals.distance_m, unix_from_ns(recorded)), None
+    if trajectory.max_speed_from == "twist":
+        fastest = trajectory.max_speed
     elif avg_speed is not None:
-        fastest = max(found.max_speed or 0.0, avg_speed)
-    return replace(found, avg_speed=avg_speed, max_speed=fastest)
+        fastest = max(trajectory.max_speed or 0.0, avg_speed)
+    return replace(trajectory, avg_speed=avg_speed, max_speed=fastest)
 
 
 def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
@@ -157,13 +159,19 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
     deleted = (ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back)
-    found = (_step_in(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:])
-    return sorted({*steps, *deleted, *filter(None, found)})
+    steps_in_pauses = (
+        _step_of_pause(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:]
+    )
+    return sorted({*steps, *deleted, *filter(None, steps_in_pauses)})
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
     """Returns the pauses that bags show in a window, and those that deleted bags showed."""
-    shown = {pause[:2]: pause for pause in view.snapshot.suspects if window.overlaps(*pause[:2])}
+    shown = {
+        (pause.start, pause.end): pause
+        for pause in view.snapshot.suspects
+        if window.overlaps(pause.start, pause.end)
+    }
     deleted = {
         pause: Pause(*pause, (), ran_on=True)
         for pause in read_thinned(view.bag_dir).pauses
@@ -182,7 +190,7 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
         )
 
 
-def _step_in(view: View, pause: Pause) -> ClockStep | None:
+def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
     """Returns the step that a pause is, which is looked at once if its bags are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
@@ -190,60 +198,61 @@ def _step_in(view: View, pause: Pause) -> ClockStep | None:
     states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
     key = (topic, pause.start, pause.end, *states)
     scanner = view.memory.columns
-    known = scanner.caches.clock_steps.get(key)
-    if known is None:
+    remembered = scanner.caches.clock_steps.get(key)
+    if remembered is None:
         with view.notes.isolated():
-            step = _read_step(view, topic, (pause.start, pause.end))
+            step = _find_step(view, topic, pause)
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
-        known = () if step is None else (step,)
+        remembered = () if step is None else (step,)
         if is_final:
-            scanner.caches.clock_steps.put(key, known, _STEPS_BYTES)
-    return next(iter(known), None)
+            scanner.caches.clock_steps.put(key, remembered, _STEPS_BYTES)
+    return next(iter(remembered), None)
 
 
-def _read_step(view: View, topic: str | None, hole: tuple[Ns, Ns]) -> ClockStep | None:
-    step = _step_by_stamps(view, hole)
-    is_long = hole[1] - hole[0] >= SHORTEST_STEP_NS
-    if step is not None or not is_long or topic is None or _is_late(view, topic, hole):
+def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
+    """Returns the step that a pause is, by header stamps, else by the poses of a topic."""
+    step = _step_by_stamps(view, pause)
+    is_long = pause.end - pause.start >= SHORTEST_STEP_NS
+    if step is not None or not is_long or topic is None or _is_late(view, topic, pause):
         return step
-    before = TimeWindow(hole[0] - BESIDE_NS, hole[0] + 1)
-    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+    before = TimeWindow(pause.start - BESIDE_NS, pause.start + 1)
+    after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     bags = [view.timeline.overlapping(window) for window in (before, after)]
-    # A recording that ended before the hole tells nothing about one that began after it.
-    through = set.intersection(*({bag.recording for bag in each} for each in bags))
+    # A recording that ended before the pause tells nothing about one that began after it.
+    through = set.intersection(*({bag.recording for bag in side_bags} for side_bags in bags))
     sides = [_poses(view, topic, window, through) for window in (before, after)]
-    return step_over(hole, *sides)
+    return step_over((pause.start, pause.end), *sides)
 
 
-def _step_by_stamps(view: View, hole: tuple[Ns, Ns]) -> ClockStep | None:
-    """Returns the step that a hole is by the header stamps of topics on both sides of it."""
-    around = TimeWindow(hole[0] - STAMPS_BESIDE_NS, hole[1] + STAMPS_BESIDE_NS)
+def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
+    """Returns the step that a pause is by the header stamps of topics on both sides of it."""
+    around = TimeWindow(pause.start - STAMPS_BESIDE_NS, pause.end + STAMPS_BESIDE_NS)
     counts: Counter[str] = Counter()
     for bag in view.timeline.overlapping(around):
-        counts.update({known.topic: known.count for known in bag.summary.topics})
+        counts.update({info.topic: info.count for info in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
         for times, stamps in _stamps(view, topic, around).values():
-            change = delay_change(hole, times, stamps)
+            change = delay_change((pause.start, pause.end), times, stamps)
             if change is not None:
                 changes.append(change)
                 break
-    return step_by_delays(hole, changes)
+    return step_by_delays((pause.start, pause.end), changes)
 
 
-def _is_late(view: View, topic: str, hole: tuple[Ns, Ns]) -> bool:
-    """Returns whether messages that follow a hole were sent in it: the recorder had stalled."""
-    after = TimeWindow(hole[1], hole[1] + BESIDE_NS)
+def _is_late(view: View, topic: str, pause: Pause) -> bool:
+    """Returns whether messages that follow a pause were sent in it: the recorder had stalled."""
+    after = TimeWindow(pause.end, pause.end + BESIDE_NS)
     first = view.stream.first((topic,), after)
     sent = [] if first is None else [first.record.publish_time]
     for _, stamps in _stamps(view, topic, after).values():
         sent += stamps.tolist()
-    return any(hole[0] + ALIKE_NS < at < hole[1] - ALIKE_NS for at in sent)
+    return any(pause.start + ALIKE_NS < at < pause.end - ALIKE_NS for at in sent)
 
 
 def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np.int64]]:
     """Returns the log times and header stamps of a topic in a window, of each recording."""
-    found: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
+    by_recording: dict[Path, list[NDArray[np.int64]]] = defaultdict(list)
 
     def may_match(parts: PartZones) -> bool:
         return _STAMP in parts.topic.layout.slots
@@ -256,16 +265,16 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np
         return np.stack((rows.times, stamps if rows.index is None else stamps[rows.index]))
 
     for rows in scan(view, topic, window, may_match=may_match):
-        found[rows.recording] += of_columns(view, rows, stamped) or []
-    found = {path: parts for path, parts in found.items() if parts}
-    return {path: np.concatenate(parts, axis=1) for path, parts in found.items()}
+        by_recording[rows.recording] += of_columns(view, rows, stamped) or []
+    by_recording = {path: parts for path, parts in by_recording.items() if parts}
+    return {path: np.concatenate(parts, axis=1) for path, parts in by_recording.items()}
 
 
 def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:
     """Returns the poses of some recordings in a window that are at a place."""
-    found = pose_rows(view, topic, window, [], among=recordings.__contains__)
+    blocks = pose_rows(view, topic, window, [], among=recordings.__contains__)
     try:
-        poses = joined_poses([each.poses for each in found])
+        poses = joined_poses([rows.poses for rows in blocks])
     except InvalidArgumentsError:
         return NO_POSES
     return poses.rows(np.flatnonzero(are_places(poses.positions)))

@@ -142,7 +142,7 @@ class Memory:
         return bags.measured(snapshot, () if heartbeat is None else heartbeat.recordings)
 
     def absent_splits(self, snapshot: Snapshot) -> list[Absent]:
-        """Returns what recordings' metadata.yaml lists and is not there."""
+        """Returns the splits that metadata.yaml of a recording lists and that are missing."""
         return absent_splits(snapshot, self.index.bag_dir, self._listings())
 
     def store_listings(self, snapshot: Snapshot) -> None:
@@ -151,12 +151,12 @@ class Memory:
         if store is None:
             return
         self.absent_splits(snapshot)
-        known, folders = self._listings(), snapshot.metadata_folders
+        listings, folders = self._listings(), snapshot.metadata_folders
         store.put_listings(
             {
-                relative(folder, str(self.index.bag_dir)): listing_to_json(*known[folder])
+                relative(folder, str(self.index.bag_dir)): listing_to_json(*listings[folder])
                 for folder in folders
-                if folder in known
+                if folder in listings
             }
         )
 
@@ -166,11 +166,11 @@ class Memory:
     def _stored_listings(self) -> Listings:
         """Returns what was stored of each metadata.yaml; one that is damaged is read again."""
         stored = {} if self.columns.store is None else self.columns.store.listings()
-        found: Listings = {}
+        listings: Listings = {}
         for folder, text in stored.items():
             with suppress(ValueError, TypeError, OverflowError):
-                found[str(self.index.bag_dir / folder)] = listing_from_json(text)
-        return found
+                listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
+        return listings
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.
@@ -330,16 +330,16 @@ class Latching:
         configured = self._configured(topic)
         return snapshot.timeline.is_transient_state(topic) if configured is None else configured
 
-    def holds(self, snapshot: Snapshot, found: StoredMessage) -> bool:
+    def holds(self, snapshot: Snapshot, stored: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
-        channel = found.record.channel
+        channel = stored.record.channel
         configured = self._configured(channel.topic)
         if configured is not None or not snapshot.timeline.is_transient_state(channel.topic):
             return bool(configured)
-        if is_carried(found.bag.file):
+        if is_carried(stored.bag.file):
             origin = origin_of(channel)
             return origin is None or not origin.often
-        return snapshot.timeline.pace(channel.topic, found.bag.recording).is_rare
+        return snapshot.timeline.pace(channel.topic, stored.bag.recording).is_rare
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.
@@ -349,7 +349,7 @@ class Latching:
         configured = self._configured(topic)
         if configured is not None or not snapshot.timeline.is_transient_state(topic):
             return bool(configured)
-        last = {path: span[1] for path, span in snapshot.timeline.recordings(topic).items()}
+        last = {path: last for path, (_, last) in snapshot.timeline.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
@@ -411,9 +411,9 @@ class Notes:
                 self._sentences.setdefault(note)
                 continue
             self.added += 1
-            known = self._notes.get((note.kind, note.file), note)
-            newest = note if known.until < note.until else known
-            since = min(known.since, note.since)
+            before = self._notes.get((note.kind, note.file), note)
+            newest = note if before.until < note.until else before
+            since = min(before.since, note.since)
             self._notes[note.kind, note.file] = newest._replace(since=since)
 
     def add_lack(self, note: str | Note) -> None:
@@ -451,8 +451,11 @@ class Notes:
         """Records that sentences already have what the summaries of these bags remark."""
         self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
-    def has_remarks(self, bag: BagFile) -> bool:
-        """Whether notes on what was read of a bag have all that its summary remarks."""
+    def notes_cover_remarks(self, bag: BagFile) -> bool:
+        """Whether the notes on a bag tell all that its summary remarks, so no sentence need do so.
+
+        False for one of which sentences have told it already (`add_remarks`).
+        """
         name = short_name(bag.path)
         if name in self._remarks:
             return False

@@ -41,6 +41,11 @@ class Counted(NamedTuple):
         np.minimum.at(self.first, pieces, first)
         np.maximum.at(self.last, pieces, last)
 
+    def add_times(self, times: IntArray, edges: IntArray) -> None:
+        """Adds a message at each of some log times (ns) to the piece that it lies in."""
+        pieces = np.searchsorted(edges, times, side="right")
+        self.add(pieces, np.ones_like(times), times, times)
+
 
 def count_messages(
     view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
@@ -63,7 +68,7 @@ def count_messages(
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
     if view.stream.may_be_relatched([topic]):
         for rows in scan(view, topic, window, columns=proves):
-            counted.add(*_one_by_one(rows.times, edges))
+            counted.add_times(rows.times, edges)
         return counted
     shared = open_scan(view, topic, window).shared
     to_read: set[str] = set()
@@ -72,21 +77,21 @@ def count_messages(
         column = segment.column(topic)
         if column is None:
             continue
-        of, firsts, lasts, messages = column
-        pieces, is_in, is_cut = _told_apart(column, window, edges, shared)
+        bag_numbers, firsts, lasts, messages = column
+        pieces, is_in, is_cut = _classify_bags(column, window, edges, shared)
         counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
         for row in np.flatnonzero(is_cut).tolist():
             # A bag has a row for each type of the topic.
-            to_read.add(segment.bags[of[row]].file)
+            to_read.add(segment.bags[bag_numbers[row]].file)
             spans.append((int(firsts[row]), int(lasts[row]) + 1))
     near_those = united(sorted(spans))
     for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
         for _, positions in rows.bag_rows(to_read):
-            counted.add(*_one_by_one(rows.times[positions], edges))
+            counted.add_times(rows.times[positions], edges)
     return counted
 
 
-def _told_apart(
+def _classify_bags(
     column: TopicColumn, window: TimeWindow, edges: IntArray, shared: Spans
 ) -> tuple[IntArray, NDArray[np.bool_], NDArray[np.bool_]]:
     """Returns the piece of each bag, which of them are counted whole, and which are to be read."""
@@ -101,10 +106,6 @@ def _told_apart(
     is_cut = np.isin(bags, bags[is_cut])
     is_here = (firsts < window.stop) & (lasts >= window.start)
     return pieces, is_here & ~is_cut, is_here & is_cut
-
-
-def _one_by_one(times: IntArray, edges: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    return np.searchsorted(edges, times, side="right"), np.ones_like(times), times, times
 
 
 def pick(
@@ -145,4 +146,4 @@ def _at_positions(
     for time, equal in groupby(there, key=lambda nth: int(times[nth])):
         numbers = {nth - int(np.searchsorted(times, time)) for nth in equal}
         at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
-        yield from (found for nth, found in enumerate(at_once) if nth in numbers)
+        yield from (stored for nth, stored in enumerate(at_once) if nth in numbers)

@@ -88,7 +88,7 @@ def note_unread(
         bag
         for bag in view.timeline.faulty(window)
         # There is no note about bags that a crash left open.
-        if bag.state is BagState.INCOMPLETE or not view.notes.has_remarks(bag)
+        if bag.state is BagState.INCOMPLETE or not view.notes.notes_cover_remarks(bag)
     ]
     view.notes.add(*describe_gaps(view, window, explained=window.start <= MIN_NS) if gaps else ())
     if nothing or search:
@@ -97,7 +97,7 @@ def note_unread(
     if (bag_dir / OWN_FOLDER).is_dir():
         view.notes.add(
             *describe_deleted(view, window),
-            *(f"{of}{each}" for each in describe_lost(bag_dir, window)),
+            *(f"{of}{sentence}" for sentence in describe_lost(bag_dir, window)),
             *describe_excluded(bag_dir, window),
         )
     view.notes.add(*unread_spans(view.snapshot, window, nothing=nothing, absent=absent, odd=odd))
@@ -150,18 +150,22 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
     bag_dir, touched = view.bag_dir, view.gaps(window)
     if not touched:
         return
-    known = [each for each in read_losses(bag_dir, MIN_NS, MAX_NS) if each.by in INTERRUPTIONS]
-    if explained and not known:
+    interruptions = [
+        loss for loss in read_losses(bag_dir, MIN_NS, MAX_NS) if loss.by in INTERRUPTIONS
+    ]
+    if explained and not interruptions:
         return
-    found: dict[str, list[str]] = {}
+    spans_by_cause: dict[str, list[str]] = {}
     gone = deleted_spans(bag_dir)
-    gaps = (part for each in touched for part in _unrecorded(view.snapshot, each, gone))
+    gaps = (part for gap in touched for part in _unrecorded(view.snapshot, gap, gone))
     for start, end in gaps:
-        cause = next((each.by for each in known if each.start < end and start < each.stop), "")
+        cause = next(
+            (loss.by for loss in interruptions if loss.start < end and start < loss.stop), ""
+        )
         may_come = being_written(view.snapshot, TimeWindow(start + 1, end))
         if window.overlaps(start, end) and (cause or not (explained or may_come)):
-            found.setdefault(cause, []).append(_span_text(start, end))
-    for by, spans in found.items():
+            spans_by_cause.setdefault(cause, []).append(_span_text(start, end))
+    for by, spans in spans_by_cause.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
         because = f", because {INTERRUPTIONS[by]}" if by else ""
         yield f"nothing was recorded from {named}{because}"
@@ -194,27 +198,27 @@ def deleted_between(view: View, window: TimeWindow) -> Spans:
 
 
 def _deleted_near(view: View, window: TimeWindow) -> Spans:
-    """Returns the same, as far as it reaches out of the window."""
+    """Returns the spans of `deleted_between` before they are cut at the ends of the window."""
     snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
         return []
-    found: Spans = []
+    deleted: Spans = []
     if window.start > MIN_NS and snapshot.earliest is not None:
-        found += [(start, min(stop, snapshot.earliest)) for start, stop in gone]
+        deleted += [(start, min(stop, snapshot.earliest)) for start, stop in gone]
     for gap in snapshot.gaps:
         if window.overlaps(*gap):
-            found += without([gap], _unrecorded(snapshot, gap, gone))
+            deleted += without([gap], _unrecorded(snapshot, gap, gone))
     first, last = window.asked()
     return [
         (start, stop)
-        for start, stop in found
+        for start, stop in deleted
         if stop - start > snapshot.shortest_gap and start < last and first < stop
     ]
 
 
 def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
-    spans = [_span_text(*each) for each in _deleted_near(view, window)]
+    spans = [_span_text(*span) for span in _deleted_near(view, window)]
     if spans:
         named = listed(spans[-MAX_NAMED:], len(spans))
         yield f"recorded, and deleted since: {named}"
@@ -227,19 +231,18 @@ def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[N
     window, in order, joined where they overlap.
     """
     losses = read_losses(bag_dir, window.start, window.stop)
-    gone = (each for each in losses if each.topic == topic and each.by in {"forgotten", "expired"})
-    return united((each.start, each.stop) for each in gone)
+    gone = (loss for loss in losses if loss.topic == topic and loss.by in {"forgotten", "expired"})
+    return united((loss.start, loss.stop) for loss in gone)
 
 
 def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on the intervals of a window that were excluded."""
-    found = united(
-        (each.start, each.stop) for each in excluded_between(bag_dir, window.start, window.stop)
-    )
-    if found:
-        spans = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in found[-MAX_NAMED:]]
-        excluded = "excluded by the rules of recording.exclude_when, so there is no data of it"
-        yield f"{excluded}: {listed(spans, len(found))}"
+    excluded = excluded_between(bag_dir, window.start, window.stop)
+    spans = united((stretch.start, stretch.stop) for stretch in excluded)
+    if spans:
+        named = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in spans[-MAX_NAMED:]]
+        what = "excluded by the rules of recording.exclude_when, so there is no data of it"
+        yield f"{what}: {listed(named, len(spans))}"
 
 
 def note_edges(view: View, window: TimeWindow) -> None:
@@ -249,7 +252,7 @@ def note_edges(view: View, window: TimeWindow) -> None:
     earliest = snapshot.earliest
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
-        if not any(before.overlaps(each.bag.start, each.bag.end) for each in snapshot.misdated):
+        if not any(before.overlaps(fault.bag.start, fault.bag.end) for fault in snapshot.misdated):
             view.notes.add(f"the memory begins at {unix_text(earliest)}")
     if snapshot.latest is None or not _ends_after(window, snapshot.latest):
         return
@@ -279,7 +282,7 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
     whole = all(map(is_whole, view.timeline.faulty(window)))
     excluded = excluded_between(view.bag_dir, window.start, window.stop)
-    deleted = any(cut_spans(view.bag_dir, each, window) for each in topics)
+    deleted = any(cut_spans(view.bag_dir, topic, window) for topic in topics)
     deleted |= bool(deleted_between(view, window))
     deleted |= any(describe_thinned(view.snapshot, window))
     if view.notes.complete and whole and not lost and not excluded and not deleted:
@@ -316,15 +319,15 @@ def unread_spans(
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         names = [
-            f"{short_name(each.path)} ({shortened(each.reason)})" for each in lost[-MAX_NAMED:]
+            f"{short_name(aside.path)} ({shortened(aside.reason)})" for aside in lost[-MAX_NAMED:]
         ]
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
     active = being_written(snapshot, window)
     # Splits are not served before they were searched.
-    if held := [short_name(each.path) for each in active if each.reason == HELD_BACK]:
+    if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:
         yield f"{HELD_BACK}: {listed(held)}"
-    if any(each.reason != HELD_BACK for each in active):
+    if any(aside.reason != HELD_BACK for aside in active):
         yield _describe_active(snapshot, active, window)
     faults = [
         fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
@@ -377,11 +380,13 @@ def _describe_active(snapshot: Snapshot, active: Sequence[SetAside], window: Tim
     if latest is not None and _ends_after(window, latest):
         return _nothing_after(snapshot.active, latest)
     excluded = [
-        short_name(each.path) for each in active if not each.answers and each.reason != HELD_BACK
+        short_name(aside.path)
+        for aside in active
+        if not aside.answers and aside.reason != HELD_BACK
     ]
     if excluded:
         return f"still being written and not included: {listed(excluded)}"
-    names = [short_name(each.path) for each in active]
+    names = [short_name(aside.path) for aside in active]
     return f"still being written and not all on disk yet: {listed(names)}"
 
 
@@ -400,7 +405,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
     for remark, [name, *others] in reversed(shown):
         subject = f"{len(others) + 1} bags ({listed([name, *others])})" if others else name
         yield f"{subject}: {remark}"
-    more = len(bags) - sum(len(each) for _, each in shown)
+    more = len(bags) - sum(len(files) for _, files in shown)
     if more:
         yield f"{counted(more, 'older bag is', 'older bags are')} odd too"
 
@@ -408,7 +413,7 @@ def by_remark(bags: Sequence[tuple[BagFile, str]], most: int) -> Iterator[str]:
 def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
     """Yields the sentences on bags that are not whole or contradict themselves."""
     remarked = [(bag, "; ".join(bag.summary.remarks)) for bag in bags]
-    left_open = [each for each in remarked if each[0].state is BagState.INCOMPLETE]
+    left_open = [(bag, remark) for bag, remark in remarked if bag.state is BagState.INCOMPLETE]
     if left_open:
         names = [
             f"{short_name(bag.path)} ({shortened(remark)})" if remark else short_name(bag.path)
@@ -420,7 +425,8 @@ def describe_odd(bags: Sequence[BagFile]) -> Iterator[str]:
             f"{listed(names, len(left_open))}"
         )
     yield from by_remark(
-        [each for each in remarked if each[0].state is not BagState.INCOMPLETE], MAX_NAMED
+        [(bag, remark) for bag, remark in remarked if bag.state is not BagState.INCOMPLETE],
+        MAX_NAMED,
     )
 
 
@@ -471,18 +477,18 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     end = min(end, max(start, until))
     outside = (min(end, earliest) - start, end - max(start, latest))
     gaps = [last - first for first, last in recording_gaps(view, TimeWindow(start, end))]
-    missing = sum(max(each, 0) for each in (*outside, *gaps))
-    whole = end - start
-    window = f"between {unix_text(start)} and {unix_text(end)}"
-    asked_for = TimeWindow(start, end)
-    deleted = deleted_between(view, asked_for)
+    missing = sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
+    length = end - start
+    when = f"between {unix_text(start)} and {unix_text(end)}"
+    deleted = deleted_between(view, TimeWindow(start, end))
     if gap_around(view, asked) is not None:
-        view.notes.add(why_nothing(window, deleted=bool(deleted)))
+        view.notes.add(why_nothing(when, deleted=bool(deleted)))
     elif gaps or max(outside) > _EDGE_NS:
-        part = unix_from_ns(max(whole - missing, 0))
-        places = 0 if whole >= 100 * NS_PER_S else 1
+        recorded_s = unix_from_ns(max(length - missing, 0))
+        digits = 0 if length >= 100 * NS_PER_S else 1
         what = "here are only" if deleted else "recorded only"
-        view.notes.add(f"{what} {part:.{places}f} of {unix_from_ns(whole):.{places}f} s {window}")
+        of_s = f"{unix_from_ns(length):.{digits}f} s"
+        view.notes.add(f"{what} {recorded_s:.{digits}f} of {of_s} {when}")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:
@@ -514,7 +520,10 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
 def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show, by `recorded_reach`."""
     reach = recorded_reach(snapshot, window)
-    return window if reach is None else window.intersect(TimeWindow(reach[0], reach[1] + 1))
+    if reach is None:
+        return window
+    first, last = reach
+    return window.intersect(TimeWindow(first, last + 1))
 
 
 def recording_gaps(view: View, window: TimeWindow | None = None) -> Iterator[tuple[Ns, Ns]]:
@@ -538,7 +547,7 @@ def unknown_times(view: View, window: TimeWindow, known: Spans, what: str) -> Sp
     around = (max(start - SILENCE_NS, first), min(end + SILENCE_NS, last))
     left = without([around], united([*known, *recording_gaps(view)]))
     cut = [(max(begin, start), min(stop, end)) for begin, stop in left if stop - begin > SILENCE_NS]
-    found = [(begin, stop) for begin, stop in cut if begin < stop]
-    if found and not any(begin <= end and start <= stop for begin, stop in known):
+    unknown = [(begin, stop) for begin, stop in cut if begin < stop]
+    if unknown and not any(begin <= end and start <= stop for begin, stop in known):
         view.notes.add(f"{what} is not known at any time of the window")
-    return found
+    return unknown

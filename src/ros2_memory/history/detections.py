@@ -50,17 +50,25 @@ class Detected(NamedTuple):
     found: Detections
 
 
+class _DecodedMessage(NamedTuple):
+    """A decoded message: log time and header stamp (ns; the log time if none), and detections."""
+
+    log_time: Ns
+    stamp: Ns
+    detections: list[Detection]
+
+
 def joined_detected(parts: Sequence[Detected]) -> Detected:
     """Returns messages of tables of one topic together; `parts` is not empty."""
     if len(parts) == 1:
         return parts[0]
     log_times, order, places = merged_times([part.log_times for part in parts])
-    found = [
+    detections = [
         part.found._replace(rows=place[part.found.rows])
         for place, part in zip(places, parts, strict=True)
     ]
     times = np.concatenate([part.times for part in parts])[order]
-    return Detected(log_times, times, joined_detections(found))
+    return Detected(log_times, times, joined_detections(detections))
 
 
 class DetectionRows:
@@ -80,47 +88,49 @@ class DetectionRows:
 
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""
-        found = of_columns(self._view, rows, self._held)
-        return self._decoded(rows) if found is None else joined_detected(found)
+        detected = of_columns(self._view, rows, self._by_columns)
+        return self._by_messages(rows) if detected is None else joined_detected(detected)
 
-    def _held(self, rows: Rows) -> Detected | None:
+    def _by_columns(self, rows: Rows) -> Detected | None:
         """Returns the detections of some rows; None where their columns leave something open."""
-        known = self._columns.of(rows.table)
-        if known is None:
+        columns = self._columns.of(rows.table)
+        if columns is None:
             return None
-        found, stamps = known
+        detections, stamps = columns
         if rows.index is not None:
-            found = found.at(rows.index)
+            detections = detections.at(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _detected(rows.times, stamps, found)
+        return _with_times(rows.times, stamps, detections)
 
-    def _decoded(self, rows: Rows) -> Detected:
-        read = [one for found in messages_of(self._view, rows) for one in self._one(found)]
+    def _by_messages(self, rows: Rows) -> Detected:
+        decoded = (self._decode(stored) for stored in messages_of(self._view, rows))
         # Those of a part come bag after bag, in the order in which bags were stored.
-        read.sort(key=lambda one: one[0])
-        log_times, stamps = (np.array([one[nth] for one in read], np.int64) for nth in (0, 1))
-        return _detected(log_times, stamps, detections_by([one[2] for one in read]))
+        messages = sorted(filter(None, decoded), key=lambda message: message.log_time)
+        return _with_times(
+            np.array([message.log_time for message in messages], np.int64),
+            np.array([message.stamp for message in messages], np.int64),
+            detections_by([message.detections for message in messages]),
+        )
 
-    def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
-        """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
-        extractor, message = self._view.extractor, self._view.bags.decode(found)
+    def _decode(self, stored: StoredMessage) -> _DecodedMessage | None:
+        extractor, message = self._view.extractor, self._view.bags.decode(stored)
         if message is None:
-            return []
+            return None
         frame = extractor.frame(message)
         stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
         detections = [
-            one if one.frame_id else one._replace(frame_id=frame)
-            for one in detections_of(extractor.exact(message, found.type))
+            detection if detection.frame_id else detection._replace(frame_id=frame)
+            for detection in detections_of(extractor.exact(message, stored.type))
         ]
-        return [(found.time, found.time if stamp is None else stamp, detections)]
+        return _DecodedMessage(stored.time, stored.time if stamp is None else stamp, detections)
 
 
-def _detected(log_times: IntArray, stamps: IntArray | None, found: Detections) -> Detected:
+def _with_times(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.
         latency = log_times - stamps
         is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
         times = np.where(is_of_this_clock, stamps, log_times)
-    places = np.rint(found.places * METRES.per_unit) / METRES.per_unit
-    return Detected(log_times, times, found._replace(places=places))
+    places = np.rint(detections.places * METRES.per_unit) / METRES.per_unit
+    return Detected(log_times, times, detections._replace(places=places))

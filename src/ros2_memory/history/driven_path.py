@@ -41,7 +41,7 @@ from ros2_memory.history.no_data import (
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
-from ros2_memory.history.robots import beside_path
+from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
 from ros2_memory.history.transforms import (
     decoded_transforms,
@@ -59,6 +59,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")
@@ -74,28 +75,31 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-class FoundWay(NamedTuple):
+class PathBackTo(NamedTuple):
     """The path of a window, None where there is no message.
 
     From `since` (log time, ns) on, where older bags were not read.
     """
 
-    way: PathSlice | None
+    path: PathSlice | None
     since: Ns | None = None
 
 
-def driven_path(view: View, topic: str, window: TimeWindow) -> FoundWay:
-    """Does as `way_in`; a note says how far back it is known where not all was read."""
-    found = way_in(view, topic, window)
-    if found.since is not None:
+def driven_path(view: View, topic: str, window: TimeWindow) -> PathBackTo:
+    """Returns the path in a window; a note says how far back it is known if not all was read.
+
+    Raises as `path_by_poses`.
+    """
+    path = path_by_poses(view, topic, window)
+    if path.since is not None:
         view.notes.add_lack(
-            f"the path is known back to {unix_text(found.since)}: out of time before older bags "
+            f"the path is known back to {unix_text(path.since)}: out of time before older bags "
             "were read"
         )
-    return found
+    return path
 
 
-def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
+def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
     """Returns the path in a window by the poses of one topic.
 
     Messages that cannot be decoded are left out, with a note.
@@ -107,28 +111,30 @@ def way_in(view: View, topic: str, window: TimeWindow) -> FoundWay:
     """
     reading = view.call.partial_after(READING_S)
     failures: list[UndecodableError] = []
-    found: list[PathSlice] = []
+    slices: list[PathSlice] = []
     start = MAX_NS
     since: Ns | None = None
 
     def reached(_: Ns) -> None:
-        if reading.expired() and found:
+        if reading.expired() and slices:
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        for start, made in slices_of_path(view, topic, window, failures, reached):  # noqa: B007
-            found += [made] if made.poses or made.invalid else []
+        for at, part in slices_of_path(view, topic, window, failures, reached):
+            start = at
+            if part.poses or part.invalid:
+                slices.append(part)
     except QueryTimeoutError:
-        if not found:
+        if not slices:
             raise
         since = start
-    if failures and not found:
+    if failures and not slices:
         raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return FoundWay(joined_slices(found[::-1], fastest) if found else None, since)
+    return PathBackTo(joined_slices(slices[::-1], fastest) if slices else None, since)
 
 
 def slices_of_path(
@@ -141,8 +147,8 @@ def slices_of_path(
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
     fastest = view.limits.max_plausible_speed_mps
 
-    def make(some: PoseSlice) -> PathSlice:
-        return path_slice(some.poses, fastest)
+    def make(piece: PoseSlice) -> PathSlice:
+        return path_slice(piece.poses, fastest)
 
     yield from slices_by_poses(
         view, topic, window, PATHS, make, failures=failures, settings=str(fastest), reached=reached
@@ -161,7 +167,7 @@ def slices_by_poses(
     settings: str = "",
     reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what is made of the robot's poses in slices of the clock, the newest first.
+    """Yields what `make` returns of the robot's poses, slice by slice of the clock, newest first.
 
     Each with a time (log time, ns) that no pose of it is earlier than. Of a topic of transforms
     they are the poses of the robot's body. Where two recordings have poses of their own, or one has
@@ -185,34 +191,37 @@ def slices_by_poses(
     if topic in view.limits.tf_topics:
         poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
         span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
-        every = [PoseRows(span, lambda: poses)] if len(poses) else []
-        for some in slices_back(every, beside):
-            yield some.start, make(some)
+        of_body = [PoseRows(span, lambda: poses)] if len(poses) else []
+        for pose_slice in pose_slices(of_body, beside):
+            yield pose_slice.start, make(pose_slice)
         return
-    twice = () if view.call.stored else beside_path(view, topic, window)
+    twice = () if view.call.stored else parallel_or_twice(view, topic, window)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
     reader = PoseReader(view, failures, twice)
 
     def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
         around = stretch.window.widened(beside)
         rows = opened.rows(newest_first=True, among=around)
-        every = map(reader.block, blocks(rows, newest_first=True))
+        read = map(reader.block, blocks(rows, newest_first=True))
         needs_all = stretch.parts is not None or not view.call.stored
-        found = (block for block in every if block.parts or needs_all)
-        for some in slices_back(found, beside):
-            if stretch.window.overlaps(some.start, some.stop - 1):
-                made = partial(make, some)
-                yield some.start, remembered(view, kind, some.key(settings), made, reader.trouble)
+        for pose_slice in pose_slices(
+            (block for block in read if block.parts or needs_all), beside
+        ):
+            if stretch.window.overlaps(pose_slice.start, pose_slice.stop - 1):
+                key, load = pose_slice.key(settings), partial(make, pose_slice)
+                yield pose_slice.start, remembered(view, kind, key, load, reader.trouble)
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
         around = stretch.window.widened(beside)
-        near = [one for one in twice if around.overlaps(one.span.start, one.span.stop - 1)]
+        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
+        near = [
+            (str(pair.other), pair.span.intersect(around), sorted(pair.bags))
+            for pair in twice
+            if around.overlaps(pair.span.start, pair.span.stop - 1)
+        ]
         if not near:
             return stretch.key(settings)
-        # Not the whole span: it grows with each bag, and poses beyond change nothing here.
-        left_out = repr(
-            [(str(one.other), one.span.intersect(around), sorted(one.bags)) for one in near]
-        )
+        left_out = repr(near)
         return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
 
     yield from joined_back(
@@ -249,33 +258,36 @@ class PoseSlice:
         return FragmentKey(self.start, settings, tuple(parts))
 
 
-def slices_back(found: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
     """Yields the slices of the clock in which there may be poses, the newest first.
 
     Args:
-        found: poses, the newest first.
+        newest_first: the poses.
         beside: poses so far before and after a slice (ns) are with it, too.
     """
     held: list[PoseRows] = []
     waiting: set[int] = set()
-
-    def done(oldest: Ns) -> Iterator[PoseSlice]:
-        """Yields the slices that reach no poses older than the oldest that is held."""
-        for number in sorted(waiting, reverse=True):
-            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
-            if start - beside < oldest:
-                return
-            waiting.discard(number)
-            near = [each for each in held if each.last >= start - beside]
-            yield PoseSlice(start, stop, beside, [e for e in near[::-1] if e.first < stop + beside])
-
-    for block in found:
+    for block in newest_first:
         newest = max(waiting, default=block.last // SLICE_NS)
-        held = [each for each in held if each.first < (newest + 1) * SLICE_NS + beside]
+        held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
         held.append(block)
         waiting.update(block.slices(SLICE_NS))
-        yield from done(block.first)
-    yield from done(MIN_NS)
+        yield from _complete_slices(waiting, held, beside, block.first)
+    yield from _complete_slices(waiting, held, beside, MIN_NS)
+
+
+def _complete_slices(
+    waiting: set[int], held: Sequence[PoseRows], beside: Ns, oldest: Ns
+) -> Iterator[PoseSlice]:
+    """Yields the slices that reach no poses older than `oldest`; they wait no longer."""
+    for number in sorted(waiting, reverse=True):
+        start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+        first, last = start - beside, stop + beside
+        if first < oldest:
+            return
+        waiting.discard(number)
+        near = [block for block in reversed(held) if block.last >= first and block.first < last]
+        yield PoseSlice(start, stop, beside, near)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
@@ -329,23 +341,23 @@ def pose_frame(view: View, topic: str) -> str:
         InvalidArgumentsError: the topic's messages carry no position.
         UndecodableError: none of the newest ones can be decoded.
     """
-    known = view.memo.of(_POSE_FRAMES, dict)
-    if topic not in known:
+    frames = view.memo.of(_POSE_FRAMES, dict)
+    if topic not in frames:
         body = robot_body(view) if topic in view.limits.tf_topics else None
-        known[topic] = _newest_frame(view, topic) if body is None else body.parent
-    return known[topic]
+        frames[topic] = _newest_frame(view, topic) if body is None else body.parent
+    return frames[topic]
 
 
 def _newest_frame(view: View, topic: str) -> str:
     failures: list[UndecodableError] = []
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for found in islice(newest, _MOST_TRIED):
-        message = view.bags.decode(found, failures)
+    for stored in islice(newest, _MOST_TRIED):
+        message = view.bags.decode(stored, failures)
         if message is None:
             continue
-        pose = view.extractor.pose(message, found.type)
+        pose = view.extractor.pose(message, stored.type)
         if pose is None:
-            raise InvalidArgumentsError(describe_lack(view, "position", found))
+            raise InvalidArgumentsError(describe_lack(view, "position", stored))
         if failures:
             note_left_out(view, failures[0])
         return pose.frame_id.lstrip("/")
@@ -372,29 +384,29 @@ def robot_body(view: View) -> Body | None:
     By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
     in the root of its frames.
     """
-    known = edges(view)
-    parents = {each.child: each.parent for each in known}
-    moving = [each.child for each in known if not each.static]
+    known_edges = edges(view)
+    parents = {edge.child: edge.parent for edge in known_edges}
+    moving = [edge.child for edge in known_edges if not edge.static]
     if not moving:
         return None
-    above = {child: _above(child, parents) for child in moving}
+    above = {child: _ancestors(child, parents) for child in moving}
     map_frame = view.limits.map_frame
-    body = min(moving, key=lambda each: (_rank(each, map_frame), len(above[each]), each))
+    body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
-    others = sorted({each for each in moving if each != body})
+    others = sorted({child for child in moving if child != body})
     return Body(root, body, tuple(others), tuple(above[body]))
 
 
-def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
+def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
     """Returns the frames above a frame, the nearest first; a loop ends it."""
-    found: list[str] = []
-    while frame in parents and parents[frame] not in found:
+    frames: list[str] = []
+    while frame in parents and parents[frame] not in frames:
         frame = parents[frame]
-        found.append(frame)
-    return found
+        frames.append(frame)
+    return frames
 
 
-def _rank(frame: str, map_frame: str | None) -> int:
+def _body_rank(frame: str, map_frame: str | None) -> int:
     name = frame.rpartition("/")[2]
     if name == map_frame or name.startswith("odom"):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected
@@ -439,19 +451,20 @@ def newest_of_body(
     transforms, it is one of these.
     """
     parent, topics, sessions = frame_id or body.parent, transform_topics(view), sessions_of(view)
-    own = None if recording is None else sessions.of(recording)
-    if own and not sessions.recordings_of(own, tuple(topics)):
-        own = None
-    for found in view.stream.messages(topics, window, newest_first=True):
-        for each in decoded_transforms(view, [found]):
-            if each.child.lstrip("/") != body.child or (own and not sessions.has(own, found)):
+    own_session = None if recording is None else sessions.of(recording)
+    if own_session and not sessions.recordings_of(own_session, tuple(topics)):
+        own_session = None
+    for stored in view.stream.messages(topics, window, newest_first=True):
+        for transform in decoded_transforms(view, [stored]):
+            is_of_session = not own_session or sessions.has(own_session, stored)
+            if transform.child.lstrip("/") != body.child or not is_of_session:
                 continue
-            clock = frames_of(view, (), [each], parent).clock
-            moment = each.stamp if clock == "stamp" else each.log_time
-            by = found.bag.recording
+            clock = frames_of(view, (), [transform], parent).clock
+            moment = transform.stamp if clock == "stamp" else transform.log_time
+            by = stored.bag.recording
             with suppress(NoDataError):  # as in `poses_of_body`
                 there = transform_at(view, parent, body.child, moment, by, explains=False).transform
-                return found, Pose(there.translation, there.rotation, parent)
+                return stored, Pose(there.translation, there.rotation, parent)
     return None
 
 
@@ -475,22 +488,34 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions, parent = sessions_of(view), body.parent
-    for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
-        moving = moving_in(view, window.widened(TF_CACHE_NS), session)
-        frames = frames_of(view, static_transforms(view, session), moving, parent)
-        own = [each for each in moving if each.child.lstrip("/") == body.child]
-        own = [each for each in own if window.contains(each.log_time)]
-        moments = [each.stamp if frames.clock == "stamp" else each.log_time for each in own]
-        found = frames.poses(body.child, np.array(moments, np.int64))
-        if found is None:
-            continue
-        last = MIN_NS
-        # None is before the first transform of the map, or in its gap.
-        for nth in np.flatnonzero(found.valid).tolist():
-            if own[nth].log_time - last >= _STEP_NS:
-                last = own[nth].log_time
-                there = found.at(nth)
-                poses[last] = Pose(there.translation, there.rotation, parent)
+    sessions = sessions_of(view)
+    for session in dict.fromkeys(sessions.of(span.bag.recording) for span in bags):
+        poses.update(_poses_of_body_in(view, window, session, body))
         view.bags.check_deadline()
     return sorted(poses.items())
+
+
+def _poses_of_body_in(
+    view: View, window: TimeWindow, session: Session, body: Body
+) -> Iterator[tuple[Ns, Pose]]:
+    """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
+    moving = moving_in(view, window.widened(TF_CACHE_NS), session)
+    frames = frames_of(view, static_transforms(view, session), moving, body.parent)
+    of_body = [
+        transform
+        for transform in moving
+        if transform.child.lstrip("/") == body.child and window.contains(transform.log_time)
+    ]
+    log_times = [transform.log_time for transform in of_body]
+    stamps = [transform.stamp for transform in of_body]
+    moments = stamps if frames.clock == "stamp" else log_times
+    placed = frames.poses(body.child, np.array(moments, np.int64))
+    if placed is None:
+        return
+    last = MIN_NS
+    # None is before the first transform of the map, or in its gap.
+    for nth in np.flatnonzero(placed.valid).tolist():
+        if log_times[nth] - last >= _STEP_NS:
+            last = log_times[nth]
+            there = placed.at(nth)
+            yield last, Pose(there.translation, there.rotation, body.parent)

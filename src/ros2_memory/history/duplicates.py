@@ -74,11 +74,11 @@ def bag_overlaps(bags: Iterable[BagSpan]) -> list[tuple[Ns, Ns]]:
     That is the time that both hold, widened by the horizon at both ends; spans that touch are
     merged.
     """
-    return overlap_spans((each.first, each.last, each.bag.recording) for each in bags)
+    return overlap_spans((bag.first, bag.last, bag.bag.recording) for bag in bags)
 
 
 def deduplicate_forward(
-    found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
+    messages: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
     """Yields an ascending stream without the later duplicates.
 
@@ -86,24 +86,24 @@ def deduplicate_forward(
     """
     recent: deque[tuple[Ns, Copy]] = deque()
     counts: dict[Copy, dict[Path, int]] = {}
-    for each in found:
-        if not lies_inside(spans, each.time):
-            yield each
+    for message in messages:
+        if not lies_inside(spans, message.time):
+            yield message
             continue
-        while recent and recent[0][0] < each.time - COPY_HORIZON_NS:
+        while recent and recent[0][0] < message.time - COPY_HORIZON_NS:
             counts.pop(recent.popleft()[1], None)
-        key = copy_key(each.record)
+        key = copy_key(message.record)
         by_recording = counts.setdefault(key, {})
         before = max(by_recording.values(), default=0)
-        recording = each.bag.recording
+        recording = message.bag.recording
         by_recording[recording] = by_recording.get(recording, 0) + 1
         if by_recording[recording] > before:
-            recent.append((each.time, key))
-            yield each
+            recent.append((message.time, key))
+            yield message
 
 
 def deduplicate_backward(
-    found: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
+    messages: Iterable[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
 ) -> Iterator[StoredMessage]:
     """Yields a descending stream without the duplicates that `deduplicate_forward` leaves out.
 
@@ -112,25 +112,27 @@ def deduplicate_backward(
     for longer than the horizon, other ones may be left out.
     """
 
-    def slice_of(each: StoredMessage) -> int | None:
-        return each.time // COPY_HORIZON_NS if lies_inside(spans, each.time) else None
+    def slice_of(message: StoredMessage) -> int | None:
+        return message.time // COPY_HORIZON_NS if lies_inside(spans, message.time) else None
 
     newer: list[StoredMessage] = []
-    for number, some in groupby(found, key=slice_of):
+    for number, slice_messages in groupby(messages, key=slice_of):
         if number is None:
-            yield from _kept(newer, [], spans)
+            yield from _without_copies(newer, [], spans)
             newer = []
-            yield from some
+            yield from slice_messages
         else:
-            older = [*some]
-            yield from _kept(newer, older, spans)
+            older = [*slice_messages]
+            yield from _without_copies(newer, older, spans)
             newer = older
-    yield from _kept(newer, [], spans)
+    yield from _without_copies(newer, [], spans)
 
 
-def _kept(
-    own: Sequence[StoredMessage], older: Sequence[StoredMessage], spans: Sequence[tuple[Ns, Ns]]
+def _without_copies(
+    messages: Sequence[StoredMessage],
+    older: Sequence[StoredMessage],
+    spans: Sequence[tuple[Ns, Ns]],
 ) -> Iterator[StoredMessage]:
     """Returns which messages of a slice count, given those of the one before it; newest first."""
-    kept = {id(each) for each in deduplicate_forward(reversed([*own, *older]), spans)}
-    return (each for each in own if id(each) in kept)
+    kept = {id(message) for message in deduplicate_forward(reversed([*messages, *older]), spans)}
+    return (message for message in messages if id(message) in kept)

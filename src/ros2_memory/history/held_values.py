@@ -104,7 +104,7 @@ class HeldValues:
         self._topic = topic
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
-        gaps = {gap[0] for gap in view.gaps(TimeWindow.everything())}
+        gaps = {start for start, _ in view.gaps(TimeWindow.everything())}
         self._gaps = sorted(gaps.union(_ends_of_clocks(view)))
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
@@ -112,11 +112,11 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            found = Held(self._word(message, newest.type), 0, 0, ended=True).exact
-            if isinstance(found, list | dict | None):
-                of = "" if field is None else f"field {field} of "
+            value = Held(self._json_at(message, newest.type), 0, 0, ended=True).exact
+            if isinstance(value, list | dict | None):
+                of_field = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(
-                    f"{asked}: {of}{topic} ({newest.type}) is no text, number or "
+                    f"{asked}: {of_field}{topic} ({newest.type}) is no text, number or "
                     "boolean, which holds until the next one: ask about a topic that has one, such "
                     "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
                 )
@@ -130,10 +130,11 @@ class HeldValues:
         self.reached = until
         later = self._runs(TimeWindow(until, MAX_NS), newest_first=False)
         after = next(later, None)
-        for run in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
-            if after is not None and self._goes_on(run, after):
-                run = run._replace(last=after.last)  # noqa: PLW2901 - it goes on after `until`
-                after = next(later, None)
+        for before in self._runs(TimeWindow(MIN_NS, until), newest_first=True):
+            run = before
+            if after is not None and self._goes_on(before, after):
+                # It goes on after `until`.
+                run, after = before._replace(last=after.last), next(later, None)
             stop, ended = self._end_of(run, after)
             self.reached = run.first
             yield Held(run.word, run.first, stop, ended)
@@ -165,9 +166,9 @@ class HeldValues:
             QueryTimeoutError: the time for reading is over.
         """
         for run in self._runs(TimeWindow(moment, MAX_NS), newest_first=False):
-            found = Held(run.word, run.first, run.last, ended=False)
-            if not found.is_blank:
-                return found
+            held = Held(run.word, run.first, run.last, ended=False)
+            if not held.is_blank:
+                return held
         return None
 
     def _runs(self, window: TimeWindow, *, newest_first: bool) -> Iterator[_Run]:
@@ -177,11 +178,11 @@ class HeldValues:
             self._view, self._topic, window, newest_first=newest_first, reached=self._check
         )
         for together in blocks(scanned, newest_first=newest_first):
-            parts = [of_columns(self._view, rows, self._said) for rows in together]
+            parts = [of_columns(self._view, rows, self._texts_of) for rows in together]
             if any(part is None for part in parts):
-                runs = self._read(together, window, newest_first=newest_first)
+                runs = self._runs_of_messages(together, window, newest_first=newest_first)
             else:
-                joined = self._joined([one for part in parts for one in part or ()])
+                joined = self._runs_of_columns([column for part in parts for column in part or ()])
                 runs = reversed(joined) if newest_first else iter(joined)
             for run in runs:
                 older, newer = (run, waiting) if newest_first else (waiting, run)
@@ -198,13 +199,13 @@ class HeldValues:
         if self._reading.expired():
             raise QueryTimeoutError("out of time")
 
-    def _joined(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
+    def _runs_of_columns(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
         """Returns the runs of rows that overlap in time, in order."""
-        times = np.concatenate([part[0] for part in parts])
+        times = np.concatenate([part_times for part_times, _ in parts])
         if not times.size:
             return []
         order = np.argsort(times, kind="stable")
-        texts = joined_texts([part[1] for part in parts]).rows(order)
+        texts = joined_texts([part_texts for _, part_texts in parts]).rows(order)
         times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
         breaks |= np.diff(np.searchsorted(self._gaps, times)) > 0
@@ -219,27 +220,27 @@ class HeldValues:
             )
         ]
 
-    def _said(self, rows: Rows) -> tuple[IntArray, Texts] | None:
+    def _texts_of(self, rows: Rows) -> tuple[IntArray, Texts] | None:
         """Returns the log times of some rows, and what each says; None where columns lack it."""
         texts = words_of(rows.table, self._field, self._view.extractor)
         if texts is None:
             return None
         return rows.times, texts if rows.index is None else texts.rows(rows.index)
 
-    def _read(
+    def _runs_of_messages(
         self, together: Sequence[Rows], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[_Run]:
         """Yields a run for each message of the times of some rows, one of which may be large."""
         first, last = min(rows.first for rows in together), max(rows.last for rows in together)
         part = window.intersect(TimeWindow(first, last + 1))
-        for found in self._view.stream.messages([self._topic], part, newest_first=newest_first):
-            self._check(found.time)
-            message = self._view.bags.decode(found)
+        for stored in self._view.stream.messages([self._topic], part, newest_first=newest_first):
+            self._check(stored.time)
+            message = self._view.bags.decode(stored)
             if message is not None:
-                word = self._word(message, found.type)
-                yield _Run(word, found.time, found.time)
+                word = self._json_at(message, stored.type)
+                yield _Run(word, stored.time, stored.time)
 
-    def _word(self, message: object, type_name: str) -> str:
+    def _json_at(self, message: object, type_name: str) -> str:
         extractor = self._view.extractor
         if self._field is None:
             return json.dumps(_as_said(extractor.exact(message, type_name)))

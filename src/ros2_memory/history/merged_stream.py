@@ -51,15 +51,12 @@ class MergedStream:
 
         Each with the times of its first and last message of those that reach into the window.
         """
-        found: dict[str, BagSpan] = {}
+        spans: dict[str, BagSpan] = {}
         for topic in topics:
             for bag, first, last in self._timeline.extents(topic, window):
-                known = found.get(bag.file)
-                span = (
-                    (first, last) if known is None else (min(first, known[0]), max(last, known[1]))
-                )
-                found[bag.file] = BagSpan(*span, bag)
-        return sorted(found.values(), key=_in_order)
+                known = spans.get(bag.file, BagSpan(first, last, bag))
+                spans[bag.file] = BagSpan(min(first, known.first), max(last, known.last), bag)
+        return sorted(spans.values(), key=_span_order)
 
     def messages(
         self,
@@ -76,9 +73,9 @@ class MergedStream:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        parts = self._parts(topics, window) if among is None else [window]
+        parts = self._segment_windows(topics, window) if among is None else [window]
         return chain.from_iterable(
-            self._part(topics, part, among, newest_first=newest_first)
+            self._messages_in(topics, part, among, newest_first=newest_first)
             for part in (reversed(parts) if newest_first else parts)
         )
 
@@ -97,20 +94,20 @@ class MergedStream:
         """Returns the newest message of the topic in the window."""
         return self.first([topic], window, newest_first=True)
 
-    def _parts(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
+    def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""
         segments = self._timeline.segments
-        begin = bisect_right(segments, window.start, key=_begins)
-        end = bisect_left(segments, window.stop, begin, key=_begins)
+        begin = bisect_right(segments, window.start, key=_start_of)
+        end = bisect_left(segments, window.stop, begin, key=_start_of)
         cuts = [
-            _begins(each)
-            for each in segments[begin:end]
-            if any(topic in each.spans for topic in topics)
+            _start_of(segment)
+            for segment in segments[begin:end]
+            if any(topic in segment.spans for topic in topics)
         ]
         edges = [window.start, *dict.fromkeys(cuts), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
 
-    def _part(
+    def _messages_in(
         self,
         topics: Sequence[str],
         window: TimeWindow,
@@ -121,18 +118,18 @@ class MergedStream:
         wider = _with_horizon(window)
         bags = self.overlapping_bags(topics, wider) if among is None else among
         spans = bag_overlaps(bags)
-        found: Iterator[StoredMessage]
+        messages: Iterator[StoredMessage]
         if spans:
             merged = self.merged(bags, topics, wider, newest_first=newest_first, since=window.start)
             once = (deduplicate_backward if newest_first else deduplicate_forward)(merged, spans)
-            found = (each for each in once if window.contains(each.time))
+            messages = (message for message in once if window.contains(message.time))
         else:
-            found = self.merged(bags, topics, window, newest_first=newest_first)
+            messages = self.merged(bags, topics, window, newest_first=newest_first)
         if self.may_be_relatched(topics):
-            found = (each for each in found if not self._is_relatched(each))
-        if all(each.bag.state is BagState.CLOSED for each in bags):
-            return found
-        return self.bags.track_sources(found)
+            messages = (message for message in messages if not self._is_relatched(message))
+        if all(span.bag.state is BagState.CLOSED for span in bags):
+            return messages
+        return self.bags.track_sources(messages)
 
     def may_be_relatched(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
@@ -141,22 +138,23 @@ class MergedStream:
             for topic in topics
         )
 
-    def find_first_copy(self, found: StoredMessage) -> None:
+    def find_first_copy(self, stored: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
-        topic, window = found.topic, _since_published(found)
-        if found.record.may_be_relatched and self.may_be_relatched([topic]):
+        topic, window = stored.topic, _since_published(stored)
+        if stored.record.may_be_relatched and self.may_be_relatched([topic]):
             bags = self.overlapping_bags([topic], window)
             copies = self.merged(bags, [topic], window, newest_first=False)
-            key = copy_key(found.record)
-            next((each for each in copies if copy_key(each.record) == key), None)
+            key = copy_key(stored.record)
+            next((copy for copy in copies if copy_key(copy.record) == key), None)
 
-    def _is_relatched(self, found: StoredMessage) -> bool:
-        record = found.record
+    def _is_relatched(self, stored: StoredMessage) -> bool:
+        record = stored.record
         if not record.may_be_relatched:
             return False
-        self._find_first_copies(found)
-        first = self._first_copies.get(copy_key(record), (found.time, found.bag.recording))
-        return found.time > first[0] and found.bag.recording != first[1]
+        self._find_first_copies(stored)
+        own = stored.time, stored.bag.recording
+        first_time, first_recording = self._first_copies.get(copy_key(record), own)
+        return stored.time > first_time and stored.bag.recording != first_recording
 
     def _find_first_copies(self, late: StoredMessage) -> None:
         """Records the first reception of every message that a late one may repeat.
@@ -173,8 +171,8 @@ class MergedStream:
         for start, stop in missing:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
-            for each in self.merged(bags, [topic], part, newest_first=False, since=window.start):
-                key, first = copy_key(each.record), (each.time, each.bag.recording)
+            for message in self.merged(bags, [topic], part, newest_first=False, since=window.start):
+                key, first = copy_key(message.record), (message.time, message.bag.recording)
                 self._first_copies[key] = min(first, self._first_copies.get(key, first))
         self._searched[topic] = united([*searched, *missing])
 
@@ -202,7 +200,7 @@ class MergedStream:
         waiting = deque(
             sorted(
                 (-span.last if newest_first else span.first, sign * rank, span.bag)
-                for rank, span in enumerate(sorted(bags, key=_by_recording))
+                for rank, span in enumerate(sorted(bags, key=_recording_order))
             )
         )
         heap: list[tuple[int, int, StoredMessage, Iterator[StoredMessage]]] = []
@@ -211,16 +209,16 @@ class MergedStream:
                 _, rank, bag = waiting.popleft()
                 source = read(bag)
             else:
-                _, rank, found, source = heapq.heappop(heap)
-                yield found
+                _, rank, stored, source = heapq.heappop(heap)
+                yield stored
             following = next(source, None)
             if following is not None:
                 heapq.heappush(heap, (sign * following.time, rank, following, source))
 
 
-def _since_published(found: StoredMessage) -> TimeWindow:
+def _since_published(stored: StoredMessage) -> TimeWindow:
     """Returns the window in which a late message may have been received before."""
-    return _with_horizon(TimeWindow(found.record.publish_time, found.time + 1))
+    return _with_horizon(TimeWindow(stored.record.publish_time, stored.time + 1))
 
 
 def _with_horizon(window: TimeWindow) -> TimeWindow:
@@ -228,17 +226,17 @@ def _with_horizon(window: TimeWindow) -> TimeWindow:
     return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
 
 
-def _begins(segment: Segment) -> Ns:
+def _start_of(segment: Segment) -> Ns:
     """Returns the log time of a segment's first message; segments are in this order."""
     return segment.bags[0].start
 
 
-def _in_order(span: BagSpan) -> tuple[Ns, Ns, str]:
+def _span_order(span: BagSpan) -> tuple[Ns, Ns, str]:
     return span.first, span.last, span.bag.file
 
 
-def _by_recording(span: BagSpan) -> tuple[str, Ns, Ns, str]:
-    return str(span.bag.recording), *_in_order(span)
+def _recording_order(span: BagSpan) -> tuple[str, Ns, Ns, str]:
+    return str(span.bag.recording), *_span_order(span)
 
 
 def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:

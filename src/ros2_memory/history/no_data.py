@@ -88,16 +88,16 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     is_recorded = configured in view.timeline.topics()
     if configured != _DEFAULT_POSES or is_recorded:
         return None
-    found = topics_of_robot(view, what)
-    if not found and degrees:
-        found = topics_of_robot(view, "geodetic")
-    return found[0] if len(found) == 1 else None
+    topics = topics_of_robot(view, what)
+    if not topics and degrees:
+        topics = topics_of_robot(view, "geodetic")
+    return topics[0] if len(topics) == 1 else None
 
 
 def topics_of_robot(view: View, what: str) -> list[str]:
     """Returns the names of `topics_with`, without goals and points that somebody clicked."""
-    names = dict.fromkeys(each.partition(" ")[0] for each in topics_with(view, what))
-    return [each for each in names if not _OF_OTHERS.search(each)]
+    names = dict.fromkeys(named.partition(" ")[0] for named in topics_with(view, what))
+    return [topic for topic in names if not _OF_OTHERS.search(topic)]
 
 
 def has_poses(view: View) -> bool:
@@ -198,7 +198,7 @@ def topics_that_show_poses(view: View) -> list[str]:
     unmapped = [
         topic
         for topic in timeline.topics()
-        if not any(extractor.is_mapped(each) for each in timeline.types_of(topic))
+        if not any(extractor.is_mapped(type_name) for type_name in timeline.types_of(topic))
     ]
     shown = []
     for topic in unmapped[:MOST_TRIED]:
@@ -226,7 +226,9 @@ def topics_with(view: View, what: str) -> list[str]:
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
     kinds_of, types = view.extractor.kinds_of, view.timeline.types
-    carriers = {each for each in set(chain(*types.values())) if what in kinds_of(each)}
+    carriers = {
+        type_name for type_name in set(chain(*types.values())) if what in kinds_of(type_name)
+    }
     return [
         f"{topic} ({type_name})"
         for topic, names in types.items()
@@ -381,8 +383,8 @@ def _within_recording(
     pace = view.timeline.pace(older.topic, older.bag.recording).topic
     period = (pace.last - pace.first) // max(pace.messages - 1, 1)
     if newer.time - older.time <= 2 * period:
-        every = f"the topic has a message every {seconds(period)}"
-        return NoDataReason.BETWEEN_MESSAGES, [every]
+        pace_text = f"the topic has a message every {seconds(period)}"
+        return NoDataReason.BETWEEN_MESSAGES, [pace_text]
     return NoDataReason.GAP, []
 
 
@@ -457,9 +459,9 @@ def _neighbours(
     )
 
 
-def _of_this_time(found: StoredMessage | None, at: Ns) -> StoredMessage | None:
+def _of_this_time(stored: StoredMessage | None, at: Ns) -> StoredMessage | None:
     """Returns a message that is not of another time altogether, as of another robot's bag."""
-    return found if found is not None and abs(found.time - at) <= LONGEST_OFF_NS else None
+    return stored if stored is not None and abs(stored.time - at) <= LONGEST_OFF_NS else None
 
 
 def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:
@@ -497,12 +499,14 @@ def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
 
     def carried(topic: str) -> set[str]:
         return {
-            kind for each in view.timeline.types_of(topic) for kind in view.extractor.kinds_of(each)
+            kind
+            for type_name in view.timeline.types_of(topic)
+            for kind in view.extractor.kinds_of(type_name)
         }
 
     wanted = {kind for topic in topics for kind in carried(topic)}
-    some = [topic for topic in sorted(held) if carried(topic) & wanted]
-    return [topic for topic in some if carried(topic) >= wanted] or some
+    similar = [topic for topic in sorted(held) if carried(topic) & wanted]
+    return [topic for topic in similar if carried(topic) >= wanted] or similar
 
 
 def between(view: View, window: TimeWindow) -> NoDataReason:
@@ -542,21 +546,21 @@ def undecodable(error: UndecodableError) -> NoDataError:
     )
 
 
-def decode(view: View, found: StoredMessage) -> object:
+def decode(view: View, stored: StoredMessage) -> object:
     """Returns the decoded message.
 
     Raises:
         NoDataError: it cannot be decoded.
     """
     try:
-        return view.memory.reader.decode(found.record)
+        return view.memory.reader.decode(stored.record)
     except UndecodableError as error:
         raise undecodable(error) from error
 
 
-def describe_lack(view: View, what: str, found: StoredMessage) -> str:
+def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
-    channel = found.record.channel
+    channel = stored.record.channel
     has = f"carries no {what}"
     if "geodetic" in view.extractor.kinds_of(channel.type):
         has = f"carries latitude and longitude in degrees, and no {what} in metres"

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
 
-from ros2_memory.analysis.poses import Frames, Poses, joined_poses
+from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.columns.fragments import Sized
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.robots import Beside
+    from ros2_memory.history.robots import ParallelRecordings
     from ros2_memory.history.view import View
 
 
@@ -104,9 +104,9 @@ def pose_rows(
         yield reader.block(together)
 
 
-def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
+def poses_of(samples: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
     """Returns poses with their log times, and the speed (m/s) that each message states, if any."""
-    rows = [*found]
+    rows = [*samples]
     unknown = (math.nan,) * 4
     turns = [unknown if pose.orientation is None else pose.orientation for _, pose, _ in rows]
     places = np.array([pose.position for _, pose, _ in rows], np.float64).reshape(-1, 3)
@@ -115,7 +115,7 @@ def poses_of(found: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
         np.array([time for time, *_ in rows], np.int64),
         rounded(places, METRES),
         np.array(turns, np.float64).reshape(-1, 4),
-        Frames(frames.codes, frames.words),
+        FrameCodes(frames.codes, frames.words),
         np.array([math.nan if speed is None else speed for *_, speed in rows], np.float64),
     )
 
@@ -143,7 +143,10 @@ class PoseReader:
     """
 
     def __init__(
-        self, view: View, failures: list[UndecodableError], beside: Sequence[Beside] = ()
+        self,
+        view: View,
+        failures: list[UndecodableError],
+        beside: Sequence[ParallelRecordings] = (),
     ) -> None:
         self._view = view
         self._failures = failures
@@ -152,39 +155,42 @@ class PoseReader:
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the poses of rows that overlap in time, in the order of `blocks`."""
-        span = min(each.first for each in rows), max(each.last for each in rows)
-        known = [each.part for each in rows]
-        numbers = tuple(part for part in known if part is not None)
-        is_whole = len(numbers) == len(known) and not any(map(self._left_out, rows))
+        span = (
+            min(table_rows.first for table_rows in rows),
+            max(table_rows.last for table_rows in rows),
+        )
+        part_numbers = [table_rows.part for table_rows in rows]
+        numbers = tuple(part for part in part_numbers if part is not None)
+        is_whole = len(numbers) == len(part_numbers) and not any(map(self._held_by_others, rows))
         parts = numbers if is_whole else None
         return PoseRows(span, partial(self._joined, rows), parts)
 
     def trouble(self) -> Hashable:
-        """Returns what differs from before where something could not be read since."""
+        """Returns how many failures and notes there are: more once something could not be read."""
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        counting = [self._counting(each) for each in rows]
-        return joined_poses([self.poses(each) for each in counting if len(each)])
+        counting = [self._without_others(table_rows) for table_rows in rows]
+        return joined_poses([self.poses(table_rows) for table_rows in counting if len(table_rows)])
 
-    def _counting(self, rows: Rows) -> Rows:
+    def _without_others(self, rows: Rows) -> Rows:
         """Returns the rows that others do not have the time of."""
-        for beside in self._left_out(rows):
+        for beside in self._held_by_others(rows):
             out = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
             if beside.bags:
-                own = [where for bag, where in rows.bag_rows() if bag.file in beside.bags]
-                of = np.zeros(len(rows), np.bool_)
-                of[np.concatenate([np.empty(0, np.int64), *own])] = True
-                out &= of
+                positions = [where for bag, where in rows.bag_rows() if bag.file in beside.bags]
+                is_of_bags = np.zeros(len(rows), np.bool_)
+                is_of_bags[np.concatenate([np.empty(0, np.int64), *positions])] = True
+                out &= is_of_bags
             rows = rows.some(np.flatnonzero(~out))
         return rows
 
-    def _left_out(self, rows: Rows) -> list[Beside]:
-        """Returns what has the time of some of these rows first."""
+    def _held_by_others(self, rows: Rows) -> list[ParallelRecordings]:
+        """Returns the pairs by which another recording holds the time of these rows first."""
         return [
-            each
-            for each in self._beside
-            if each.other == rows.recording and each.span.overlaps(rows.first, rows.last)
+            beside
+            for beside in self._beside
+            if beside.other == rows.recording and beside.span.overlaps(rows.first, rows.last)
         ]
 
     def poses(self, rows: Rows) -> Poses:
@@ -194,27 +200,33 @@ class PoseReader:
             InvalidArgumentsError: messages carry no position.
         """
         try:
-            found = of_columns(
-                self._view, rows, lambda each: self._columns.of(each.table, each.times, each.index)
+            poses = of_columns(
+                self._view,
+                rows,
+                lambda table_rows: self._columns.of(
+                    table_rows.table, table_rows.times, table_rows.index
+                ),
             )
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
-        return poses_of(self._decoded(rows)) if found is None else joined_poses(found)
+        return poses_of(self._decoded(rows)) if poses is None else joined_poses(poses)
 
     def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
         extractor = self._view.extractor
         samples: list[tuple[Ns, Pose, float | None]] = []
-        for found in messages_of(self._view, rows):
-            type_name = found.type
-            message = self._view.bags.decode(found, self._failures)
+        for stored in messages_of(self._view, rows):
+            type_name = stored.type
+            message = self._view.bags.decode(stored, self._failures)
             if message is None:
                 continue
             pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
             if pose is None:
-                raise InvalidArgumentsError(describe_lack(self._view, "position", found))
-            samples.append((found.time, pose, None if twist is None else math.hypot(*twist.linear)))
+                raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
+            samples.append(
+                (stored.time, pose, None if twist is None else math.hypot(*twist.linear))
+            )
         # Those of a part come bag after bag, in the order in which bags were stored.
         yield from sorted(samples, key=lambda sample: sample[0])

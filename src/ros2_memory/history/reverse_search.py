@@ -9,7 +9,7 @@ from __future__ import annotations
 import heapq
 import re
 from itertools import chain, islice
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -114,7 +114,7 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     """
     word = value.strip() if isinstance(value, str) else ""
     timeline = view.timeline
-    topic = next((each for each in timeline.topics() if type_name in timeline.types_of(each)), None)
+    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
     if not _CONSTANT_NAME.fullmatch(word) or topic is None:
         return value
     try:
@@ -122,11 +122,11 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     except BagError:
         return value
     is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
-    for each in channels:
-        text = each.schema.text.decode("utf-8", "replace")
-        if each.type == type_name and is_number.search(text):
-            found = {number for name, number in _CONSTANT.findall(text) if name == word}
-            return int(found.pop()) if len(found) == 1 else value
+    for channel in channels:
+        text = channel.schema.text.decode("utf-8", "replace")
+        if channel.type == type_name and is_number.search(text):
+            numbers = {number for name, number in _CONSTANT.findall(text) if name == word}
+            return int(numbers.pop()) if len(numbers) == 1 else value
     return value
 
 
@@ -142,8 +142,10 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    frames = [(topic, _frames_of(view, topic)) for topic in topics[:_MOST_FRAMES]]
-    named = [f"{', '.join(each)} ({topic})" for topic, each in frames if each]
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    named = [
+        f"{', '.join(topic_frames)} ({topic})" for topic, topic_frames in frames if topic_frames
+    ]
     if not named:
         return ()
     within = f"within {condition.test.tolerance_m:g} m"
@@ -160,9 +162,9 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
-    frames = {each for topic in topics[:_MOST_FRAMES] for each in _frames_of(view, topic)}
+    frames = {frame for topic in topics[:_MOST_FRAMES] for frame in _frames_of_newest(view, topic)}
     try:
-        return any(each != target and connects(view, (target, each)) for each in sorted(frames))
+        return any(frame != target and connects(view, (target, frame)) for frame in sorted(frames))
     except QueryTimeoutError:
         return True
 
@@ -176,29 +178,29 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     test = condition.test
     asked = test.frame_id if isinstance(test, NearPosition) else None
     for topic in topics[:_MOST_FRAMES] if asked else ():
-        frames = _frames_of(view, topic)
-        if frames and (asked or "").lstrip("/") not in {each.lstrip("/") for each in frames}:
+        frames = _frames_of_newest(view, topic)
+        if frames and (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
                 f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
             )
 
 
-def _frames_of(view: View, topic: str) -> list[str]:
+def _frames_of_newest(view: View, topic: str) -> list[str]:
     """Returns the frames of the positions in a topic's newest message; none where not known."""
     try:
-        found = view.stream.newest(topic, TimeWindow.everything())
+        stored = view.stream.newest(topic, TimeWindow.everything())
     except QueryTimeoutError:
         return []
-    message = None if found is None else view.bags.decode(found)
-    if found is None or message is None:
+    message = None if stored is None else view.bags.decode(stored)
+    if stored is None or message is None:
         return []
-    extractor, type_name = view.extractor, found.type
-    own = extractor.frame(message)
-    seen = detections_of(extractor.exact(message, type_name), own)
-    frames = {each.frame_id for each in seen if each.place is not None}
+    extractor, type_name = view.extractor, stored.type
+    own_frame = extractor.frame(message)
+    seen = detections_of(extractor.exact(message, type_name), own_frame)
+    frames = {detection.frame_id for detection in seen if detection.place is not None}
     pose = extractor.pose(message, type_name)
-    return sorted(filter(None, frames or {own if pose is None else pose.frame_id}))
+    return sorted(filter(None, frames or {own_frame if pose is None else pose.frame_id}))
 
 
 def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
@@ -207,11 +209,11 @@ def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
     Only the one whose name is the field's and the word, where there is one.
     """
     wanted = "_".join(word.upper().split())
-    found = _CONSTANT.findall(schema.text.decode("utf-8", "replace")) if wanted else []
+    constants = _CONSTANT.findall(schema.text.decode("utf-8", "replace")) if wanted else []
     whole = {wanted, f"{field.upper()}_{wanted}"}
-    same = [(name, value) for name, value in found if name in whole]
-    some = same or [(name, value) for name, value in found if wanted in name]
-    return [f"{name} = {value}" for name, value in dict.fromkeys(some)]
+    same = [(name, value) for name, value in constants if name in whole]
+    shown = same or [(name, value) for name, value in constants if wanted in name]
+    return [f"{name} = {value}" for name, value in dict.fromkeys(shown)]
 
 
 def out_of_time(view: View, searched_to: Ns) -> QueryTimeoutError:
@@ -252,21 +254,36 @@ class RowCondition:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        found, channel = self._test.truth(rows.table), rows.table.channel
+        truth, channel = self._test.truth(rows.table), rows.table.channel
         index = np.arange(len(rows.table)) if rows.index is None else rows.index
-        left = np.flatnonzero(found.unsure[index])
+        left = np.flatnonzero(truth.unsure[index])
         is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
         if not is_stored or left.size <= MOST_UNSURE or channel.type in self._left_to_messages:
-            return found
-        surely, perhaps = found.surely.copy(), found.perhaps.copy()
+            return truth
+        surely, perhaps = truth.surely.copy(), truth.perhaps.copy()
         for positions, decoded in decoded_rows(self._view, rows.some(left)):
             of_bag = index[left[positions]]
-            known, at = self._test.truth(decoded.table), decoded.index
-            surely[of_bag], perhaps[of_bag] = known.surely[at], known.perhaps[at]
+            decoded_truth, at = self._test.truth(decoded.table), decoded.index
+            surely[of_bag], perhaps[of_bag] = decoded_truth.surely[at], decoded_truth.perhaps[at]
             if (perhaps & ~surely)[of_bag].mean() > _MOST_LEFT:
                 self._left_to_messages.add(channel.type)
                 break
         return TruthValues(surely, perhaps)
+
+
+class _Candidate(NamedTuple):
+    """A message that may match: its log time (ns) and its topic."""
+
+    time: Ns
+    topic: str
+
+
+class _TableCandidates(NamedTuple):
+    """A table's last log time (ns), its topic, and when messages of it may match."""
+
+    last: Ns
+    topic: str
+    times: list[Ns]
 
 
 class CandidateRows:
@@ -283,7 +300,7 @@ class CandidateRows:
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
         self._ready: list[tuple[Ns, str]] = []
-        self._group: list[tuple[Ns, str]] = []
+        self._group: list[_Candidate] = []
         self._view = view
         self._until = until
         self._test = RowCondition(view, condition)
@@ -296,12 +313,12 @@ class CandidateRows:
         most = 1
         for time, topic in chain(self._times(), [(MIN_NS - 1, "")]):
             group = self._group
-            if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
-                window = TimeWindow(group[-1][0], group[0][0] + 1)
-                yield window, sorted({each for _, each in group})
+            if group and (group[-1].time - time > _TOGETHER_NS or len(group) >= most):
+                window = TimeWindow(group[-1].time, group[0].time + 1)
+                yield window, sorted({candidate.topic for candidate in group})
                 # The first that may match mostly does; where many do not, more are read at once.
                 most, self._group = min(2 * most, _MOST_TOGETHER), []
-            self._group.append((time, topic))
+            self._group.append(_Candidate(time, topic))
 
     @property
     def reached(self) -> Ns:
@@ -311,20 +328,20 @@ class CandidateRows:
 
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
-        ready, before = self._ready, (MAX_NS, "")
-        tables = heapq.merge(*map(self._of_topic, self._left), key=lambda table: -table[0])
-        for last, topic, times in chain(tables, [(MIN_NS - 1, "", list[Ns]())]):
+        ready, newer = self._ready, (MAX_NS, "")
+        tables = heapq.merge(*map(self._tables_of, self._left), key=lambda table: -table.last)
+        for table in chain(tables, [_TableCandidates(MIN_NS - 1, "", [])]):
             # What is left is no newer than the next table.
-            while ready and -ready[0][0] > last:
-                found = heapq.heappop(ready)
-                if found != before:
-                    yield -found[0], found[1]
-                before = found
-            for time in times:
-                heapq.heappush(ready, (-time, topic))
+            while ready and -ready[0][0] > table.last:
+                negative, topic = heapq.heappop(ready)
+                if (negative, topic) != newer:
+                    yield -negative, topic
+                newer = negative, topic
+            for time in table.times:
+                heapq.heappush(ready, (-time, table.topic))
 
-    def _of_topic(self, topic: str) -> Iterator[tuple[Ns, str, list[Ns]]]:
-        """Yields for each table of a topic its last log time, and when messages may match."""
+    def _tables_of(self, topic: str) -> Iterator[_TableCandidates]:
+        """Yields when messages of a topic may match, table by table, the newest first."""
 
         def reached(last: Ns) -> None:
             self._left[topic] = min(last + 1, self._until)
@@ -339,24 +356,24 @@ class CandidateRows:
             may_be_empty=True,
             reached=reached,
         ):
-            found = self._candidates(rows)
+            times = self._candidates(rows)
             reached(rows.last)
-            yield rows.last, topic, found.tolist()
+            yield _TableCandidates(rows.last, topic, times.tolist())
         self._left[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:
-        found = self._test.may_match(parts)
+        may_match = self._test.may_match(parts)
         self.has_looked = True
-        self.ruled_out |= not np.all(found)
-        return found
+        self.ruled_out |= not np.all(may_match)
+        return may_match
 
     def _candidates(self, rows: Rows) -> IntArray:
         self.has_looked = True
-        found = self._test.truth(rows)
-        if found.is_none:
+        truth = self._test.truth(rows)
+        if truth.is_none:
             self.ruled_out = True
             return np.empty(0, np.int64)
-        may = found.perhaps
+        may = truth.perhaps
         if rows.index is not None:
             may = may[rows.index]
         self.ruled_out |= not may.all()
@@ -398,22 +415,22 @@ class ReverseSearch:
         try:
             for window, topics in candidates.windows():
                 messages = self._view.stream.messages(topics, window, newest_first=True)
-                for found in filter(self.matches, messages):
+                for stored in filter(self.matches, messages):
                     self._view.notes.retract_outside(
-                        TimeWindow(found.time, MAX_NS), keep=noted_before
+                        TimeWindow(stored.time, MAX_NS), keep=noted_before
                     )
-                    self._view.stream.find_first_copy(found)
+                    self._view.stream.find_first_copy(stored)
                     self.note_undecodable()
-                    return found
+                    return stored
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
         everything = TimeWindow(MIN_NS, until)
-        self.close(everything, found=False, ruled_out=candidates.ruled_out)
+        self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
         return None
 
-    def close(self, window: TimeWindow, *, found: bool, ruled_out: bool) -> None:
+    def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
 
         `ruled_out`: whether something in it was known to be no match, without being read.
@@ -422,13 +439,13 @@ class ReverseSearch:
             InvalidArgumentsError: nothing was found, and no value of the topics can be a match.
             NoDataError: nothing was found, since no message could be decoded.
         """
-        if not found and self._failures and not self._has_decoded and not ruled_out:
+        if not is_found and self._failures and not self._has_decoded and not ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
                 self.note_undecodable()
             raise with_notes(self._view, window, undecodable(failure))
         self.note_undecodable()
-        if not found:
+        if not is_found:
             self.require_testable()
 
     def require_testable(self) -> None:
@@ -449,40 +466,38 @@ class ReverseSearch:
 
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
-        found = self._view.stream.newest(topic, TimeWindow.everything())
-        value = None if found is None else self._view.value(found)
-        field = self.condition.field
-        if found is None or value is None:
+        newest = self._view.stream.newest(topic, TimeWindow.everything())
+        value = None if newest is None else self._view.value(newest)
+        if newest is None or value is None:
             return None
-        if field is not None and is_unknown_below(value, field):
+        field, test = self.condition.field or "", self.condition.test
+        if field and is_unknown_below(value, field):
             # An empty list does not show what its elements have.
-            older = self._view.stream.messages(
-                [topic], TimeWindow(MIN_NS, found.time), newest_first=True
-            )
+            window = TimeWindow(MIN_NS, newest.time)
+            older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            value = next((each for each in values if not is_unknown_below(each, field)), value)
-        schema = found.record.channel.schema
+            shows_field = (older for older in values if not is_unknown_below(older, field))
+            value = next(shows_field, value)
         refusal = refusal_for(self.condition, value)
-        test = self.condition.test
         if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
             return refusal
-        field = (self.condition.field or "").rpartition(".")[2]
-        constants = _constants_named(schema, field, str(test.value))
+        _, _, name = field.rpartition(".")
+        constants = _constants_named(newest.record.channel.schema, name, str(test.value))
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
-    def matches(self, found: StoredMessage) -> bool | None:
+    def matches(self, stored: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
-        channel, memory = found.record.channel, self._view.memory
+        channel, memory = stored.record.channel, self._view.memory
         with self._view.call.stages.timed("extract"):
             try:
-                message = memory.reader.decode(found.record)
+                message = memory.reader.decode(stored.record)
                 value = memory.extractor.exact(message, channel.type)
                 self._has_decoded = True
                 return self.condition.matches(value)
             except UndecodableError as error:
                 # A copy: the raised error keeps its traceback alive, and the message with it.
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
-                self._failures.setdefault((channel.topic, channel.type), (alone, found.time))
+                self._failures.setdefault((channel.topic, channel.type), (alone, stored.time))
                 return None
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:

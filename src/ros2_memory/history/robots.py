@@ -84,14 +84,14 @@ class Contradiction(NamedTuple):
     @property
     def names(self) -> tuple[str, str]:
         """The names of the two recordings."""
-        one, other = self.recordings
-        return Overlapping(Path(one), Path(other), 0, 0).names
+        first, other = self.recordings
+        return Overlapping(Path(first), Path(other), 0, 0).names
 
     def __str__(self) -> str:
         """Returns a sentence, without a full stop."""
-        one, other = self.names
+        first, other = self.names
         return (
-            f"the frame {self.frame} is in {self.parents[0]} in the recording {one}, and in "
+            f"the frame {self.frame} is in {self.parents[0]} in the recording {first}, and in "
             f"{self.parents[1]} in {other}, as of two robots"
         )
 
@@ -103,17 +103,17 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     recordings ran, show no second robot. A few messages are read once of each of the first pairs.
     """
     view = View(memory, call)  # notes on what is read here are of no answer
-    found: list[Mixed] = []
+    mixed: list[Mixed] = []
     pairs = overlapping_recordings(view.snapshot, memory.index.joined_with)
     bags, steps = recordings_of(view.snapshot) if pairs else {}, _steps_back(view)
     for pair in pairs:
         by_clock = pair.end - pair.start <= max(steps[pair.first], steps[pair.second])
-        is_compared = not by_clock and len(found) < _MAX_PAIRS
+        is_compared = not by_clock and len(mixed) < _MAX_PAIRS
         try:
-            found.append(Mixed(pair, _differing_topic(view, pair, bags) if is_compared else None))
+            mixed.append(Mixed(pair, _differing_topic(view, pair, bags) if is_compared else None))
         except QueryTimeoutError:
             break
-    return tuple(found)
+    return tuple(mixed)
 
 
 def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
@@ -123,23 +123,25 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     alone: they are of one robot.
     """
     view = View(memory, call)
-    known = memory.memo.of(_PARENTS, dict)
+    parents_by_path = memory.memo.of(_PARENTS, dict)
     trees: dict[str, Mapping[str, str]] = {}
-    for path, bags in _of_different_makers(view):
+    for path, bags in _recordings_to_compare(view):
         try:
-            parents = known[path] if path in known else _static_parents(view, bags)
+            parents = (
+                parents_by_path[path] if path in parents_by_path else _static_parents(view, bags)
+            )
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
-            known[path] = parents
+            parents_by_path[path] = parents
         trees[path] = parents
-    found: dict[str, Contradiction] = {}
-    for (one, parents), (other, others) in combinations(trees.items(), 2):
+    contradictions: dict[str, Contradiction] = {}
+    for (first_path, parents), (other, others) in combinations(trees.items(), 2):
         for frame in sorted(parents.keys() & others.keys()):
             if parents[frame] != others[frame]:
                 both = (parents[frame], others[frame])
-                found.setdefault(frame, Contradiction((one, other), frame, both))
-    return tuple(found.values())
+                contradictions.setdefault(frame, Contradiction((first_path, other), frame, both))
+    return tuple(contradictions.values())
 
 
 def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
@@ -147,16 +149,21 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
-    now, known = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
-    if not known or abs(now - known[0][0]) > _RECENT_NS:
-        known[:] = [(now, tuple(_described(memory, call)))]
-    return known[0][1]
+    now, described = memory.clock.now(), memory.memo.of(_DESCRIBED, list)
+    for described_at, sentences in described:
+        if abs(now - described_at) <= _RECENT_NS:
+            return sentences
+    sentences = tuple(_mixed_sentences(memory, call))
+    described[:] = [(now, sentences)]
+    return sentences
 
 
-def _described(memory: Memory, call: Call) -> Iterator[str]:
-    mixed = [each for each in mixed_recordings(memory, call) if each.topic is not None]
+def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
+    mixed = [
+        recordings for recordings in mixed_recordings(memory, call) if recordings.topic is not None
+    ]
     if mixed:
-        names = sorted({name for each in mixed for name in each.pair.names})
+        names = sorted({name for recordings in mixed for name in recordings.pair.names})
         first = mixed[0]
         yield (
             f"robots are mixed: {listed(names)} overlap in time (from "
@@ -173,15 +180,15 @@ def _differing_topic(
     view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
 ) -> str | None:
     both = TimeWindow(pair.start, pair.end + 1)
-    one, other = (
+    first_bags, other_bags = (
         [bag for bag in recordings.get(str(path), ()) if both.overlaps(bag.start, bag.end)]
         for path in (pair.first, pair.second)
     )
-    shared = _topics_of(one) & _topics_of(other) - view.timeline.transient_local
-    limits = view.limits
-    first = [each for each in (view.pose_topic, *limits.tf_topics) if each in shared]
-    for topic in islice([*first, *sorted(shared.difference(first))], _MAX_COMPARED):
-        if _differ_in(view, topic, (_spans(one, topic), _spans(other, topic)), both):
+    shared = _topics_of(first_bags) & _topics_of(other_bags) - view.timeline.transient_local
+    of_robot = [topic for topic in (view.pose_topic, *view.limits.tf_topics) if topic in shared]
+    for topic in islice([*of_robot, *sorted(shared.difference(of_robot))], _MAX_COMPARED):
+        spans = _bag_spans(first_bags, topic), _bag_spans(other_bags, topic)
+        if _bags_differ(view, topic, spans, both):
             return topic
     return None
 
@@ -190,25 +197,26 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
     return {topic for bag in bags for topic in bag.summary.schema.positions}
 
 
-def _spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
+def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
     return [bag_span_of(bag, (topic,)) for bag in bags if topic in bag.summary.schema.positions]
 
 
-def _of_different_makers(view: View) -> list[tuple[str, Sequence[BagFile]]]:
+def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     """Returns the newest recordings with static transforms, of this program's one in a folder."""
     topics = view.limits.tf_static_topics
     root = f"{view.bag_dir}/"
-    newest: dict[str, tuple[str, Sequence[BagFile]]] = {}
+    bags_of: dict[str, Sequence[BagFile]] = {}
+    newest: dict[str, str] = {}
     for path, bags in recordings_of(view.snapshot).items():
         folder, _, name = path.rpartition("/")
         holding = [bag for bag in bags if any(map(bag.summary.schema.positions.get, topics))]
         if holding and not is_kept_apart(path.removeprefix(root)):
-            key = folder if has_own_name(name) else path
-            before = newest.get(key)
-            if before is None or before[1][0].start < holding[0].start:
-                newest[key] = (path, holding)
-    ordered = sorted(newest.values(), key=lambda each: each[1][0].start)
-    return ordered[-_MAX_TREES:] if len(ordered) > 1 else []
+            bags_of[path] = holding
+            maker = folder if has_own_name(name) else path
+            if maker not in newest or bags_of[newest[maker]][0].start < holding[0].start:
+                newest[maker] = path
+    ordered = sorted(newest.values(), key=lambda path: bags_of[path][0].start)
+    return [(path, bags_of[path]) for path in ordered[-_MAX_TREES:]] if len(ordered) > 1 else []
 
 
 def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
@@ -216,17 +224,17 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     parents: dict[str, str] = {}
     window = TimeWindow.everything()
     for topic in view.limits.tf_static_topics:
-        spans = _spans(bags, topic)
+        spans = _bag_spans(bags, topic)
         merged = view.stream.merged(spans, [topic], window, newest_first=False) if spans else ()
-        for each in islice(merged, _MAX_STATIC):
-            message = view.bags.decode(each)
+        for stored in islice(merged, _MAX_STATIC):
+            message = view.bags.decode(stored)
             if message is not None:
-                edges = view.extractor.transforms(message, each.time, static=True)
+                edges = view.extractor.transforms(message, stored.time, static=True)
                 parents.update({edge.child: edge.parent for edge in edges})
     return parents
 
 
-class Beside(NamedTuple):
+class ParallelRecordings(NamedTuple):
     """Two recordings with messages of their own on a topic at the same time.
 
     Or one, with itself, in which the clock was set back.
@@ -257,11 +265,11 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     Raises:
         NoDataError: recordings hold messages of their own on the topic at the same time.
     """
-    found = recordings_beside(view, topic, window)
-    names = _names([each for each in found if not each.by_clock])
+    beside = parallel_recordings(view, topic, window)
+    names = _recording_names([pair for pair in beside if not pair.by_clock])
     # Transforms are of all recordings at once, so a path by them is not that of one there.
     if topic in view.limits.tf_topics:
-        names = _names(found)
+        names = _recording_names(beside)
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
@@ -269,17 +277,17 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
             "a time with one of them, or set data.recording to one",
         )
-    for each in [*found, *_beside_themselves(view, window)]:
+    for pair in [*beside, *_times_recorded_twice(view, window)]:
         name, start, stop = (
-            each.first.name,
-            unix_text(each.span.start),
-            unix_text(each.span.stop - 1),
+            pair.first.name,
+            unix_text(pair.span.start),
+            unix_text(pair.span.stop - 1),
         )
         view.notes.add(
             f"{name} has the time from {start} to {stop} twice, as the clock was set back "
             "meanwhile: the path there is that from before"
-            if each.first == each.other
-            else f"{name} and {each.other.name} have different messages on {topic} from {start} to "
+            if pair.first == pair.other
+            else f"{name} and {pair.other.name} have different messages on {topic} from {start} to "
             f"{stop}, as after a clock was set back, or from two robots: the path there is that of "
             f"{name}"
         )
@@ -290,26 +298,26 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
 
     Returns these times, without those that a clock made which was set back.
     """
-    found = recordings_beside(view, topic, window)
-    names = _names(found)
+    beside = parallel_recordings(view, topic, window)
+    names = _recording_names(beside)
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
             f"from several robots, and the answer does not separate them: {listed(names)}"
         )
-    return united((each.span.start, each.span.stop) for each in found if not each.by_clock)
+    return united((pair.span.start, pair.span.stop) for pair in beside if not pair.by_clock)
 
 
-def _names(found: Sequence[Beside]) -> list[str]:
-    return sorted({path.name for each in found for path in (each.first, each.other)})
+def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:
+    return sorted({path.name for pair in beside for path in (pair.first, pair.other)})
 
 
-def beside_path(view: View, topic: str, window: TimeWindow) -> list[Beside]:
+def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     """Returns all that would make a path by a topic go to and fro between two times of a robot."""
-    return [*recordings_beside(view, topic, window), *_beside_themselves(view, window)]
+    return [*parallel_recordings(view, topic, window), *_times_recorded_twice(view, window)]
 
 
-def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
+def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     """Returns the recordings that hold messages of their own on a topic at the same time.
 
     None for latched topics, which each recording receives again, or where the time for the answer
@@ -317,61 +325,67 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     """
     if topic in view.timeline.transient_local:
         return []
-    found: list[Beside] = []
+    differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
     try:
-        for each in _overlapping_pairs(view, topic, window):
-            pair = each.first, each.other
+        for beside in _overlapping_pairs(view, topic, window):
+            pair = beside.first, beside.other
             # Of several robots in a folder there may be thousands of pairs.
-            is_known = not each.by_clock and apart.issuperset(pair)
-            if not is_known and _differ(view, topic, pair, each.span.intersect(window)):
-                found.append(each)
-                apart.update(() if each.by_clock else pair)
+            is_known = not beside.by_clock and apart.issuperset(pair)
+            if not is_known and _differ(view, topic, pair, beside.span.intersect(window)):
+                differing.append(beside)
+                apart.update(() if beside.by_clock else pair)
     except (QueryTimeoutError, NotInLakeError):
         return []
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_outside(keep=noted_before)
-    return found
+    return differing
 
 
 def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spans:
-    """Does as `note_robots` for the first few of some topics."""
-    every = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
-    return united(chain.from_iterable(every))
+    """Notes, for the first topics, the recordings that hold messages of their own at one time.
+
+    Returns these times; see `note_robots`.
+    """
+    spans_by_topic = [note_robots(view, topic, window) for topic in topics[:_MAX_TOPICS]]
+    return united(chain.from_iterable(spans_by_topic))
 
 
-def note_robots_near(view: View, found: StoredMessage) -> None:
-    """Does as `note_robots`, around the time of a message; a single recording is of one robot."""
-    topic = found.topic
+def note_robots_near(view: View, stored: StoredMessage) -> None:
+    """Notes recordings with messages of their own around the time of a message.
+
+    A single recording is of one robot; see `note_robots`.
+    """
+    topic = stored.topic
     if len(view.timeline.recordings(topic)) > 1:
-        near = TimeWindow.around(found.time, _NEAR_NS)
+        near = TimeWindow.around(stored.time, _NEAR_NS)
         if any(_overlapping_pairs(view, topic, near)):
-            note_robots(view, topic, TimeWindow.around(found.time, _SLOW_NS))
+            note_robots(view, topic, TimeWindow.around(stored.time, _SLOW_NS))
 
 
-def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[Beside]:
+def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
-    spans = [(*span, path) for path, span in recordings.items()]
-    for first, last, path in sorted(each for each in spans if window.overlaps(each[0], each[1])):
-        open_spans = [each for each in open_spans if each[1] >= first]
+    spans = [(*span, path) for path, span in recordings.items() if window.overlaps(*span)]
+    for first, last, path in sorted(spans):
+        open_spans = [(since, until, other) for since, until, other in open_spans if until >= first]
         for since, until, other in open_spans:
             span = TimeWindow(first, min(last, until) + 1)
             if window.overlaps(span.start, span.stop - 1):
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
-                yield Beside(other, path, span, is_edge or is_step)
+                yield ParallelRecordings(other, path, span, is_edge or is_step)
         open_spans.append((first, last, path))
 
 
-def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
+def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields recordings in which the clock was set back, with the bags from after that."""
     for fault in view.snapshot.dating.faults:
         after = split_of(fault.bag.file)
@@ -379,14 +393,19 @@ def _beside_themselves(view: View, window: TimeWindow) -> Iterator[Beside]:
             continue
         series, number = after
         twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        splits = [(split_of(bag.file), bag) for bag in view.timeline.overlapping(twice)]
-        own = [(split[1], bag) for split, bag in splits if split is not None and split[0] == series]
-        begin = min((bag.start for nth, bag in own if nth < number), default=twice.stop)
-        span = TimeWindow(min(max(begin, twice.start), twice.stop), twice.stop)
-        bags = frozenset(bag.file for nth, bag in own if nth >= number)
+        begins, bags = [twice.stop], set[str]()
+        for bag in view.timeline.overlapping(twice):
+            bag_series, bag_number = split_of(bag.file) or (None, 0)
+            if bag_series == series and bag_number < number:
+                begins.append(bag.start)
+            elif bag_series == series:
+                bags.add(bag.file)
+        span = TimeWindow(max(min(begins), twice.start), twice.stop)
         if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
             recording = fault.bag.recording
-            yield Beside(recording, recording, span, by_clock=True, bags=bags)
+            yield ParallelRecordings(
+                recording, recording, span, by_clock=True, bags=frozenset(bags)
+            )
 
 
 def _steps_back(view: View) -> Mapping[Path, Ns]:
@@ -400,17 +419,17 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
     """Whether two recordings hold messages in a window, and the other none of the one's."""
-    known, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
-    if key in known:
-        return known[key]
+    differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
+    if key in differing:
+        return differing[key]
     if sessions_of(view).are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
         return False
     wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)
-    one, other = ([each for each in bags if each.bag.recording == path] for path in pair)
-    differ = _differ_in(view, topic, (one, other), both)
+    first_spans, other = ([span for span in bags if span.bag.recording == path] for path in pair)
+    differ = _bags_differ(view, topic, (first_spans, other), both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
-        known[key] = differ
+        differing[key] = differ
     return differ
 
 
@@ -422,24 +441,24 @@ def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
     return any(window.overlaps(*span) for span in spans)
 
 
-def _differ_in(
+def _bags_differ(
     view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
 ) -> bool:
-    """Does as `_differ`, for the bags of each."""
-    one, other = bags
-    if next(_messages(view, topic, other, both), None) is None:
+    """Whether two lists of bags hold messages in a window, and the second none of the first's."""
+    first_spans, other = bags
+    if next(_merged_messages(view, topic, other, both), None) is None:
         return False
-    some = list(islice(_messages(view, topic, one, both), _TRIED))
-    for found in some:
-        near = TimeWindow.around(found.time, COPY_HORIZON_NS)
-        key = copy_key(found.record)
-        if any(copy_key(each.record) == key for each in _messages(view, topic, other, near)):
+    tried = list(islice(_merged_messages(view, topic, first_spans, both), _TRIED))
+    for stored in tried:
+        near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
+        key = copy_key(stored.record)
+        if any(copy_key(copy.record) == key for copy in _merged_messages(view, topic, other, near)):
             return False
-    return bool(some)
+    return bool(tried)
 
 
-def _messages(
+def _merged_messages(
     view: View, topic: str, bags: Sequence[BagSpan], window: TimeWindow
 ) -> Iterator[StoredMessage]:
-    inside = [each for each in bags if window.overlaps(each.first, each.last)]
+    inside = [span for span in bags if window.overlaps(span.first, span.last)]
     return view.stream.merged(inside, [topic], window, newest_first=False)

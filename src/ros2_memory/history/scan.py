@@ -108,7 +108,7 @@ def joined_back(
     beside: Ns = 0,
     trouble: Callable[[], Hashable] = lambda: None,
 ) -> Iterator[tuple[Ns, T]]:
-    """Yields what follows from the rows of a scan, the newest first, each with a time.
+    """Yields what `make` returns of the rows of a scan, the newest first, each with a time.
 
     Nothing of it is earlier than that (log time, ns). What follows from whole parts alone is joined
     by stretches of the clock, and remembered.
@@ -123,7 +123,7 @@ def joined_back(
         beside: how far before and after a stretch (ns) rows are part of it, too.
         trouble: differs from before where something could not be read since.
     """
-    known = view.memory.columns.fragments(joining(kind))
+    fragments = view.memory.columns.fragments(joining(kind))
     for stretch in opened.stretches(beside):
         view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
         key = key_of(stretch)
@@ -131,21 +131,21 @@ def joined_back(
             yield from make(stretch._replace(parts=None))
             continue
         view.bags.check_deadline()
-        joined = known.get(key)
+        joined = fragments.get(key)
         if joined is None:
             before = trouble(), view.notes.added
-            made: list[tuple[Ns, T]] = []
+            results: list[tuple[Ns, T]] = []
             try:
-                made.extend(make(stretch))
+                results.extend(make(stretch))
             except QueryTimeoutError:
                 # What there was time for is an answer, too, with a note.
-                yield from made
+                yield from results
                 raise
-            joined = Joined(kind.join([one for _, one in made[::-1]]) if made else [])
+            joined = Joined(kind.join([result for _, result in results[::-1]]) if results else [])
             if before == (trouble(), view.notes.added):
-                known.put(key, joined)
-        for one in reversed(joined.fragments):
-            yield stretch.window.start, one
+                fragments.put(key, joined)
+        for result in reversed(joined.fragments):
+            yield stretch.window.start, result
 
 
 def remembered(
@@ -157,19 +157,19 @@ def remembered(
     *,
     also_before: Ns = 0,
 ) -> T:
-    """Returns what follows from whole parts: what is known of it, else made now.
+    """Returns what is stored under a key, else what `make` returns.
 
     That is remembered unless something could not be read; see `joined_back`. A key of None stands
     for what may still change. `also_before`: see `Fragments.get`.
     """
-    known = view.memory.columns.fragments(kind)
-    found = None if key is None else known.get(key, also_before)
-    if found is None:
+    fragments = view.memory.columns.fragments(kind)
+    fragment = None if key is None else fragments.get(key, also_before)
+    if fragment is None:
         before = trouble(), view.notes.added
-        found = make()
+        fragment = make()
         if key is not None and before == (trouble(), view.notes.added):
-            known.put(key, found)
-    return found
+            fragments.put(key, fragment)
+    return fragment
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
@@ -180,9 +180,9 @@ def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows
     together: list[Rows] = []
     for rows in scanned:
         is_apart = together and (
-            rows.last < min(each.first for each in together)
+            rows.last < min(other.first for other in together)
             if newest_first
-            else rows.first > max(each.last for each in together)
+            else rows.first > max(other.last for other in together)
         )
         if is_apart:
             yield _in_order(together)
@@ -216,19 +216,19 @@ def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list
 
     A topic beyond its share has few in the store. None where only the messages have it.
     """
-    found = read(rows)
+    values = read(rows)
     # Without any column ("") a stored table is for its type, which its bag does not change; one of
     # a bag may be so for the size of all its messages together.
     left_out, is_stored = rows.table.left_out, isinstance(rows.table, StoredTable)
-    if found is not None or not left_out or ("" in left_out) == is_stored:
-        return None if found is None else [found]
-    known, left = list[V](), len(rows)
+    if values is not None or not left_out or ("" in left_out) == is_stored:
+        return None if values is None else [values]
+    by_bag, left = list[V](), len(rows)
     for positions, decoded in decoded_rows(view, rows):
-        found, left = read(decoded), left - positions.size
-        if found is None:
+        values, left = read(decoded), left - positions.size
+        if values is None:
             return None
-        known.append(found)
-    return known if known and not left else None
+        by_bag.append(values)
+    return by_bag if by_bag and not left else None
 
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
@@ -239,8 +239,8 @@ def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
         counting = {*zip(wanted.tolist(), ranks[positions].tolist(), strict=True)}
         met = Counter[Ns]()
-        for found in view.bags.read(bag, [channel.topic], window):
-            if found.type == channel.type:
-                if (found.time, met[found.time]) in counting:
-                    yield found
-                met[found.time] += 1
+        for stored in view.bags.read(bag, [channel.topic], window):
+            if stored.type == channel.type:
+                if (stored.time, met[stored.time]) in counting:
+                    yield stored
+                met[stored.time] += 1

@@ -38,7 +38,7 @@ _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
 
 
-class _Recorded(NamedTuple):
+class _TransformSpans(NamedTuple):
     """What sessions follow from: folders, with the log times of their first and last messages.
 
     Attributes:
@@ -52,7 +52,7 @@ class _Recorded(NamedTuple):
     joined: Mapping[str, Session]
 
 
-_RECORDED: Final[Key[_Recorded]] = Key()
+_RECORDED: Final[Key[_TransformSpans]] = Key()
 """Of a timeline: sidecars are read for it."""
 _RECORDINGS: Final[Key[dict[tuple[str, ...], dict[str, dict[Path, tuple[Ns, Ns]]]]]] = Key()
 """Of a timeline: by topics, then by where they were recorded, the recordings that hold them."""
@@ -82,7 +82,7 @@ class Sessions:
         self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._recorded = view.timeline.memo.of(_RECORDED, self._find_recorded)
+        self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
         self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
         self.statics: dict[Session, Sequence[StampedTransform]] = {}
         self.linked = view.timeline.memo.of(_LINKED, set)
@@ -105,32 +105,31 @@ class Sessions:
         if topics not in self._recordings:
             self._recordings[topics] = self._recordings_with(topics)
         by_folder = self._recordings[topics]
-        every = (by_folder.get(folder, {}) for folder in sorted(session))
-        return {path: span for found in every for path, span in found.items()}
+        held = (by_folder.get(folder, {}) for folder in sorted(session))
+        return {path: span for recordings in held for path, span in recordings.items()}
 
     def _recordings_with(self, topics: Iterable[str]) -> dict[str, dict[Path, tuple[Ns, Ns]]]:
         """Returns the recordings that hold some topics, by where they were recorded."""
-        found: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
+        by_folder: dict[str, dict[Path, tuple[Ns, Ns]]] = {}
         for topic in topics:
             for path, span in self._view.timeline.recordings(topic).items():
-                there = found.setdefault(self.folder(path), {})
-                first, last = there.get(path, span)
-                there[path] = min(first, span[0]), max(last, span[1])
-        return found
+                there = by_folder.setdefault(self.folder(path), {})
+                there[path] = enclosing((span, there.get(path, span)))
+        return by_folder
 
-    def has(self, session: Session, found: StoredMessage) -> bool:
+    def has(self, session: Session, stored: StoredMessage) -> bool:
         """Whether a message is of a session; a carried one that names no recording is of each."""
-        folder = self.folder(found.bag.recording)
+        folder = self.folder(stored.bag.recording)
         if folder != self._carried:
             return folder in session
-        origin = origin_of(found.record.channel)
+        origin = origin_of(stored.record.channel)
         if origin is None or session == {self._carried}:
             return True
-        return any(f"{self._root}/{each}" in session for each in origin.recordings)
+        return any(f"{self._root}/{name}" in session for name in origin.recordings)
 
     def has_all_kinds(self, session: Session) -> bool:
         """Whether a session holds moving and static transforms: then it borrows none."""
-        return len(self._kinds(session)) == len(self._recorded.kinds)
+        return len(self._kinds(session)) == len(self._spans.kinds)
 
     def holds_carried(self, recording: Path) -> bool:
         """Whether a recording is of carried messages."""
@@ -142,14 +141,14 @@ class Sessions:
 
     def of(self, recording: Path) -> Session:
         """Returns the session of a recording."""
-        return self._of(self.folder(recording))
+        return self._session_of(self.folder(recording))
 
-    def are_joined(self, one: Path, other: Path) -> bool:
+    def are_joined(self, first: Path, other: Path) -> bool:
         """Whether two recordings are of one session."""
-        if self.of(one) == self.of(other):
+        if self.of(first) == self.of(other):
             return True
         joined_with = self._view.memory.index.joined_with
-        return other.name in joined_with(one) or one.name in joined_with(other)
+        return other.name in joined_with(first) or first.name in joined_with(other)
 
     def lending_to(self, recording: Path, at: Ns) -> Session:
         """Returns the session whose transforms hold for a message of a recording.
@@ -157,9 +156,10 @@ class Sessions:
         That is more than the recording's own session where another one lends; empty where none has
         any.
         """
-        key = (self.folder(recording), at // _AROUND_NS)
+        folder = self.folder(recording)
+        key = (folder, at // _AROUND_NS)
         if key not in self._lending:
-            self._lending[key] = self._completed(self._of(key[0]), at)
+            self._lending[key] = self._with_lender(self._session_of(folder), at)
         return self._lending[key]
 
     def recorded_at(self, moment: Ns) -> list[Session] | None:
@@ -167,14 +167,16 @@ class Sessions:
         around = self._around(moment)
         if not around:
             return None
-        with_transforms = (each for each in around if self._kinds(each))
-        return [*dict.fromkeys(self._completed(each, moment) for each in with_transforms)]
+        with_transforms = (session for session in around if self._kinds(session))
+        return [*dict.fromkeys(self._with_lender(session, moment) for session in with_transforms)]
 
     def names(self, session: Session, at: Ns) -> str:
         """Returns the names of a session's recordings at a moment; of all if none went on."""
         recordings = sorted(session - {self._carried})
-        around = [each for each in recordings if each in self._folders_around(at)] or recordings
-        return " and ".join(each.rpartition("/")[2] for each in around) or "deleted recordings"
+        around = [
+            folder for folder in recordings if folder in self._folders_around(at)
+        ] or recordings
+        return " and ".join(folder.rpartition("/")[2] for folder in around) or "deleted recordings"
 
     def parts_of(self, session: Session) -> tuple[Session, ...]:
         """Returns the two sessions that were joined by lending into this one; none if it is one."""
@@ -182,69 +184,70 @@ class Sessions:
 
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
-        spans = [span for by_folder in self._recorded.kinds for span in by_folder.items()]
-        near = sorted(spans, key=lambda each: (_distance(each[1], moment), each[0]))
-        return [*dict.fromkeys(self._of(folder) for folder, _ in near)]
+        near = sorted(
+            (_distance(span, moment), folder)
+            for by_folder in self._spans.kinds
+            for folder, span in by_folder.items()
+        )
+        return [*dict.fromkeys(self._session_of(folder) for _, folder in near)]
 
-    def _completed(self, own: Session, at: Ns) -> Session:
+    def _with_lender(self, session: Session, at: Ns) -> Session:
         """Returns a session with the one that lends to it; empty where it has no transforms."""
-        kinds = self._kinds(own)
-        if self.has_all_kinds(own) or self._are_two_robots(at):
-            return own if kinds else frozenset()
-        beside = [each for each in self._around(at) if each != own and self._kinds(each)]
+        kinds = self._kinds(session)
+        if self.has_all_kinds(session) or self._are_two_robots(at):
+            return session if kinds else frozenset()
+        beside = [other for other in self._around(at) if other != session and self._kinds(other)]
         if kinds:
-            partners = [each for each in beside if self._complement(own, each)]
+            partners = [other for other in beside if self._are_complementary(session, other)]
         else:
-            partners = [*dict.fromkeys(self._completed(each, at) for each in beside)]
+            partners = [*dict.fromkeys(self._with_lender(other, at) for other in beside)]
         if len(partners) == 1:
-            completed = own | partners[0]
-            self._parts[completed] = own, partners[0]
+            completed = session | partners[0]
+            self._parts[completed] = session, partners[0]
             return completed
-        return own if kinds else frozenset()
+        return session if kinds else frozenset()
 
     def _are_two_robots(self, at: Ns) -> bool:
         """Whether two sessions near a moment hold poses of the same time."""
-        near = [each for each in self._recorded.poses if _distance(each[1], at) <= _AROUND_NS]
+        poses = self._spans.poses
+        near = [(folder, span) for folder, span in poses if _distance(span, at) <= _AROUND_NS]
         return any(
-            max(first, begin) <= min(last, end) and self._of(one) != self._of(other)
-            for (one, (first, last)), (other, (begin, end)) in combinations(near, 2)
+            max(first, begin) <= min(last, end)
+            and self._session_of(first_folder) != self._session_of(other)
+            for (first_folder, (first, last)), (other, (begin, end)) in combinations(near, 2)
         )
 
-    def _complement(self, one: Session, other: Session) -> bool:
+    def _are_complementary(self, first: Session, other: Session) -> bool:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
-        if self._kinds(one) & self._kinds(other):
+        if self._kinds(first) & self._kinds(other):
             return False
-        frames_of_one, of_other = (self._children(self._view, each) for each in (one, other))
-        return not frames_of_one & of_other
+        return self._children(self._view, first).isdisjoint(self._children(self._view, other))
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
-        kinds = enumerate(self._recorded.kinds)
+        kinds = enumerate(self._spans.kinds)
         return frozenset(kind for kind, spans in kinds if session & spans.keys())
 
     def _around(self, moment: Ns) -> list[Session]:
         """Returns the sessions that were being recorded at a moment."""
-        return [*dict.fromkeys(map(self._of, sorted(self._folders_around(moment))))]
+        return [*dict.fromkeys(map(self._session_of, sorted(self._folders_around(moment))))]
 
     def _folders_around(self, moment: Ns) -> set[str]:
         """Returns the folders of the recordings that went on at a moment."""
         bags = self._view.timeline.overlapping(TimeWindow.around(moment, _AROUND_NS))
         return {self.folder(bag.recording) for bag in bags} - {self._carried}
 
-    def _of(self, folder: str) -> Session:
+    def _session_of(self, folder: str) -> Session:
         if folder == self._carried:
             return frozenset({folder})
-        return self._recorded.joined.get(folder) or frozenset({folder, self._carried})
+        return self._spans.joined.get(folder) or frozenset({folder, self._carried})
 
     def _spans_of(self, topics: Iterable[str]) -> dict[str, tuple[Ns, Ns]]:
         """Returns the log times of the first and the last message of some topics, by folder."""
-        ends = {
-            folder: zip(*held.values(), strict=True)
-            for folder, held in self._recordings_with(topics).items()
-        }
-        return {folder: (min(firsts), max(lasts)) for folder, (firsts, lasts) in ends.items()}
+        by_folder = self._recordings_with(topics)
+        return {folder: enclosing(spans.values()) for folder, spans in by_folder.items()}
 
-    def _find_recorded(self) -> _Recorded:
+    def _find_spans(self) -> _TransformSpans:
         limits, pose_topic = self._view.limits, self._view.pose_topic
         topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
         recordings = map(self._view.timeline.recordings, topics)
@@ -254,18 +257,18 @@ class Sessions:
             for folder, path in (paths.items() if len(paths) > 1 else ())
             for name in self._view.memory.index.joined_with(path)
         )
-        return _Recorded(
+        return _TransformSpans(
             (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
             [*self._spans_of((pose_topic,)).items()],
-            {folder: frozenset(each | {self._carried}) for folder, each in chains.items()},
+            {folder: frozenset(linked | {self._carried}) for folder, linked in chains.items()},
         )
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     """Returns, by node of an undirected graph, all that are connected with it, itself included."""
     component: dict[str, set[str]] = {}
-    for one, other in pairs:
-        ends = [component.setdefault(node, {node}) for node in (one, other)]
+    for first, other in pairs:
+        ends = [component.setdefault(node, {node}) for node in (first, other)]
         small, large = sorted(ends, key=len)
         if small is not large:
             large |= small
@@ -273,6 +276,13 @@ def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:
     return component
 
 
+def enclosing(spans: Iterable[tuple[Ns, Ns]]) -> tuple[Ns, Ns]:
+    """Returns the earliest begin and the latest end of spans, of which there is one at least."""
+    firsts, lasts = zip(*spans, strict=True)
+    return min(firsts), max(lasts)
+
+
 def _distance(span: tuple[Ns, Ns], moment: Ns) -> Ns:
     """Returns how far a moment is from a span of time."""
-    return max(span[0] - moment, moment - span[1], 0)
+    first, last = span
+    return max(first - moment, moment - last, 0)

@@ -15,7 +15,7 @@ import numpy as np
 from ros2_memory.analysis.frames import (
     TF_CACHE_NS,
     Edges,
-    Frames,
+    FrameTree,
     TfClock,
     connected_with,
     edges_of,
@@ -69,7 +69,7 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
-from ros2_memory.history.sessions import Session, Sessions
+from ros2_memory.history.sessions import Session, Sessions, enclosing
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -134,38 +134,46 @@ def transform_at(
             or no transform brackets the moment on one of the edges between them.
     """
     limits = view.limits
-    if not _recorded(view, (*limits.tf_topics, *limits.tf_static_topics)):
+    if not _recorded_topics(view, (*limits.tf_topics, *limits.tf_static_topics)):
         raise not_recorded(view, limits.tf_topics[0] if limits.tf_topics else "/tf")
     frames, sessions = (parent, child), sessions_of(view)
     if recording is not None:
         session = lending_to(view, recording, frames, at)
-        return _transform_in(view, session, frames, at, explains=explains)
+        return _transform_of_session(view, session, frames, at, explains=explains)
     recorded = sessions.recorded_at(at)
     answers: list[tuple[Session, FoundTransform]] = []
     failures: list[NoDataError] = []
     for session in (sessions.nearest_to(at) if recorded is None else recorded) or [frozenset()]:
         try:
-            found = _transform_in(view, session, frames, at, explains=explains)
-            answers.append((session, found))
+            answer = _transform_of_session(view, session, frames, at, explains=explains)
+            answers.append((session, answer))
         except NoDataError as error:
             failures.append(error)
         if recorded is None and answers:
             break
     if not answers:
         raise failures[0]
-    session, found = answers[0]
-    if not all(alike(found.transform, each.transform) for _, each in answers):
+    _note_sessions(view, frames, at, answers)
+    _, answer = answers[0]
+    return answer
+
+
+def _note_sessions(
+    view: View, frames: tuple[str, str], at: Ns, answers: Sequence[tuple[Session, FoundTransform]]
+) -> None:
+    """Notes where sessions differ in a transform, of which the first counts, or are combined."""
+    sessions, (session, counting) = sessions_of(view), answers[0]
+    if not all(alike(counting.transform, answer.transform) for _, answer in answers):
         view.notes.add(
             f"{len(answers)} sessions recorded at that time have different transforms; "
             f"this is that of {sessions.names(session, at)}"
         )
     parts = sessions.parts_of(session)
-    if parts and not any(connected(view, frames, among=each) for each in parts):
+    if parts and not any(connects_in_time(view, frames, session=part) for part in parts):
         view.notes.add(
             f"transforms of {sessions.names(session, at)} are combined, as of one robot: they "
             "were recorded at the same time, but no handover proves that they are of one"
         )
-    return found
 
 
 def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> Session:
@@ -175,56 +183,58 @@ def lending_to(view: View, recording: Path, frames: tuple[str, str], at: Ns) -> 
     other, and those of the one other session that lends do.
     """
     sessions = sessions_of(view)
-    session, own = sessions.lending_to(recording, at), sessions.of(recording)
-    if not session or session == own:
+    session, own_session = sessions.lending_to(recording, at), sessions.of(recording)
+    if not session or session == own_session:
         return session
-    key = (session, own, frames)
+    key = (session, own_session, frames)
     if key not in sessions.chosen:
-        borrows = not connected(view, frames, among=own) and connected(view, frames, among=session)
-        sessions.chosen[key] = session if borrows else own
+        borrows = not connects_in_time(view, frames, session=own_session) and connects_in_time(
+            view, frames, session=session
+        )
+        sessions.chosen[key] = session if borrows else own_session
         if borrows:
-            lender = sessions.names(session - own, at)
-            view.notes.add(Note(_BORROWED, sessions.names(own, at), f"those of {lender}"))
+            lender = sessions.names(session - own_session, at)
+            view.notes.add(Note(_BORROWED, sessions.names(own_session, at), f"those of {lender}"))
     return sessions.chosen[key]
 
 
-def _transform_in(
-    view: View, among: Session, frames: tuple[str, str], at: Ns, *, explains: bool
+def _transform_of_session(
+    view: View, session: Session, frames: tuple[str, str], at: Ns, *, explains: bool
 ) -> FoundTransform:
-    """Does as `transform_at`, by the transforms of one session."""
+    """Returns the pose of a child in its parent by one session; raises as `transform_at`."""
     limits, (parent, child) = view.limits, frames
-    static = static_at(static_transforms(view, among), at)
+    static = static_at(static_transforms(view, session), at)
 
     def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
-        found = frames_of(view, static, moving, parent)
-        return FoundTransform(found.lookup(child, at), found.clock)
+        tree = frames_of(view, static, moving, parent)
+        return FoundTransform(tree.lookup(child, at), tree.clock)
 
     for half_width in _HALF_WIDTHS:
         window = TimeWindow.around(at, half_width)
-        moving = moving_in(view, window, among)
+        moving = moving_in(view, window, session)
         try:
             return look_up(moving)._replace(reach=half_width)
         except NoDataError as error:
             failure = error
     if limits.tf_clock == "stamp":
-        moving = list(_stamped_near(view, at, among))
+        moving = list(_stamped_near(view, at, session))
         try:
             return look_up(moving)
         except NoDataError as error:
             raise _stamp_failure(error, at, nothing_near=not moving) from error
     if not explains:
         raise failure
-    raise _explained(view, failure, frames, at, among, nothing_near=not moving) from failure
+    raise _explain_failure(view, failure, frames, at, session, nothing_near=not moving) from failure
 
 
-def moving_in(view: View, window: TimeWindow, among: Session) -> list[StampedTransform]:
+def moving_in(view: View, window: TimeWindow, session: Session) -> list[StampedTransform]:
     """Returns the moving transforms that a session received in a window, in log-time order."""
-    sessions, topics = sessions_of(view), _recorded(view, view.limits.tf_topics)
-    bags = _bags_of(view, topics, window, among)
+    sessions, topics = sessions_of(view), _recorded_topics(view, view.limits.tf_topics)
+    bags = _bags_of_session(view, topics, window, session)
     merged = view.stream.merged(bags, topics, window, newest_first=False)
     tracked = view.bags.track_sources(merged)
-    own = (found for found in tracked if sessions.has(among, found))
-    return [*decoded_transforms(view, own)]
+    of_session = (stored for stored in tracked if sessions.has(session, stored))
+    return [*decoded_transforms(view, of_session)]
 
 
 def frames_of(
@@ -232,13 +242,13 @@ def frames_of(
     static: Sequence[StampedTransform],
     moving: Iterable[StampedTransform],
     target: str,
-) -> Frames:
+) -> FrameTree:
     """Returns frames in a target frame by some transforms, of which none holds on."""
     clock = view.limits.tf_clock
-    return Frames(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
+    return FrameTree(static, edges_of(moving), target, clock, AT_OR_BEFORE_SLACK_NS)
 
 
-def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
+def static_transforms(view: View, session: Session) -> Sequence[StampedTransform]:
     """Returns the static transforms of a session, in log-time order.
 
     One that is equal to the one before of its child is left out: each split may have all again.
@@ -248,25 +258,26 @@ def static_transforms(view: View, among: Session) -> Sequence[StampedTransform]:
         QueryTimeoutError: the call's time is over.
     """
     sessions, timeline, scanner = sessions_of(view), view.timeline, view.memory.columns
-    known = sessions.statics.get(among)
-    if known is not None:
-        return known
-    topics = _recorded(view, view.limits.tf_static_topics)
-    key = (among, topics)
-    kept = scanner.caches.statics.get(key)
-    if kept is not None and kept[0] is timeline:
-        sessions.statics[among] = kept[1]
-        return kept[1]
+    if session in sessions.statics:
+        return sessions.statics[session]
+    topics = _recorded_topics(view, view.limits.tf_static_topics)
+    key = (session, topics)
+    cached_timeline, cached = scanner.caches.statics.get(key) or (None, ())
+    if cached_timeline is timeline:
+        sessions.statics[session] = cached
+        return cached
     if len(sessions.statics) == _FEW_SESSIONS:
         # Who has asked for so many asks for more.
         _find_all_statics(view, topics)
-        if among in sessions.statics:
-            return sessions.statics[among]
+        if session in sessions.statics:
+            return sessions.statics[session]
     before = view.notes.added
-    found = [each for topic in topics for each in _received(view, topic, among)]
-    found.sort(key=lambda one: one.log_time)
-    static = _changes(found)
-    sessions.statics[among] = static
+    received = [
+        transform for topic in topics for transform in _static_received(view, topic, session)
+    ]
+    received.sort(key=lambda transform: transform.log_time)
+    static = _without_repeats(received)
+    sessions.statics[session] = static
     # What was noted must be noted in each answer.
     if view.notes.added == before and not view.call.used_active:
         scanner.caches.statics.put(key, (timeline, static), 1000 + 600 * len(static))
@@ -280,20 +291,22 @@ def _find_all_statics(view: View, topics: Sequence[str]) -> None:
     recordings = [path for topic in topics for path in view.timeline.recordings(topic)]
     if coverage is None or any(map(sessions.holds_carried, recordings)):
         return
-    found: dict[Session, list[StampedTransform]] = {}
+    by_session: dict[Session, list[StampedTransform]] = {}
     for topic in topics:
-        for one in _statics_back(view, topic, TimeWindow.everything()):
-            found.setdefault(sessions.of(root / one.recording), []).extend(one.transforms)
+        for statics in _statics_back(view, topic, TimeWindow.everything()):
+            by_session.setdefault(sessions.of(root / statics.recording), []).extend(
+                statics.transforms
+            )
     for session in {sessions.of(bag.recording) for bag in coverage.missing}:
-        found.pop(session, None)
-    for session, received in found.items():
-        received.sort(key=lambda one: one.log_time)
-        sessions.statics[session] = _changes(received)
+        by_session.pop(session, None)
+    for session, received in by_session.items():
+        received.sort(key=lambda transform: transform.log_time)
+        sessions.statics[session] = _without_repeats(received)
 
 
 def make_statics(view: View, window: TimeWindow) -> None:
     """Makes the static transforms of the parts in a window."""
-    for topic in _recorded(view, view.limits.tf_static_topics):
+    for topic in _recorded_topics(view, view.limits.tf_static_topics):
         deque(_statics_back(view, topic, window), maxlen=0)
 
 
@@ -304,56 +317,61 @@ def _statics_back(view: View, topic: str, window: TimeWindow) -> Iterator[Static
     def make(stretch: Stretch) -> Iterator[tuple[Ns, Statics]]:
         for rows in opened.rows(newest_first=True, among=stretch.window):
             if stretch.window.contains(max(rows.first, window.start)):
-                yield rows.first, _changes_in(view, rows)
+                yield rows.first, _static_changes(view, rows)
 
     for _, statics in joined_back(view, opened, STATICS, make):
         yield statics
 
 
-def _received(view: View, topic: str, among: Session) -> Iterator[StampedTransform]:
+def _static_received(view: View, topic: str, session: Session) -> Iterator[StampedTransform]:
     """Yields the static transforms of a topic; of equal ones that follow in a part the first."""
     sessions = sessions_of(view)
-    for rows in scan(view, topic, _span_of(view, topic, among), copies=True):
+    for rows in scan(view, topic, _span_of_session(view, topic, session), copies=True):
         if sessions.holds_carried(rows.recording):
-            yield from decoded_transforms(view, _messages_in(view, rows, among))
-        elif sessions.folder(rows.recording) in among:
-            yield from _changes_in(view, rows).transforms
+            yield from decoded_transforms(view, _messages_in(view, rows, session))
+        elif sessions.folder(rows.recording) in session:
+            yield from _static_changes(view, rows).transforms
 
 
-def _span_of(view: View, topic: str, among: Session) -> TimeWindow:
+def _span_of_session(view: View, topic: str, session: Session) -> TimeWindow:
     """Returns when a session has a topic: mostly some hours of a week."""
-    spans = sessions_of(view).recordings_of(among, (topic,)).values()
-    first = min((first for first, _ in spans), default=0)
-    return TimeWindow(first, max((last + 1 for _, last in spans), default=first))
+    spans = sessions_of(view).recordings_of(session, (topic,)).values()
+    if not spans:
+        return TimeWindow(0, 0)
+    first, last = enclosing(spans)
+    return TimeWindow(first, last + 1)
 
 
-def _changes_in(view: View, rows: Rows) -> Statics:
+def _static_changes(view: View, rows: Rows) -> Statics:
     """Returns the static transforms in some rows that differ from those before, as received."""
 
     def make() -> Statics:
         times = static_times(rows.table, rows.times, rows.index)
-        some = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
+        new_rows = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
         received = sorted(
-            decoded_transforms(view, messages_of(view, some)), key=lambda one: one.log_time
+            decoded_transforms(view, messages_of(view, new_rows)),
+            key=lambda transform: transform.log_time,
         )
-        return Statics(relative(str(rows.recording), str(view.bag_dir)), tuple(_changes(received)))
+        return Statics(
+            relative(str(rows.recording), str(view.bag_dir)), tuple(_without_repeats(received))
+        )
 
     part = rows.part
     key = None if part is None else FragmentKey(rows.first, "", (part,))
     return remembered(view, STATICS, key, make)
 
 
-def _changes(static: Iterable[StampedTransform]) -> list[StampedTransform]:
+def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
     """Returns transforms in log-time order without those equal to the one before of their child."""
     latest: dict[str, StampedTransform] = {}
-    found: list[StampedTransform] = []
-    for each in static:
-        child = each.child.lstrip("/")
+    changes: list[StampedTransform] = []
+    for transform in static:
+        child = transform.child.lstrip("/")
         last = latest.get(child)
-        if last is None or (last.parent, last.transform) != (each.parent, each.transform):
-            latest[child] = each
-            found.append(each)
-    return found
+        if last is None or (last.parent, last.transform) != (transform.parent, transform.transform):
+            latest[child] = transform
+            changes.append(transform)
+    return changes
 
 
 def sessions_of(view: View) -> Sessions:
@@ -367,7 +385,7 @@ def _children_in(view: View, session: Session) -> set[str]:
     """Returns the child frames of all transforms of a session."""
     limits = view.limits
     topics = (*limits.tf_topics, *limits.tf_static_topics)
-    return {child for _, child in _pairs(view, topics, among=session)}
+    return {child for _, child in _all_pairs(view, topics, session=session)}
 
 
 def newest_in_session(
@@ -379,11 +397,11 @@ def newest_in_session(
     """
     newest = view.stream.newest(topic, window)
     sessions = sessions_of(view)
-    own = sessions.of(recording)
-    if not any(sessions.folder(each) in own for each in view.timeline.recordings(topic)):
+    own_session = sessions.of(recording)
+    if not any(sessions.folder(path) in own_session for path in view.timeline.recordings(topic)):
         return newest
-    bags = _bags_of(view, (topic,), window, own)
-    if newest is not None and newest.bag in {each.bag for each in bags}:
+    bags = _bags_of_session(view, (topic,), window, own_session)
+    if newest is not None and newest.bag in {span.bag for span in bags}:
         return newest
     return view.stream.first((topic,), window, newest_first=True, among=bags)
 
@@ -397,61 +415,65 @@ def edges(view: View) -> tuple[FrameEdge, ...]:
     limits, sessions = view.limits, sessions_of(view)
     if sessions.edges is not None:
         return sessions.edges
-    pairs = dict.fromkeys(_pairs(view, limits.tf_static_topics), True)
-    pairs |= dict.fromkeys(_pairs(view, limits.tf_topics), False)
-    named = [each for each in sorted(pairs.items()) if is_edge(each[0])]
+    pairs = dict.fromkeys(_all_pairs(view, limits.tf_static_topics), True)
+    pairs |= dict.fromkeys(_all_pairs(view, limits.tf_topics), False)
+    named = [(pair, is_static) for pair, is_static in sorted(pairs.items()) if is_edge(pair)]
     if len(named) < len(pairs):
         view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(named)}")
     sessions.edges = tuple(FrameEdge(*pair, is_static) for pair, is_static in named)
     return sessions.edges
 
 
-def _pairs(view: View, topics: Iterable[str], among: Session | None = None) -> set[Pair]:
-    """Returns the pairs of these topics; with `among` those that a session received."""
+def _all_pairs(view: View, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
+    """Returns the pairs of these topics; with a `session` those that it received."""
     everything = TimeWindow.everything()
-    every = (
+    pair_sets = (
         pairs
-        for topic in _recorded(view, topics)
-        for pairs in _pairs_in(view, topic, everything, among)
+        for topic in _recorded_topics(view, topics)
+        for pairs in _pairs_by_table(view, topic, everything, session)
     )
-    return set[Pair]().union(*every)
+    return set[Pair]().union(*pair_sets)
 
 
-def _pairs_in(
-    view: View, topic: str, window: TimeWindow, among: Session | None
+def _pairs_by_table(
+    view: View, topic: str, window: TimeWindow, session: Session | None
 ) -> Iterator[frozenset[Pair]]:
     """Yields the pairs of a topic in a window, table by table, those of the newest first."""
     scanner = view.memory.columns
-    if among is not None:
-        window = window.intersect(_span_of(view, topic, among))
+    if session is not None:
+        window = window.intersect(_span_of_session(view, topic, session))
     for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
-        if among is not None and sessions_of(view).holds_carried(rows.recording):
-            yield _pairs_of(view, _messages_in(view, rows, among))
-        elif among is None or sessions_of(view).folder(rows.recording) in among:
+        if session is not None and sessions_of(view).holds_carried(rows.recording):
+            yield _pairs_of_messages(view, _messages_in(view, rows, session))
+        elif session is None or sessions_of(view).folder(rows.recording) in session:
             part = rows.part
             pairs = None if part is None else scanner.caches.pairs.get(part)
             if pairs is None:
-                known = of_columns(view, rows, lambda each: pairs_in(each.table, each.index))
+                pair_sets = of_columns(
+                    view, rows, lambda part_rows: pairs_in(part_rows.table, part_rows.index)
+                )
                 pairs = (
-                    _pairs_of(view, messages_of(view, rows))
-                    if known is None
-                    else frozenset[Pair]().union(*known)
+                    _pairs_of_messages(view, messages_of(view, rows))
+                    if pair_sets is None
+                    else frozenset[Pair]().union(*pair_sets)
                 )
             if part is not None:
                 scanner.caches.pairs.put(part, pairs, 200 + 200 * len(pairs))
             yield pairs
 
 
-def _pairs_of(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
-    return frozenset((one.parent, one.child) for one in decoded_transforms(view, messages))
+def _pairs_of_messages(view: View, messages: Iterable[StoredMessage]) -> frozenset[Pair]:
+    return frozenset(
+        (transform.parent, transform.child) for transform in decoded_transforms(view, messages)
+    )
 
 
-def _explained(
+def _explain_failure(
     view: View,
     failure: NoDataError,
     frames: tuple[str, str],
     at: Ns,
-    among: Session,
+    session: Session,
     *,
     nothing_near: bool,
 ) -> NoDataError:
@@ -459,14 +481,16 @@ def _explained(
 
     A frame that is unknown near the moment, and known within `_LONGER_NS` of it, is a gap.
     """
-    topics = _recorded(view, view.limits.tf_topics)
+    topics = _recorded_topics(view, view.limits.tf_topics)
     near = TimeWindow.around(at, TF_CACHE_NS)
     if topics and nothing_near:
         return no_data_at(view, topics, at, None, around=TF_CACHE_NS)
     if failure.reason in _OF_ALL_TIMES:
         then = _near_failure(failure, at)
         unknown = failure.reason is NoDataReason.FRAME_UNKNOWN
-        if not unknown or not connected(view, frames, TimeWindow.around(at, _LONGER_NS), among):
+        if not unknown or not connects_in_time(
+            view, frames, TimeWindow.around(at, _LONGER_NS), session
+        ):
             return then
         advice = f"within {seconds(_LONGER_NS)} the two were connected: ask about then"
         return NoDataError(between(view, near), f"{then.detail}; {advice}")
@@ -480,18 +504,18 @@ def _explained(
     return NoDataError(between(view, near) if inside else beyond(view, at), failure.detail)
 
 
-def connected(
+def connects_in_time(
     view: View,
     frames: tuple[str, str],
     window: TimeWindow | None = None,
-    among: Session | None = None,
+    session: Session | None = None,
 ) -> bool:
     """Whether transforms recorded in a window, and static ones, lead from one frame to the other.
 
     False, too, where the time for the answer is over before that is known.
     """
     try:
-        return connects(view, frames, window, among)
+        return connects(view, frames, window, session)
     except QueryTimeoutError:
         return False
 
@@ -500,36 +524,36 @@ def connects(
     view: View,
     frames: tuple[str, str],
     window: TimeWindow | None = None,
-    among: Session | None = None,
+    session: Session | None = None,
 ) -> bool:
-    """Does as `connected`; looks at the newest transforms first, until they do.
+    """Whether transforms lead from one frame to the other; the newest are looked at first.
 
     Raises:
         QueryTimeoutError: the call's time is over before that is known.
     """
-    limits, known = view.limits, sessions_of(view).linked
-    if (frames, among) in known:
+    limits, linked = view.limits, sessions_of(view).linked
+    if (frames, session) in linked:
         return True
     pairs: set[Pair] = set()
     everything = TimeWindow.everything()
-    every = [
-        _pairs_in(view, topic, within or everything, among)
+    by_topic = [
+        _pairs_by_table(view, topic, within or everything, session)
         for topics, within in ((limits.tf_static_topics, None), (limits.tf_topics, window))
-        for topic in _recorded(view, topics)
+        for topic in _recorded_topics(view, topics)
     ]
     # Of all topics in turn: mostly the newest table of each is enough.
-    for found in zip_longest(*every, fillvalue=frozenset[Pair]()):
-        fresh = frozenset[Pair]().union(*found)
+    for newest_pairs in zip_longest(*by_topic, fillvalue=frozenset[Pair]()):
+        fresh = frozenset[Pair]().union(*newest_pairs)
         if not fresh <= pairs:
             pairs |= fresh
-            if _link(pairs, frames):
+            if _are_linked(pairs, frames):
                 if window is None:
-                    known.add((frames, among))
+                    linked.add((frames, session))
                 return True
     return False
 
 
-def _link(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
+def _are_linked(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
     """Whether pairs of a parent and a child lead from one frame to the other."""
     origin, target = (name.lstrip("/") for name in frames)
     linked = [(parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(is_edge, pairs)]
@@ -556,7 +580,7 @@ def _near_failure(failure: NoDataError, at: Ns) -> NoDataError:
     )
 
 
-def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransform]:
+def _stamped_near(view: View, at: Ns, session: Session) -> Iterator[StampedTransform]:
     """Yields the moving transforms stamped around a moment, wherever in log time they are."""
     sessions = sessions_of(view)
     earliest, latest = at - TF_CACHE_NS, at + TF_CACHE_NS
@@ -566,78 +590,82 @@ def _stamped_near(view: View, at: Ns, among: Session) -> Iterator[StampedTransfo
         return zones.reaches(earliest - 1, above=True) & zones.reaches(latest + 1, above=False)
 
     def near(rows: Rows) -> Rows | None:
-        found = stamped_between(rows.table, rows.index, earliest, latest)
-        return None if found is None else rows.some(found)
+        stamped = stamped_between(rows.table, rows.index, earliest, latest)
+        return None if stamped is None else rows.some(stamped)
 
-    for topic in _recorded(view, view.limits.tf_topics):
+    for topic in _recorded_topics(view, view.limits.tf_topics):
         everything = TimeWindow.everything()
         for rows in scan(view, topic, everything, copies=True, may_match=may_match):
-            if sessions.may_hold(among, rows.recording):
-                for some in of_columns(view, rows, near) or [rows]:
-                    yield from decoded_transforms(view, _messages_in(view, some, among))
+            if sessions.may_hold(session, rows.recording):
+                for near_rows in of_columns(view, rows, near) or [rows]:
+                    yield from decoded_transforms(view, _messages_in(view, near_rows, session))
 
 
-def _recorded(view: View, topics: Iterable[str]) -> tuple[str, ...]:
-    known = set(view.timeline.topics())
-    return tuple(topic for topic in topics if topic in known)
+def _recorded_topics(view: View, topics: Iterable[str]) -> tuple[str, ...]:
+    recorded = set(view.timeline.topics())
+    return tuple(topic for topic in topics if topic in recorded)
 
 
-def _bags_of(
-    view: View, topics: Sequence[str], window: TimeWindow, among: Session
+def _bags_of_session(
+    view: View, topics: Sequence[str], window: TimeWindow, session: Session
 ) -> list[BagSpan]:
-    chosen = sessions_of(view).recordings_of(among, tuple(topics))
+    chosen = sessions_of(view).recordings_of(session, tuple(topics))
     if not chosen:
         return []
-    first, last = min(span[0] for span in chosen.values()), max(span[1] for span in chosen.values())
+    first, last = enclosing(chosen.values())
     # A session is mostly some minutes of a week, whose bags are many.
     bags = view.stream.overlapping_bags(topics, window.intersect(TimeWindow(first, last + 1)))
-    return [each for each in bags if each.bag.recording in chosen]
+    return [span for span in bags if span.bag.recording in chosen]
 
 
 def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:
     """Yields the transforms of messages; a note names the topics that cannot be decoded."""
-    for found in messages:
-        is_static = found.topic in view.limits.tf_static_topics
+    for stored in messages:
+        is_static = stored.topic in view.limits.tf_static_topics
         with view.call.stages.timed("extract"):
             try:
-                message = view.memory.reader.decode(found.record)
-                some = view.extractor.transforms(message, found.time, static=is_static)
+                message = view.memory.reader.decode(stored.record)
+                transforms = view.extractor.transforms(message, stored.time, static=is_static)
             except UndecodableError as error:
                 view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
                 continue
-        yield from some
+        yield from transforms
 
 
-def _messages_in(view: View, rows: Rows, among: Session) -> Iterator[StoredMessage]:
+def _messages_in(view: View, rows: Rows, session: Session) -> Iterator[StoredMessage]:
     """Returns the messages of some rows that are of a session."""
     has = sessions_of(view).has
-    return (found for found in messages_of(view, rows) if has(among, found))
+    return (stored for stored in messages_of(view, rows) if has(session, stored))
 
 
-def edges_of_rows(view: View, rows: Rows, among: Session) -> Edges:
+def _edges_by_columns(rows: Rows) -> Edges | None:
+    return edges_in(rows.table, rows.times, rows.index)
+
+
+def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
     """Returns the transforms of a session in some rows, by their columns, else by their messages.
 
     Raises:
         QueryTimeoutError: the call's time is over.
     """
     sessions = sessions_of(view)
-    if not sessions.may_hold(among, rows.recording):
+    if not sessions.may_hold(session, rows.recording):
         return {}
     if sessions.holds_carried(rows.recording):
-        return edges_of(decoded_transforms(view, _messages_in(view, rows, among)))
-    known = of_columns(view, rows, lambda each: edges_in(each.table, each.times, each.index))
-    if known is not None and len(known) == 1:
-        return known[0]
-    if known is not None:
+        return edges_of(decoded_transforms(view, _messages_in(view, rows, session)))
+    tables = of_columns(view, rows, _edges_by_columns)
+    if tables is not None and len(tables) == 1:
+        return tables[0]
+    if tables is not None:
         # As those of bags come in the order of their log times.
         return {
             pair: rows_of(edge, np.argsort(edge.log_times, kind="stable"))
-            for pair, edge in joined_edges(known).items()
+            for pair, edge in joined_edges(tables).items()
         }
     return edges_of(decoded_transforms(view, messages_of(view, rows)))
 
 
-def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> Frames:
+def frames_over(view: View, session: Session, window: TimeWindow, target: str) -> FrameTree:
     """Returns the frames of a session in a window, looked up in a target frame.
 
     They are the same however the history is cut: moving transforms are read from so far around the
@@ -649,9 +677,9 @@ def frames_over(view: View, among: Session, window: TimeWindow, target: str) -> 
     limits = view.limits
     around = window.widened(TF_CACHE_NS)
     moving = [
-        edges_of_rows(view, rows, among)
+        edges_of_rows(view, rows, session)
         for topic in limits.tf_topics
         for rows in scan(view, topic, around, copies=True)
     ]
-    static = static_in(static_transforms(view, among), window)
-    return Frames(static, joined_edges(moving), target, limits.tf_clock)
+    static = static_in(static_transforms(view, session), window)
+    return FrameTree(static, joined_edges(moving), target, limits.tf_clock)

@@ -99,16 +99,16 @@ class View:
         """Whether a topic has the robot's poses; else transforms may place it."""
         return has_poses(self)
 
-    def value(self, found: StoredMessage) -> JsonValue:
+    def value(self, stored: StoredMessage) -> JsonValue:
         """Returns all that a message has; None where it cannot be decoded."""
-        message = self.bags.decode(found)
-        return None if message is None else self.extractor.exact(message, found.type)
+        message = self.bags.decode(stored)
+        return None if message is None else self.extractor.exact(message, stored.type)
 
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
         """Returns the first and the last log time of a topic in each bag of a window, or near."""
         none = np.empty(0, np.int64)
-        every = [each.bounds(topic) for each in self.timeline.segments_in(window)]
-        firsts, lasts = zip((none, none), *every, strict=True)
+        bounds = [segment.bounds(topic) for segment in self.timeline.segments_in(window)]
+        firsts, lasts = zip((none, none), *bounds, strict=True)
         return np.concatenate(firsts), np.concatenate(lasts)
 
     def note_thinned(self, window: TimeWindow) -> None:
@@ -120,7 +120,8 @@ class View:
     def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
         """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
         first, last = window.asked()
-        touched = [gap for gap in self.snapshot.gaps if gap[0] < last and first < gap[1]]
+        gaps = self.snapshot.gaps
+        touched = [(start, end) for start, end in gaps if start < last and first < end]
         return without_steps(self, touched) if touched else touched
 
     def census(self, topic: str) -> dict[str, Census]:
@@ -134,21 +135,21 @@ class View:
             return counted[topic]
         before = self.notes.added
         with self.notes.isolated():
-            found = self._census(topic)
+            censuses = self._read_census(topic)
             if self.notes.complete and self.notes.added == before and not self.call.used_active:
-                counted[topic] = found
-        return found
+                counted[topic] = censuses
+        return censuses
 
-    def _census(self, topic: str) -> dict[str, Census]:
+    def _read_census(self, topic: str) -> dict[str, Census]:
         counted = {
             type_name: Census(*stated) for type_name, stated in self.timeline.totals(topic).items()
         }
         for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
             type_name = rows.table.channel.type
-            known = counted[type_name]
-            last = known.last if rows.span[1] < known.last else self._last_of(topic, type_name)
-            counted[type_name] = Census(known.first, last, known.count - len(rows))
-        return {type_name: known for type_name, known in counted.items() if known.count}
+            before = counted[type_name]
+            last = before.last if rows.span[1] < before.last else self._last_of(topic, type_name)
+            counted[type_name] = Census(before.first, last, before.count - len(rows))
+        return {type_name: census for type_name, census in counted.items() if census.count}
 
     def _last_of(self, topic: str, type_name: str) -> Ns:
         """Returns the log time of the newest message of a type that counts."""

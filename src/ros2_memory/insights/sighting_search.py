@@ -369,7 +369,7 @@ def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | 
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_undecodable(runs[enough - 1].first)
         return Found(runs, reached)
-    search.close(scope.window, found=bool(runs), ruled_out=matching.ruled_out)
+    search.close(scope.window, is_found=bool(runs), ruled_out=matching.ruled_out)
     return Found(runs)
 
 

@@ -83,28 +83,28 @@ def driven_inside(
     region = parse_where(memory.limits, where)
     view, window = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    way, _ = driven_path(view, name, window)
-    if way is None or not way.poses:
+    path, _ = driven_path(view, name, window)
+    if path is None or not path.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
     track = joined_in_region(view, region, window).track
     inside = robot_inside(track, region.region, window)
-    totals = totals_inside(way.line, inside)
-    waypoints = way_inside(way.line, inside, max_waypoints)
-    waypoints = tuple(_as_turned(view, name, way.line, each) for each in waypoints)
+    totals = totals_inside(path.line, inside)
+    waypoints = way_inside(path.line, inside, max_waypoints)
+    waypoints = tuple(_as_turned(view, name, path.line, waypoint) for waypoint in waypoints)
     elapsed = elapsed_in(view, window)
-    spans = [(each.start, each.stop) for each in inside]
+    spans = [(stay.start, stay.stop) for stay in inside]
     duration = elapsed.among(spans)
     average = mean_speed(totals.distance_m, unix_from_ns(duration)) if duration else 0.0
     if frame_id is not None:
-        waypoints = placed_waypoints(view, name, waypoints, way.frames[0], frame_id)
+        waypoints = placed_waypoints(view, name, waypoints, path.frames[0], frame_id)
     require_one_robot(view, name, window)
     away = None if farthest is None else farthest_from(view, farthest, name, spans, frame_id)
     note_unread(view, window)
     note_edges(view, window)
     return DrivenInside(
         name,
-        frame_id or way.frames[0],
+        frame_id or path.frames[0],
         region.shown,
         len(inside),
         duration,
@@ -165,8 +165,8 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     if not spans:
         return ()
     inside = stacked([_part(line, span) for span in spans])
-    found, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
-    return found if at_most >= _FEWEST_WAYPOINTS else found[len(found) - at_most :]
+    waypoints, _ = drawn(inside, max(at_most, _FEWEST_WAYPOINTS))
+    return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 
 def _as_turned(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
@@ -214,35 +214,61 @@ def farthest_from(
     place = parse_where(view.limits, value, 1.0, _FARTHEST_FROM)
     if place.several:
         raise InvalidArgumentsError(f"{_FARTHEST_FROM} has several places; give one, or x and y")
-    if topic != (known := resolve_path_topic(view)):
-        raise InvalidArgumentsError(f"{_FARTHEST_FROM} is measured along {known}: leave out topic")
+    if topic != (robot_topic := resolve_path_topic(view)):
+        raise InvalidArgumentsError(
+            f"{_FARTHEST_FROM} is measured along {robot_topic}: leave out topic"
+        )
     frame = map_placement(view, topic, place.frame_id or frame_id).frame_id
     min_x, max_x, min_y, max_y = place.region.bounds
     x, y = (min_x + max_x) / 2, (min_y + max_y) / 2
     if not spans:
         return None
     window = TimeWindow(spans[0][0], spans[-1][1] + 1)
-    track, tracks = joined_in(view, frame, window).track, RobotTracks(view, frame)
+    track = joined_in(view, frame, window).track
+    pose = _farthest_pose(RobotTracks(view, frame), track, spans, (x, y))
+    if pose is None:
+        return None
+    inside = places_at(view.limits.places, frame, pose.x, pose.y)
+    return FarthestPose((x, y), frame, pose.away_m, pose.time, (pose.x, pose.y), inside)
+
+
+class _DistantPose(NamedTuple):
+    """A pose (m), its log time (ns), and its distance from the point that is asked about."""
+
+    away_m: float
+    time: Ns
+    x: float
+    y: float
+
+
+def _farthest_pose(
+    tracks: RobotTracks,
+    track: RobotTrack,
+    spans: Sequence[tuple[Ns, Ns]],
+    point: tuple[float, float],
+) -> _DistantPose | None:
+    """Returns the pose in some times that is farthest from a point (m).
+
+    Poses are looked up around the places of the track that are farthest away.
+    """
+    x, y = point
     times, at_x, at_y = _along(track, spans)
     off_m = np.hypot(at_x - x, at_y - y)
-    best: tuple[float, Ns, float, float] | None = None
+    farthest: _DistantPose | None = None
     for nth in np.argsort(-off_m, kind="stable")[:_MOST_TRIED].tolist():
-        if best is not None and off_m[nth] <= best[0] - _OFF_TRACK_M:
+        if farthest is not None and off_m[nth] <= farthest.away_m - _OFF_TRACK_M:
             break
         at = int(times[nth])
-        first, last = next(span for span in spans if span[0] <= at <= span[1])
+        first, last = next((first, last) for first, last in spans if first <= at <= last)
         around = TimeWindow(max(first, at - _AROUND_NS), min(last, at + _AROUND_NS) + 1)
         poses = tracks.poses(around)
-        for time, pose_x, pose_y in zip(*(part.tolist() for part in poses[:3]), strict=True):
+        rows = zip(poses.times.tolist(), poses.x.tolist(), poses.y.tolist(), strict=True)
+        for time, pose_x, pose_y in rows:
             away_m = math.hypot(pose_x - x, pose_y - y)
             is_near = away_m <= off_m[nth] + _OFF_TRACK_M  # else the robot jumped there, and back
-            if is_near and (best is None or away_m > best[0]):
-                best = away_m, time, pose_x, pose_y
-    if best is None:
-        return None
-    away_m, time, *there = best
-    inside = places_at(view.limits.places, frame, *there)
-    return FarthestPose((x, y), frame, away_m, time, (there[0], there[1]), inside)
+            if is_near and (farthest is None or away_m > farthest.away_m):
+                farthest = _DistantPose(away_m, time, pose_x, pose_y)
+    return farthest
 
 
 def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Floats, Floats]:
@@ -250,11 +276,11 @@ def _along(track: RobotTrack, spans: Sequence[tuple[Ns, Ns]]) -> tuple[Times, Fl
 
     Without those that the robot jumped to and from.
     """
-    found = []
+    points = []
     for first, last in spans:
         part = cut(track, TimeWindow(first, last + 1))
         jumped = jumps(part)
         fine = ~(jumped & np.roll(jumped, 1))
-        found.append((part.times[fine], part.x[fine], part.y[fine]))
-    times, x, y = (np.concatenate(column) for column in zip(*found, strict=True))
+        points.append((part.times[fine], part.x[fine], part.y[fine]))
+    times, x, y = (np.concatenate(column) for column in zip(*points, strict=True))
     return times, x, y

@@ -60,8 +60,8 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
     """
     if topic not in view.timeline.topics():
         return None
-    every = view.stream.messages([topic], TimeWindow.everything())
-    _, origin = next(_fixes(view, islice(every, _MOST_TRIED)), (0, None))
+    messages = view.stream.messages([topic], TimeWindow.everything())
+    _, origin = next(_fixes(view, islice(messages, _MOST_TRIED)), (0, None))
     if origin is None:
         return None
     _, fixes = fixes_in(view, topic, window)
@@ -74,10 +74,10 @@ def local_track(view: View, topic: str, window: TimeWindow) -> tuple[str, RobotT
 
 def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, Geodetic]]:
     extractor = view.extractor
-    for each in messages:
-        message = view.bags.decode(each)
-        fix = None if message is None else extractor.geodetic(message, each.type)
+    for stored in messages:
+        message = view.bags.decode(stored)
+        fix = None if message is None else extractor.geodetic(message, stored.type)
         if fix is None or not fix.has_fix:
             continue
         if math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
-            yield each.time, fix
+            yield stored.time, fix

@@ -40,8 +40,8 @@ from ros2_memory.history.driven_path import (
     robot_body,
 )
 from ros2_memory.history.transforms import (
-    connected,
     connects,
+    connects_in_time,
     newest_in_session,
     sessions_of,
     transform_at,
@@ -72,10 +72,10 @@ def pose_in(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) ->
         transform = transform_at(view, frame_id, pose.frame_id, time, recording, explains=False)
     except NoDataError:
         return None
-    found, turn = transform.transform, pose.orientation
+    lookup, turn = transform.transform, pose.orientation
     return Pose(
-        transform_point(found, pose.position),
-        None if turn is None else multiply(found.rotation, turn),
+        transform_point(lookup, pose.position),
+        None if turn is None else multiply(lookup.rotation, turn),
         frame_id,
     )
 
@@ -92,13 +92,13 @@ def newest_pose(
     if body is not None:
         return newest_of_body(view, body, window, recording=recording)
     if recording is None:
-        found = view.stream.newest(topic, window)
+        stored = view.stream.newest(topic, window)
     else:
-        found = newest_in_session(view, topic, window, recording)
-    message = None if found is None else view.bags.decode(found)
-    if found is None or message is None:
+        stored = newest_in_session(view, topic, window, recording)
+    message = None if stored is None else view.bags.decode(stored)
+    if stored is None or message is None:
         return None
-    return found, view.extractor.pose(message, found.type)
+    return stored, view.extractor.pose(message, stored.type)
 
 
 def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Path | None:
@@ -108,10 +108,10 @@ def recording_at(view: View, topic: str, at: Ns, own: Path | None = None) -> Pat
     recordings: which of their bags reaches over a time depends on how they were split.
     """
     spans = view.timeline.recordings(topic)
-    if own is not None and own in spans and spans[own][0] <= at <= spans[own][1]:
+    around = {path: last - first for path, (first, last) in spans.items() if first <= at <= last}
+    if own in around or not around:
         return own
-    around = [(last - first, path) for path, (first, last) in spans.items() if first <= at <= last]
-    return min(around)[1] if around else own
+    return min(around, key=lambda path: (around[path], path))
 
 
 def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose | None:
@@ -122,11 +122,11 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     """
     window = TimeWindow(max(at - NEWEST_POSE_NS, MIN_NS), at + 1)
     topic = view.pose_topic if body_by_transforms(view) is None else resolve_path_topic(view)
-    found, pose = newest_pose(view, topic, window, recording) or (None, None)
-    if found is None or pose is None or not all(map(math.isfinite, pose.position)):
+    stored, pose = newest_pose(view, topic, window, recording) or (None, None)
+    if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
-    there = placed(view, pose, found.time, found.bag.recording, frame_id)
-    return with_place(view, there, found.time, found.bag.recording)
+    there = placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    return with_place(view, there, stored.time, stored.bag.recording)
 
 
 def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | None = None) -> Pose:
@@ -136,10 +136,10 @@ def placed(view: View, pose: Pose, time: Ns, recording: Path, frame_id: str | No
         InvalidArgumentsError: no transform leads to `frame_id`, which was asked for.
     """
     target = frame_id or view.limits.map_frame
-    found = None if not target else pose_in(view, pose, target, time, recording)
-    if found is None and frame_id is not None:
+    there = None if not target else pose_in(view, pose, target, time, recording)
+    if there is None and frame_id is not None:
         raise InvalidArgumentsError(_unreachable(frame_id, pose.frame_id))
-    return pose if found is None else found
+    return pose if there is None else there
 
 
 def placed_waypoints(
@@ -154,37 +154,37 @@ def placed_waypoints(
         InvalidArgumentsError: no transform places any of them.
         QueryTimeoutError: the call's time is over before it is known whether any leads there.
     """
-    found: list[Waypoint] = []
+    moved: list[Waypoint] = []
     known_to_lead = False
-    for each in waypoints:
-        recording = recording_at(view, topic, each.time)
-        half = math.nan if each.yaw_rad is None else each.yaw_rad / 2
-        pose = Pose(each.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
+    for waypoint in waypoints:
+        recording = recording_at(view, topic, waypoint.time)
+        half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
+        pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
         there = None
         if recording is not None:
-            there = _pose_near(view, pose, frame_id, each.time, recording)
+            there = _pose_near(view, pose, frame_id, waypoint.time, recording)
         if there is None or there.orientation is None:
             # Asked once: to look for a frame that nothing leads to at each time takes long.
-            if not (found or known_to_lead) and not connects(view, (frame_id, own_frame)):
+            if not (moved or known_to_lead) and not connects(view, (frame_id, own_frame)):
                 break
             known_to_lead = True
             continue
-        turn = None if each.yaw_rad is None else yaw(there.orientation)
-        found.append(replace(each, position=there.position, yaw_rad=turn))
-    if waypoints and not found:
+        turn = None if waypoint.yaw_rad is None else yaw(there.orientation)
+        moved.append(replace(waypoint, position=there.position, yaw_rad=turn))
+    if waypoints and not moved:
         raise InvalidArgumentsError(_unreachable(frame_id, own_frame))
-    if len(found) < len(waypoints):
-        left_out = counted(len(waypoints) - len(found), "waypoint")
+    if len(moved) < len(waypoints):
+        left_out = counted(len(waypoints) - len(moved), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
-    return tuple(found)
+    return tuple(moved)
 
 
 def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
     """Returns a pose by the transforms of its time, or of the nearest one up to `HOLD_NS` off."""
     for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
-        found = pose_in(view, pose, frame_id, time + off, recording)
-        if found is not None:
-            return found
+        there = pose_in(view, pose, frame_id, time + off, recording)
+        if there is not None:
+            return there
     return None
 
 
@@ -198,7 +198,7 @@ def _unreachable(frame_id: str, own_frame: str) -> str:
 def with_place(view: View, pose: Pose, time: Ns, recording: Path) -> Pose:
     """Returns a pose with the names of the places that it is in."""
     places = view.limits.places
-    for frame in dict.fromkeys(each.frame_id for each in places):
+    for frame in dict.fromkeys(place.frame_id for place in places):
         there = pose_in(view, pose, frame, time, recording)
         if there is None:
             continue
@@ -244,19 +244,20 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
     if frame_id in (frame, *above):
         return MapPlacement(frame_id, frame, frame_id == target, above)
     # No answer is better than one that denies a frame which is asked for, since the time is over.
-    leads = connected if frame_id is None else connects
+    leads = connects_in_time if frame_id is None else connects
     places_frame = frame
     if target and target != frame and leads(view, (target, frame)):
         recordings = view.timeline.recordings(topic).items()
-        lending = {sessions_of(view).lending_to(each, first) for each, (first, _) in recordings}
-        if any(leads(view, (target, frame), among=each) for each in lending):
+        lending = {sessions_of(view).lending_to(path, first) for path, (first, _) in recordings}
+        if any(leads(view, (target, frame), session=session) for session in lending):
             places_frame = target
     placement = MapPlacement(places_frame, frame, places_frame == target, above)
     if frame_id not in (None, places_frame):
-        known = " or ".join(placement.frames)
+        known_frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"frame_id was {abbreviate(frame_id)} (as asked, or of a place), and where the robot "
-            f"was is known in {known} only: ask in that frame, or make it the `frame` of the place"
+            f"was is known in {known_frames} only: ask in that frame, or make it the `frame` of "
+            "the place"
         )
     return placement
 
@@ -272,12 +273,12 @@ def known_placement(view: View) -> MapPlacement | None:
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
     """Returns whether all poses in some windows are of one session, whose odometry goes on."""
     sessions, asked = sessions_of(view), tuple(windows)
-    found = {
+    held_by = {
         sessions.of(recording)
         for recording, span in view.timeline.recordings(topic).items()
         if any(window.overlaps(*span) for window in asked)
     }
-    return len(found) < 2
+    return len(held_by) < 2
 
 
 def changing_origin(frame_id: str) -> str:
@@ -318,15 +319,15 @@ def placed_times(track: RobotTrack, mixed: Spans) -> Spans:
     return without(zip(starts.tolist(), (stops + 1).tolist(), strict=True), mixed)
 
 
-def tracks_made(view: View, window: TimeWindow) -> Iterator[Ns]:
-    """Makes what the parts in a window say of where the robot was in the frames of places.
+def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
+    """Makes the robot's tracks by the parts in a window, in the frames of places; they are stored.
 
     Yields a log time (ns) of each, the newest first.
     """
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_path_topic(view)
         frames = map_placement(view, topic).frames
-        yield from merge(*(RobotTracks(view, one).made(window) for one in frames), reverse=True)
+        yield from merge(*(RobotTracks(view, frame).made(window) for frame in frames), reverse=True)
 
 
 def places_in(
@@ -339,16 +340,16 @@ def places_in(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    found: list[tuple[Place, JoinedTrack]] = []
+    tracks: list[tuple[Place, JoinedTrack]] = []
     for place in places:
         if place.frame_id in placement.frames:
-            found.append((place, joined_in(view, place.frame_id, window)))
+            tracks.append((place, joined_in(view, place.frame_id, window)))
         else:
             view.notes.add(
                 f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
                 f"known in {' and '.join(placement.frames)}"
             )
-    return found
+    return tracks
 
 
 @dataclass
@@ -377,7 +378,7 @@ class RobotPlaces:
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""
         places = self.view.limits.places
-        if not any(each.frame_id == self.map_frame for each in places):
+        if not any(place.frame_id == self.map_frame for place in places):
             return ()
         point = place_at(self._track, time, SILENCE_NS)
         return () if point is None else places_at(places, self.map_frame, *point)
@@ -389,15 +390,17 @@ class RobotPlaces:
             note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
         except QueryTimeoutError:
             self.view.bags.check_deadline()
-            joined = None
-        if joined is None or joined.since is not None:
-            since = "" if joined is None or joined.since is None else unix_text(joined.since)
-            reach = f"known back to {since} alone" if since else "not known"
-            self.view.notes.add(
-                f"where the robot was in {self.map_frame} is {reach}: reading the bags that "
-                "are not stored takes too long"
-            )
-        return empty_track() if joined is None else joined.track
+            self._note_reach("not known")
+            return empty_track()
+        if joined.since is not None:
+            self._note_reach(f"known back to {unix_text(joined.since)} alone")
+        return joined.track
+
+    def _note_reach(self, reach: str) -> None:
+        self.view.notes.add(
+            f"where the robot was in {self.map_frame} is {reach}: reading the bags that are not "
+            "stored takes too long"
+        )
 
 
 def robot_places(view: View, window: TimeWindow, frame_id: str | None = None) -> RobotPlaces | None:

@@ -15,7 +15,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import TF_CACHE_NS, Edges, Floats, Frames, Mask, Times, static_in
+from ros2_memory.analysis.frames import (
+    TF_CACHE_NS,
+    Edges,
+    Floats,
+    FrameTree,
+    Mask,
+    Times,
+    static_in,
+)
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
@@ -116,7 +124,7 @@ class JoinedTrack:
 
     def inside(self, region: Region, window: TimeWindow) -> list[Inside]:
         """Returns when any robot was inside of a region, in order; times of several may overlap."""
-        return sorted(chain(*(robot_inside(each, region, window) for each in self.tracks)))
+        return sorted(chain(*(robot_inside(track, region, window) for track in self.tracks)))
 
 
 _JOINED: Final[Key[dict[tuple[str, TimeWindow], JoinedTrack]]] = Key()
@@ -149,24 +157,24 @@ class RobotTracks:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out before any result.
         """
-        known = self._view.memo.of(_JOINED, dict)
-        if (self._frame_id, window) not in known:
-            known[self._frame_id, window] = self._over(window)
-        return known[self._frame_id, window]
+        tracks = self._view.memo.of(_JOINED, dict)
+        if (self._frame_id, window) not in tracks:
+            tracks[self._frame_id, window] = self._read_track(window)
+        return tracks[self._frame_id, window]
 
-    def _over(self, window: TimeWindow) -> JoinedTrack:
+    def _read_track(self, window: TimeWindow) -> JoinedTrack:
         view = self._view
         # Whole slices, so that no vertex depends on the window; and what may reach into it.
         around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
-        found: list[TrackPart] = []
+        parts: list[TrackPart] = []
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
         try:
             for start, part in self._parts(around, reading):
-                found.append(part)
+                parts.append(part)
                 since = start
         except QueryTimeoutError as error:
-            if not found:
+            if not parts:
                 raise QueryTimeoutError(
                     f"the question needs more time; {view.bags.filling_progress()}"
                     "ask about a shorter window"
@@ -175,8 +183,8 @@ class RobotTracks:
             since = None
         if self._failures:
             note_left_out(view, self._failures[0])
-        left_out = sum(part.left_out for part in found)
-        whole, numbers, is_beside = _by_robot(found)
+        left_out = sum(part.left_out for part in parts)
+        whole, numbers, is_beside = _tracks_by_robot(parts)
         fastest = view.limits.max_plausible_speed_mps
 
         def track(index: NDArray[np.intp]) -> RobotTrack:
@@ -209,7 +217,7 @@ class RobotTracks:
                 opened,
                 TRACKS,
                 partial(self._parts_in, opened, moving, window, reading),
-                partial(self._joined_key, opened, moving, window),
+                partial(self._stretch_key, opened, moving, window),
                 trouble=lambda: len(self._failures),
             )
 
@@ -219,7 +227,7 @@ class RobotTracks:
         around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
         named = self._view.limits.tf_topics
         return [
-            open_scan(self._view, each, around, copies=True) for each in named if each in topics
+            open_scan(self._view, name, around, copies=True) for name in named if name in topics
         ]
 
     def _parts_in(
@@ -231,28 +239,28 @@ class RobotTracks:
         stretch: Stretch,
     ) -> Iterator[tuple[Ns, TrackPart]]:
         """Yields the track table by table, of those that begin in a stretch, the newest first."""
-        among = stretch.window.intersect(window)
-        for rows in opened.rows(newest_first=True, among=among):
+        searched = stretch.window.intersect(window)
+        for rows in opened.rows(newest_first=True, among=searched):
             if rows.first < stretch.window.start and stretch.window.start > opened.window.start:
                 continue
-            groups = self._groups(rows, TimeWindow.everything())
-            key = self._key(rows, groups, scans)
+            lent_spans = self._lent_spans(rows, TimeWindow.everything())
+            key = self._rows_key(rows, lent_spans, scans)
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
-                yield rows.first, self._part(rows, key, groups, reading)
+                yield rows.first, self._part(rows, key, lent_spans, reading)
                 continue
-            known = self._known(key)
-            if known is not None and not known.left_out:
-                yield rows.first, known.some(_inside(known.times, window))
-            elif (inside := _inside(rows.times, window)).size:
-                groups = self._groups(rows, window)
-                yield rows.first, self._part(rows.some(inside), None, groups, reading)
+            stored = None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
+            if stored is not None and not stored.left_out:
+                yield rows.first, stored.some(_positions_in(stored.times, window))
+            elif (inside := _positions_in(rows.times, window)).size:
+                lent_spans = self._lent_spans(rows, window)
+                yield rows.first, self._part(rows.some(inside), None, lent_spans, reading)
 
-    def _joined_key(
+    def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
     ) -> FragmentKey | None:
-        """Returns what the track of a stretch follows from; None where that may still change."""
+        """Returns the key of a stretch's track; None where what it follows from may change."""
         start, last = stretch.window.start, stretch.last
         if stretch.parts is None or not window.covers(start, last):
             return None
@@ -260,101 +268,106 @@ class RobotTracks:
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         parts = [*stretch.parts]
-        for recording in () if self._is_own else map(opened.recording_of, stretch.parts):
-            own = sessions.of(recording)
-            if not sessions.has_all_kinds(own):
+        recordings = () if self._is_own else map(opened.recording_of, stretch.parts)
+        for recording in recordings:
+            session = sessions.of(recording)
+            if not sessions.has_all_kinds(session):
                 return None
-            if own not in numbers:
-                placed_by.append(static_in(static_transforms(self._view, own), span))
-            placed_by.append(numbers.setdefault(own, len(numbers)))
+            if session not in numbers:
+                placed_by.append(static_in(static_transforms(self._view, session), span))
+            placed_by.append(numbers.setdefault(session, len(numbers)))
         moving = self._moving_parts(scans, span)
         if moving is None:
             return None
         placed_by += [numbers.get(sessions.of(recording)) for recording in moving.values()]
         parts += [part for part in moving if part not in parts]
-        return FragmentKey(start, self._settings(placed_by), tuple(parts))
+        return FragmentKey(start, self._settings_hash(placed_by), tuple(parts))
 
     def _moving_parts(self, scans: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
         """Returns the whole parts that all moving transforms around a time are of.
 
         Each with its recording. None where there are others, or some are of several recordings.
         """
-        found: dict[int, Path] = {}
+        paths: dict[int, Path] = {}
         for scan_ in scans:
             parts = scan_.whole_parts(span.widened(TF_CACHE_NS))
             if parts is None:
                 return None
-            found |= {part: scan_.recording_of(part) for part in parts}
-        is_mixed = any(map(sessions_of(self._view).holds_carried, found.values()))
-        return None if is_mixed else found
+            paths |= {part: scan_.recording_of(part) for part in parts}
+        is_mixed = any(map(sessions_of(self._view).holds_carried, paths.values()))
+        return None if is_mixed else paths
 
-    def _settings(self, placed_by: Sequence[object]) -> str:
-        """Returns what a track depends on besides the poses and transforms in parts, as a text."""
+    def _settings_hash(self, placed_by: Sequence[object]) -> str:
+        """Returns a hash of the settings and transforms that a track depends on, but for parts."""
         clock = self._view.limits.tf_clock
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
 
-    def _known(self, key: FragmentKey | None) -> TrackPart | None:
-        return None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
-
     def _part(
-        self, rows: Rows, key: FragmentKey | None, groups: Sequence[_Group], reading: Deadline
+        self,
+        rows: Rows,
+        key: FragmentKey | None,
+        lent_spans: Sequence[_LentSpan],
+        reading: Deadline,
     ) -> TrackPart:
         """Returns the track by some rows: what is stored of it, else made now."""
 
         def make() -> TrackPart:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
-            placed = self._placed(rows, groups)
+            placed = self._poses_of(rows, lent_spans)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
             return track_part(*placed)._replace(recording=recording)
 
         return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
 
-    def _key(
-        self, rows: Rows, groups: Sequence[_Group], scans: Sequence[Scan]
+    def _rows_key(
+        self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]
     ) -> FragmentKey | None:
-        """Returns what the track by some rows follows from; None where that may still change."""
+        """Returns the key of the track by some rows; None where what it follows from may change."""
         if rows.part is None:
             return None
         parts, placed_by = [rows.part], []
-        for group in groups:
-            moving = self._moving_parts(scans, group.span)
+        for lent in lent_spans:
+            moving = self._moving_parts(scans, lent.span)
             if moving is None:
                 return None
-            sessions, session = sessions_of(self._view), group.session
+            sessions, session = sessions_of(self._view), lent.session
             used = [part for part, path in moving.items() if sessions.folder(path) in session]
             parts += [part for part in used if part not in parts]
-            static = static_in(static_transforms(self._view, session), group.span)
+            static = static_in(static_transforms(self._view, session), lent.span)
             # By their places among the parts: those of one recording have one text.
-            placed_by.append((group.since, tuple(static), [parts.index(part) for part in used]))
-        return FragmentKey(rows.first, self._settings(placed_by), tuple(parts))
+            placed_by.append((lent.since, tuple(static), [parts.index(part) for part in used]))
+        return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
 
-    def _groups(self, rows: Rows, window: TimeWindow) -> list[_Group]:
+    def _lent_spans(self, rows: Rows, window: TimeWindow) -> list[_LentSpan]:
         """Returns by what the poses of some rows in a window are placed; none: by nothing."""
         if self._is_own:
             return []
         lenders = self._lenders(rows)
         ends = [since for since, _ in lenders[1:]] + [MAX_NS]
         whole = TimeWindow(rows.first, rows.last + 1).intersect(window)
-        every = [
-            _Group(since, whole.intersect(TimeWindow(since, end)), session)
+        lent_spans = [
+            _LentSpan(since, whole.intersect(TimeWindow(since, end)), session)
             for (since, session), end in zip(lenders, ends, strict=True)
         ]
-        return [group for group in every if not group.span.empty]
+        return [lent for lent in lent_spans if not lent.span.empty]
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
         sessions, recording = sessions_of(self._view), rows.recording
-        own = sessions.of(recording)
-        if sessions.has_all_kinds(own):
-            return [(MIN_NS, own)]
-        first, last = (self._lending(recording, at) for at in (rows.first, rows.last))
+        session = sessions.of(recording)
+        if sessions.has_all_kinds(session):
+            return [(MIN_NS, session)]
+        first, last = (self._lender_at(recording, at) for at in (rows.first, rows.last))
         if first == last:
             return [(MIN_NS, first)]
-        slices = (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist()
-        every = [(at, self._lending(recording, at)) for at in slices]
-        return [one for nth, one in enumerate(every) if not nth or one[1] != every[nth - 1][1]]
+        lenders: list[tuple[Ns, Session]] = []
+        for at in (np.unique(rows.times // TRACK_SLICE_NS) * TRACK_SLICE_NS).tolist():
+            lender = self._lender_at(recording, at)
+            if not lenders or lenders[-1][1] != lender:
+                lenders.append((at, lender))
+        return lenders
 
     def poses(self, window: TimeWindow) -> Placed:
         """Returns all poses in a short window, in order.
@@ -362,40 +375,40 @@ class RobotTracks:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        found = [NOWHERE]
+        placed = [NOWHERE]
         for topic in self._topics:
-            found += [
-                self._placed(rows, self._groups(rows, window))
+            placed += [
+                self._poses_of(rows, self._lent_spans(rows, window))
                 for rows in scan(self._view, topic, window)
             ]
-        return _joined(found)
+        return _in_time_order(placed)
 
-    def _lending(self, recording: Path, at: Ns) -> Session:
+    def _lender_at(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none, or another."""
         session = lending_to(self._view, recording, (self._frame_id, self._own_frame), at)
         if not session:
             self._view.notes.add(Note(_NOT_PLACED, recording.name))
         return session
 
-    def _placed(self, rows: Rows, groups: Sequence[_Group]) -> Placed:
-        """Returns the poses of some rows."""
+    def _poses_of(self, rows: Rows, lent_spans: Sequence[_LentSpan]) -> Placed:
+        """Returns the poses of some rows in the frame; without lent spans as they are."""
         if self._body is None:
             poses = self._reader.poses(rows)
-        if not groups:
-            return _placed(poses, None, self._frame_id)
-        found: list[Placed] = []
-        for group in groups:
-            frames = frames_over(self._view, group.session, group.span, self._frame_id)
+        if not lent_spans:
+            return _placed_poses(poses, None, self._frame_id)
+        placed: list[Placed] = []
+        for lent in lent_spans:
+            frames = frames_over(self._view, lent.session, lent.span, self._frame_id)
             if self._body is None:
-                some = poses.between(group.span.start, group.span.stop)
-                found.append(_placed(some, frames, self._frame_id))
+                of_span = poses.between(lent.span.start, lent.span.stop)
+                placed.append(_placed_poses(of_span, frames, self._frame_id))
             else:
-                edges = edges_of_rows(self._view, rows, group.session)
-                found.append(_placed_body(edges, self._body, frames, group.span))
-        return _joined(found)
+                edges = edges_of_rows(self._view, rows, lent.session)
+                placed.append(_placed_body(edges, self._body, frames, lent.span))
+        return _in_time_order(placed)
 
 
-class _Group(NamedTuple):
+class _LentSpan(NamedTuple):
     """By what poses of a span of log time are placed: the transforms of one session.
 
     `since`: from when on it lends them.
@@ -427,15 +440,20 @@ class Placed(NamedTuple):
 NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0), 0)
 
 
-def _joined(parts: Sequence[Placed]) -> Placed:
+def _in_time_order(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    columns = [np.concatenate(each) for each in zip(*(part[:4] for part in parts), strict=True)]
-    order = np.argsort(columns[0], kind="stable")
-    left_out = sum(part.left_out for part in parts)
-    return Placed._make((*(column[order] for column in columns), left_out))
+    times = np.concatenate([part.times for part in parts])
+    order = np.argsort(times, kind="stable")
+    return Placed(
+        times[order],
+        np.concatenate([part.x for part in parts])[order],
+        np.concatenate([part.y for part in parts])[order],
+        np.concatenate([part.heading for part in parts])[order],
+        sum(part.left_out for part in parts),
+    )
 
 
-def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
+def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
     turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
     x, y, z = (column.copy() for column in poses.positions.T)
@@ -445,35 +463,35 @@ def _placed(poses: Poses, frames: Frames | None, target: str) -> Placed:
         if name.lstrip("/") == target.lstrip("/"):
             valid[here] = True
         elif here.size and frames is not None:
-            found = frames.poses(name, poses.times[here])
-            if found is None:
+            in_target = frames.poses(name, poses.times[here])
+            if in_target is None:
                 continue
-            x[here], y[here], _ = found.points((x[here], y[here], z[here]))
+            x[here], y[here], _ = in_target.points((x[here], y[here], z[here]))
             qx, qy, qz, qw = turns[here].T
-            turns[here] = np.stack(multiply(found.rotation, (qx, qy, qz, qw)), axis=1)
-            valid[here] = found.valid
+            turns[here] = np.stack(multiply(in_target.rotation, (qx, qy, qz, qw)), axis=1)
+            valid[here] = in_target.valid
     kept = np.flatnonzero(valid)
     left_out = len(poses) - len(kept)
     return Placed(poses.times[kept], x[kept], y[kept], headings(turns[kept]), left_out)
 
 
-def _placed_body(edges: Edges, body: Body, frames: Frames, span: TimeWindow) -> Placed:
+def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
-    own = [edge for (_, child), edge in edges.items() if child == body.child]
-    times = np.concatenate([edge.log_times for edge in own] or [np.zeros(0, np.int64)])
-    stamps = np.concatenate([edge.stamps for edge in own] or [np.zeros(0, np.int64)])
+    of_body = [edge for (_, child), edge in edges.items() if child == body.child]
+    times = np.concatenate([edge.log_times for edge in of_body] or [np.zeros(0, np.int64)])
+    stamps = np.concatenate([edge.stamps for edge in of_body] or [np.zeros(0, np.int64)])
     order = np.argsort(times, kind="stable")
     order = order[(times[order] >= span.start) & (times[order] < span.stop)]
-    found = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
-    if found is None:
+    in_target = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
+    if in_target is None:
         return NOWHERE
-    x, y, _ = found.translation
-    valid = found.valid
+    x, y, _ = in_target.translation
+    valid = in_target.valid
     return Placed(
         times[order][valid],
         x[valid],
         y[valid],
-        headings(np.stack(found.rotation, axis=1))[valid],
+        headings(np.stack(in_target.rotation, axis=1))[valid],
         0,
     )
 
@@ -484,24 +502,24 @@ def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
     return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
 
 
-def _inside(times: Times, window: TimeWindow) -> Times:
+def _positions_in(times: Times, window: TimeWindow) -> Times:
     """Returns the positions of those times that are in a window."""
     return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
-def _by_robot(found: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
+def _tracks_by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
     """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
 
     Where several recordings place a robot at a time, that which began first is in the track; of
     those that began at one time the first by name.
     """
     by_recording: dict[str, list[TrackPart]] = defaultdict(list)
-    for part in found[::-1]:
+    for part in parts[::-1]:
         if len(part.times):
             by_recording[part.recording].append(part)
     recordings = sorted(
         by_recording.values(),
-        key=lambda parts: (min(int(part.times[0]) for part in parts), parts[0].recording),
+        key=lambda track: (min(int(part.times[0]) for part in track), track[0].recording),
     )
     whole, numbers = joined_parts(recordings)
     ends = np.searchsorted(numbers, np.arange(len(recordings) + 1))
@@ -517,12 +535,12 @@ def _by_robot(found: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
     return whole, numbers, is_beside
 
 
-def _without_jumps(parts: Parts, every: Mask) -> Parts:
-    """Returns parts of steps, of those that are jumps their ends alone, or both where all is in.
+def _without_jumps(parts: Parts, are_jumps: Mask) -> Parts:
+    """Returns the parts of steps inside of a region; of a jump only those of its ends inside.
 
     Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
     """
-    jumped = every[parts.step]
+    jumped = are_jumps[parts.step]
     begins, ends = parts.start <= 0, parts.stop >= 1
     start = np.where(jumped & ~begins, 1.0, parts.start)
     stop = np.where(jumped & ~ends, 0.0, parts.stop)
@@ -533,9 +551,9 @@ def _without_jumps(parts: Parts, every: Mask) -> Parts:
 def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:
     """Returns when the robot was inside of a region in a window, in order; see `times_inside`."""
     return [
-        each.within(window)
-        for each in times_inside(track, region)
-        if window.overlaps(each.start, each.stop)
+        stay.within(window)
+        for stay in times_inside(track, region)
+        if window.overlaps(stay.start, stay.stop)
     ]
 
 

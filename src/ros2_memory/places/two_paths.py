@@ -79,8 +79,8 @@ def farthest_apart(
     Only the part of each path in its window counts, and in the region, if one is given.
     None where it has no point, or the other way has none at all.
     """
-    one, two = _steps(*this), _steps(*other)
-    return _farthest(one, two, region), _farthest(two, one, region)
+    these, two = _steps(*this), _steps(*other)
+    return _farthest(these, two, region), _farthest(two, these, region)
 
 
 def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
@@ -103,8 +103,8 @@ def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
     return _Steps(here + share * (there - here), here + until * (there - here), start, stop)
 
 
-def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | None:
-    points, times = _sampled(own)
+def _farthest(steps: _Steps, other: _Steps, region: Region | None) -> FarPoint | None:
+    points, times = _sampled(steps)
     if region is not None:
         inside = [region.contains(x, y) for x, y in points.tolist()]
         points, times = points[inside], times[inside]
@@ -114,12 +114,12 @@ def _farthest(own: _Steps, other: _Steps, region: Region | None) -> FarPoint | N
     marks, _ = _thinned(*_sampled(other))
     near = np.concatenate(
         [
-            ((some[:, :1] - marks[:, 0]) ** 2 + (some[:, 1:] - marks[:, 1]) ** 2).min(axis=1)
-            for some in np.array_split(points, len(points) // 64 + 1)
+            ((chunk[:, :1] - marks[:, 0]) ** 2 + (chunk[:, 1:] - marks[:, 1]) ** 2).min(axis=1)
+            for chunk in np.array_split(points, len(points) // 64 + 1)
         ]
     )
     tried = np.argsort(-near, kind="stable")[:_CANDIDATES]
-    away = _away(points[tried], other)
+    away = _distances_to(points[tried], other)
     farthest = int(np.argmax(away))
     nth = int(tried[farthest])
     x, y = points[nth].tolist()
@@ -150,19 +150,19 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
         size *= 2
 
 
-def _away(points: Floats, steps: _Steps) -> list[float]:
+def _distances_to(points: Floats, steps: _Steps) -> list[float]:
     """Returns how far (m) each of some points is from the nearest step."""
     along, begin = steps.end - steps.begin, steps.begin
     (along_x, along_y), (begin_x, begin_y) = along.T.copy(), begin.T.copy()
     size = along_x * along_x + along_y * along_y
     whole = np.where(size > 0, size, 1.0)
-    found = []
+    distances = []
     for x, y in points.tolist():
         share = (x - begin_x) * along_x + (y - begin_y) * along_y
         share = np.clip(share / whole, 0.0, 1.0)
         away_x, away_y = begin_x + share * along_x - x, begin_y + share * along_y - y
-        found.append(float(np.hypot(away_x, away_y).min()))
-    return found
+        distances.append(float(np.hypot(away_x, away_y).min()))
+    return distances
 
 
 def placed_standstills(
@@ -176,13 +176,13 @@ def placed_standstills(
     if not len(track.times) or not len(ends):
         return
     at = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
-    known = _is_known(track, at)
-    some = known.any(axis=1)
-    ends, at, known = ends[some], at[some], known[some]
+    is_known = _is_known(track, at)
+    has_known = is_known.any(axis=1)
+    ends, at, is_known = ends[has_known], at[has_known], is_known[has_known]
     since = track.times[0]
     times = (track.times - since).astype(np.float64)
     x, y = (
-        np.nanmedian(np.where(known, np.interp(at - since, times, axis), np.nan), axis=1)
+        np.nanmedian(np.where(is_known, np.interp(at - since, times, axis), np.nan), axis=1)
         for axis in (track.x, track.y)
     )
     rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
@@ -206,23 +206,21 @@ def stood_at(this: Iterable[PlacedStandstill], other: Iterable[PlacedStandstill]
 
     A place is where it stood longest within `SAME_STAND_M`.
     """
-    every = [(0, each) for each in this] + [(1, each) for each in other]
-    every.sort(key=lambda each: (-each[1].duration, each[1]))
-    middles = np.empty((len(every), 2))
-    sums: list[list[Ns]] = []
+    stands = [(stand, side) for side, window in enumerate((this, other)) for stand in window]
+    stands.sort(key=lambda sided: (-sided[0].duration, sided[0]))
+    middles = np.empty((len(stands), 2))
+    durations: list[list[Ns]] = []
     since: list[list[Ns | None]] = []
-    for side, stand in every:
-        count = len(sums)
+    for stand, side in stands:
+        count = len(durations)
         away = ((middles[:count] - (stand.x, stand.y)) ** 2).sum(axis=1)
         nth = int(away.argmin()) if (away <= SAME_STAND_M**2).any() else count
         if nth == count:
             middles[nth] = stand.x, stand.y
-            sums.append([0, 0])
+            durations.append([0, 0])
             since.append([None, None])
-        sums[nth][side] += stand.duration
-        known = since[nth][side]
-        since[nth][side] = stand.start if known is None else min(known, stand.start)
-    return [
-        StoodAt(x, y, (both[0], both[1]), (first[0], first[1]))
-        for (x, y), both, first in zip(middles[: len(sums)].tolist(), sums, since, strict=True)
-    ]
+        durations[nth][side] += stand.duration
+        earliest = since[nth][side]
+        since[nth][side] = stand.start if earliest is None else min(earliest, stand.start)
+    places = zip(middles[: len(durations)].tolist(), durations, since, strict=True)
+    return [StoodAt(x, y, (a, b), (first, second)) for (x, y), (a, b), (first, second) in places]

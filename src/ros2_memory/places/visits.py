@@ -31,12 +31,13 @@ from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
+    MapPlacement,
     joined_in,
     map_placement,
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Inside, RobotTracks, times_inside
+from ros2_memory.places.robot_tracks import Inside, Placed, RobotTracks, times_inside
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import PlaceVisits, Visit, Visits
 
@@ -85,45 +86,78 @@ def visits(
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
     named_frame = None if place is None else place.frame_id
-    asked = frame_id if named_frame is None else named_frame
-    placement = map_placement(view, topic, asked)
+    asked_frame = frame_id if named_frame is None else named_frame
+    placement = map_placement(view, topic, asked_frame)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
-        table = [
-            (each, RegionVisits(view, each.frame_id, each.region, window))
-            for each, _ in places_in(view, memory.limits.places, placement, window)
-        ]
-        rows = (place_visits(found, each.name) for each, found in table)
-        places = tuple(sorted(rows, key=lambda each: (-each.duration, each.place)))
-        tracks = {each.frame_id: found.joined.track for each, found in table}.values()
-        been = any(each.duration for each in places)
-        note_unread(view, window, nothing=not been, gaps=not been)
-        return Visits(
-            frame_id=placement.frame_id,
-            x=None,
-            y=None,
-            radius_m=None,
-            visits=(),
-            more=False,
-            total=sum(each.entries for each in places),
-            now=now,
-            places=places,
-            unknown=_unknown(view, window, tracks, mixed),
-            notes=view.notes.sentences(),
-        )
-    found = RegionVisits(view, placement.frame_id, place.region, window)
-    track, every = found.joined.track, found.every
-    newest = _newest(view, topic, track, window, now + FUTURE_NS)
+        return _visits_of_places(view, window, placement, mixed, now)
+    region_visits = RegionVisits(view, placement.frame_id, place.region, window)
+    track, all_visits = region_visits.joined.track, region_visits.every
+    newest = _newest_pose_time(view, topic, track, window, now + FUTURE_NS)
     # A newer pose shows where the robot is now.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
     current = newest if newest is not None and newest >= stale else None
-    shown = tuple(_within_asked(found.shown(each, current), window) for each in every[:limit])
+    shown = tuple(
+        _within_asked(region_visits.shown(visit, current), window) for visit in all_visits[:limit]
+    )
     if not placement.is_map:
         shown = _with_restarts(view, topic, shown, now)
-    if not every and asked is None:
+    if not all_visits and asked_frame is None:
         ask = f'ask with frame_id "{placement.pose_frame}"'
         note_other_frame(view, place, placement, window, ask)
     view.notes.retract_outside(window)
+    _note_shown(view, window, shown, newest)
+    circle = place.region if isinstance(place.region, Circle) and place.name is None else None
+    return Visits(
+        frame_id=placement.frame_id,
+        x=None if circle is None else circle.x,
+        y=None if circle is None else circle.y,
+        radius_m=None if circle is None else circle.radius_m,
+        visits=shown,
+        more=len(all_visits) > len(shown),
+        total=len(all_visits),
+        now=now,
+        duration=region_visits.duration,
+        entries=sum(visit.inside.entered for visit in all_visits),
+        exits=sum(visit.inside.left for visit in all_visits),
+        all_counted=region_visits.joined.since is None,
+        where=place.name,
+        unknown=_unknown(view, window, [track], mixed),
+        reaches_now=newest is not None,
+        notes=view.notes.sentences(),
+    )
+
+
+def _visits_of_places(
+    view: View, window: TimeWindow, placement: MapPlacement, mixed: Spans, now: Ns
+) -> Visits:
+    """Returns how often and for how long the robot was in each named place, the longest first."""
+    visited = [
+        (place, RegionVisits(view, place.frame_id, place.region, window))
+        for place, _ in places_in(view, view.limits.places, placement, window)
+    ]
+    rows = (place_visits(region_visits, place.name) for place, region_visits in visited)
+    places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
+    tracks = {place.frame_id: region_visits.joined.track for place, region_visits in visited}
+    was_in_one = any(row.duration for row in places)
+    note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
+    return Visits(
+        frame_id=placement.frame_id,
+        x=None,
+        y=None,
+        radius_m=None,
+        visits=(),
+        more=False,
+        total=sum(row.entries for row in places),
+        now=now,
+        places=places,
+        unknown=_unknown(view, window, tracks.values(), mixed),
+        notes=view.notes.sentences(),
+    )
+
+
+def _note_shown(view: View, window: TimeWindow, shown: Sequence[Visit], newest: Ns | None) -> None:
+    """Adds notes on what the visits shown leave open; `newest` is the time of the newest pose."""
     note_unread(view, window, nothing=not shown, gaps=not shown)
     if newest is not None and any(visit.departed == newest for visit in shown):
         view.notes.add(
@@ -135,25 +169,6 @@ def visits(
             "visits with restarts_since are from before odometry restarted: "
             "the same coordinates may have been another place"
         )
-    circle = place.region if isinstance(place.region, Circle) and place.name is None else None
-    return Visits(
-        frame_id=placement.frame_id,
-        x=None if circle is None else circle.x,
-        y=None if circle is None else circle.y,
-        radius_m=None if circle is None else circle.radius_m,
-        visits=shown,
-        more=len(every) > len(shown),
-        total=len(every),
-        now=now,
-        duration=found.duration,
-        entries=sum(each.inside.entered for each in every),
-        exits=sum(each.inside.left for each in every),
-        all_counted=found.joined.since is None,
-        where=place.name,
-        unknown=_unknown(view, window, [track], mixed),
-        reaches_now=newest is not None,
-        notes=view.notes.sentences(),
-    )
 
 
 def asked_place(
@@ -188,17 +203,21 @@ def asked_place(
 
 def _unknown(view: View, window: TimeWindow, tracks: Iterable[RobotTrack], mixed: Spans) -> Ns:
     """Returns for how long it is not known where the robot was, by a track for each frame."""
-    every = (unknown_times(view, window, placed_times(one, mixed), WHEREABOUTS) for one in tracks)
-    return elapsed_in(view, window).among(united(chain.from_iterable(every)))
+    spans = (
+        unknown_times(view, window, placed_times(track, mixed), WHEREABOUTS) for track in tracks
+    )
+    return elapsed_in(view, window).among(united(chain.from_iterable(spans)))
 
 
-def _newest(view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns) -> Ns | None:
+def _newest_pose_time(
+    view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns
+) -> Ns | None:
     """Returns the time of the newest pose until `last`, where the window reaches as far."""
     message = view.stream.newest(topic, TimeWindow(MIN_NS, last + 1))
     if message is None or window.stop <= message.time:
         return None
-    known = track.times[track.times <= last]
-    return int(known[-1]) if known.size else None
+    times = track.times[track.times <= last]
+    return int(times[-1]) if times.size else None
 
 
 def _within_asked(visit: Visit, window: TimeWindow) -> Visit:
@@ -225,8 +244,8 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
         return shown
     resets = () if path is None else path.totals.resets
     return tuple(
-        replace(each, restarts=sum(reset > (each.departed or now) for reset in resets))
-        for each in shown
+        replace(visit, restarts=sum(reset > (visit.departed or now) for reset in resets))
+        for visit in shown
     )
 
 
@@ -254,7 +273,7 @@ class RegionVisits:
     """
 
     def __init__(self, view: View, frame_id: str, region: Region, window: TimeWindow) -> None:
-        """Finds them.
+        """Finds the visits by the tracks, and confirms by poses those that are in doubt.
 
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
@@ -262,22 +281,22 @@ class RegionVisits:
         self.joined = joined_in(view, frame_id, window)
         self.elapsed = elapsed_in(view, window)
         self._region, self._window = region, window
-        # What shows that a visit is one shows where it begins, too.
+        # The poses that confirm a visit show where it begins, too.
         self._poses = lru_cache(2 * _MOST_TRIED)(RobotTracks(view, frame_id).poses)
-        found = [
-            RegionVisit(one.within(window), one, track)
+        by_track = [
+            RegionVisit(stay.within(window), stay, track)
             for track in self.joined.tracks
-            for one in self._continued(times_inside(track, region))
-            if window.overlaps(one.start, one.stop)
+            for stay in self._continued(times_inside(track, region))
+            if window.overlaps(stay.start, stay.stop)
         ]
-        found.sort(key=lambda visit: visit.whole, reverse=True)
+        by_track.sort(key=lambda visit: visit.whole, reverse=True)
         self._looked_at = 0
-        self.every = [each for each in map(self._seen, found) if each is not None]
+        self.every = [visit for visit in map(self._confirmed, by_track) if visit is not None]
 
     @property
     def duration(self) -> Ns:
         """How long they were in all, as the tracks have them."""
-        return self.elapsed.among((each.inside.start, each.inside.stop) for each in self.every)
+        return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.every)
 
     def ends(self, visit: RegionVisit) -> Inside:
         """Returns a visit from its first to its last pose inside, cut at the window's ends."""
@@ -290,20 +309,20 @@ class RegionVisits:
         Its times are those of poses: of the first and the last one inside, and of the closest.
         `newest` is the newest pose, if it is recent enough.
         """
-        one = self.ends(visit)
-        is_there = newest is not None and one.start <= newest <= one.stop and not one.left
+        ends = self.ends(visit)
+        is_there = newest is not None and ends.start <= newest <= ends.stop and not ends.left
         distance_m, at = None, None
         if isinstance(self._region, Circle):
-            distance_m, at = self._closest(visit.track, one, self._region)
+            distance_m, at = self._closest(visit.track, ends, self._region)
         return Visit(
-            arrived=one.start,
-            departed=None if is_there else one.stop,
-            duration=self.elapsed.between(one.start, one.stop),
+            arrived=ends.start,
+            departed=None if is_there else ends.stop,
+            duration=self.elapsed.between(ends.start, ends.stop),
             closest_m=distance_m,
             closest_at=at,
             restarts=0,
-            already_inside=not one.entered,
-            still_inside=not one.left and not is_there,
+            already_inside=not ends.entered,
+            still_inside=not ends.left and not is_there,
         )
 
     def _continued(self, visits: list[Inside]) -> list[Inside]:
@@ -312,17 +331,17 @@ class RegionVisits:
         Along the edge of a region its track may be outside where it was inside. The newest
         `_MOST_TRIED` of such visits are looked at.
         """
-        found = visits[-1:]
+        joined_visits = visits[-1:]
         looked_at = 0
         for older in visits[-2::-1]:
-            newer = found[-1]
+            newer = joined_visits[-1]
             if newer.entered and older.left and newer.start - older.stop < _CLOSE_NS:
                 looked_at += 1
                 if looked_at <= _MOST_TRIED and self._stays(older, newer):
-                    found[-1] = newer._replace(start=older.start, entered=older.entered)
+                    joined_visits[-1] = newer._replace(start=older.start, entered=older.entered)
                     continue
-            found.append(older)
-        return found
+            joined_visits.append(older)
+        return joined_visits
 
     def _stays(self, older: Inside, newer: Inside) -> bool:
         """Returns whether poses between two visits were never outside for as long as leaving takes.
@@ -332,12 +351,12 @@ class RegionVisits:
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = [*self._inside(*poses[:3])]
+        inside = [*self._poses_inside(poses)]
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
 
-    def _seen(self, visit: RegionVisit) -> RegionVisit | None:
+    def _confirmed(self, visit: RegionVisit) -> RegionVisit | None:
         """Returns a visit; None where no pose in the window is inside: the line alone touches.
 
         The newest `_MOST_TRIED` visits without a vertex inside are looked at.
@@ -346,16 +365,18 @@ class RegionVisits:
         # So near to the window's ends, poses decide on which side a visit begins, or ends.
         room = TRACK_SLICE_NS
         if window.start + room <= whole.start and whole.stop < window.stop - room:
-            self._looked_at += not (has_vertex := any(True for _ in self._vertices(track, whole)))
-            if has_vertex or self._looked_at > _MOST_TRIED:
+            if any(True for _ in self._vertices_inside(track, whole)):
+                return visit
+            self._looked_at += 1
+            if self._looked_at > _MOST_TRIED:
                 return visit
         exact = self._by_poses(visit)
         if exact is None or not window.overlaps(exact.start, exact.stop):
             return None
         cut = exact.within(window)
-        if cut != exact and not any(True for _ in self._vertices(track, cut)):
+        if cut != exact and not any(True for _ in self._vertices_inside(track, cut)):
             poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
-            if not any(True for _ in self._inside(*poses[:3])):
+            if not any(True for _ in self._poses_inside(poses)):
                 return None
         inside = visit.inside._replace(entered=cut.entered, left=cut.left)
         return visit._replace(inside=inside)
@@ -365,48 +386,58 @@ class RegionVisits:
 
         None where no pose is inside: the robot's line alone touches the region.
         """
-        one = visit.whole
-        within = [*self._vertices(visit.track, one)]
-        start, stop = one.start, one.stop
-        if one.entered:
-            poses = self._poses_around(visit.track, one.start)
-            inside = [time for time in self._inside(*poses) if time <= one.stop]
-            others = [back for left, back in _absences(poses[0], inside) if left < one.start]
-            inside = [time for time in inside if time >= max(others, default=MIN_NS)]
-            start = min((*inside[:1], *within[:1]), default=MAX_NS)
-        if one.left:
-            poses = self._poses_around(visit.track, one.stop)
-            inside = [time for time in self._inside(*poses) if time >= one.start]
-            others = [left for left, back in _absences(poses[0], inside) if back > one.stop]
-            inside = [time for time in inside if time <= min(others, default=MAX_NS)]
-            stop = max((*inside[-1:], *within[-1:]), default=MIN_NS)
-        return one._replace(start=start, stop=stop) if start <= stop else None
+        whole = visit.whole
+        start = self._first_inside(visit) if whole.entered else whole.start
+        stop = self._last_inside(visit) if whole.left else whole.stop
+        return whole._replace(start=start, stop=stop) if start <= stop else None
 
-    def _inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
+    def _first_inside(self, visit: RegionVisit) -> Ns:
+        """Returns when the first pose of a visit is inside; `MAX_NS` where none is."""
+        whole = visit.whole
+        poses = self._poses_around(visit.track, whole.start)
+        inside = [time for time in self._poses_inside(poses) if time <= whole.stop]
+        # What lies before an absence is of the visit before.
+        returns = [back for left, back in _absences(poses.times, inside) if left < whole.start]
+        own = (time for time in inside if time >= max(returns, default=MIN_NS))
+        return min(chain(own, self._vertices_inside(visit.track, whole)), default=MAX_NS)
+
+    def _last_inside(self, visit: RegionVisit) -> Ns:
+        """Returns when the last pose of a visit is inside; `MIN_NS` where none is."""
+        whole = visit.whole
+        poses = self._poses_around(visit.track, whole.stop)
+        inside = [time for time in self._poses_inside(poses) if time >= whole.start]
+        leaves = [left for left, back in _absences(poses.times, inside) if back > whole.stop]
+        own = (time for time in inside if time <= min(leaves, default=MAX_NS))
+        return max(chain(own, self._vertices_inside(visit.track, whole)), default=MIN_NS)
+
+    def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
+        return self._times_inside(poses.times, poses.x, poses.y)
+
+    def _times_inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
         """Yields those of some times at which the robot was in the region."""
         rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
         return (time for time, *place in rows if self._region.contains(*place))
 
-    def _vertices(self, track: RobotTrack, one: Inside) -> Iterator[Ns]:
+    def _vertices_inside(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
         """Yields the times of a visit's vertices that are inside."""
-        first = int(np.searchsorted(track.times, one.start, side="left"))
-        last = int(np.searchsorted(track.times, one.stop, side="right"))
+        first = int(np.searchsorted(track.times, stay.start, side="left"))
+        last = int(np.searchsorted(track.times, stay.stop, side="right"))
         visit = slice(first, last)
-        return self._inside(track.times[visit], track.x[visit], track.y[visit])
+        return self._times_inside(track.times[visit], track.x[visit], track.y[visit])
 
-    def _poses_around(self, track: RobotTrack, at: Ns) -> tuple[Times, Floats, Floats]:
+    def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
         """Returns the poses between the vertices before and after a time, these included."""
         times = track.times
         before = max(int(np.searchsorted(times, at, side="left")) - 1, 0)
         after = min(int(np.searchsorted(times, at, side="right")), len(times) - 1)
-        return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))[:3]
+        return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))
 
-    def _closest(self, track: RobotTrack, one: Inside, circle: Circle) -> tuple[float, Ns]:
+    def _closest(self, track: RobotTrack, stay: Inside, circle: Circle) -> tuple[float, Ns]:
         """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
-        first = max(int(np.searchsorted(track.times, one.start, side="right")) - 1, 0)
-        last = int(np.searchsorted(track.times, one.stop, side="left"))
+        first = max(int(np.searchsorted(track.times, stay.start, side="right")) - 1, 0)
+        last = int(np.searchsorted(track.times, stay.stop, side="left"))
         times = track.times[first : last + 1]
-        inner = np.concatenate(([one.start], times, [one.stop])).clip(one.start, one.stop)
+        inner = np.concatenate(([stay.start], times, [stay.stop])).clip(stay.start, stay.stop)
         since = times[0]
         x, y = (
             np.interp(inner - since, times - since, column[first : last + 1])
@@ -420,11 +451,11 @@ class RegionVisits:
         nearest = int(off.argmin())
         lasted = int(inner[nearest + 1] - inner[nearest])
         at = int(inner[nearest] + round(float(along[nearest]) * lasted))
-        times, x, y = self._poses_around(track, at)
-        away_m = np.hypot(x - circle.x, y - circle.y)
-        near = (times >= one.start) & (times <= one.stop)
-        poses = zip(away_m[near].tolist(), times[near].tolist(), strict=True)
-        return min(poses, default=(float(min(off[nearest], circle.radius_m)), at))
+        poses = self._poses_around(track, at)
+        away_m = np.hypot(poses.x - circle.x, poses.y - circle.y)
+        near = (poses.times >= stay.start) & (poses.times <= stay.stop)
+        approaches = zip(away_m[near].tolist(), poses.times[near].tolist(), strict=True)
+        return min(approaches, default=(float(min(off[nearest], circle.radius_m)), at))
 
 
 def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
@@ -438,15 +469,17 @@ def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
             yield left, back
 
 
-def place_visits(found: RegionVisits, name: str) -> PlaceVisits:
+def place_visits(region_visits: RegionVisits, name: str) -> PlaceVisits:
     """Returns how often, and for how long, the robot was in a place."""
-    entries = [each for each in found.every if each.inside.entered]
-    exits = [each for each in found.every if each.inside.left]
+    entries = [visit for visit in region_visits.every if visit.inside.entered]
+    exits = [visit for visit in region_visits.every if visit.inside.left]
     return PlaceVisits(
         place=name,
         entries=len(entries),
         exits=len(exits),
-        duration=found.duration,
-        first=found.ends(entries[-1]).start if entries else None,
-        last=found.ends(max(exits, key=lambda each: each.inside.stop)).stop if exits else None,
+        duration=region_visits.duration,
+        first=region_visits.ends(entries[-1]).start if entries else None,
+        last=region_visits.ends(max(exits, key=lambda visit: visit.inside.stop)).stop
+        if exits
+        else None,
     )

@@ -90,7 +90,7 @@ class Where:
     def places(self, frame_id: str) -> tuple[Place, ...]:
         """Returns each of its places by name; `frame_id` is the frame of those that name none."""
         frame = self.frame_id or frame_id
-        return tuple(Place(one.title, one.frame_id or frame, one.region) for one in self.each)
+        return tuple(Place(part.title, part.frame_id or frame, part.region) for part in self.each)
 
     @property
     def shown(self) -> JsonValue:
@@ -122,40 +122,40 @@ def parse_where(
     Raises:
         InvalidArgumentsError: it is no region, or no place has that name.
     """
-    several = _several(limits, value)
+    several = _places_by_name(limits, value)
     if several is None:
-        return _one(limits, value, default_radius_m, what)
+        return _parse_place(limits, value, default_radius_m, what)
     if len(several) > _MOST_PLACES:
         raise InvalidArgumentsError(
             f"{what} has {len(several)} places, more than {_MOST_PLACES}: ask about some of them"
         )
-    every = (
-        (name, _one(limits, each, default_radius_m, f"{what}: {abbreviate(name)}"))
-        for name, each in several.items()
+    by_name = (
+        (name, _parse_place(limits, place_value, default_radius_m, f"{what}: {abbreviate(name)}"))
+        for name, place_value in several.items()
     )
-    found = tuple(
-        replace(place, name=name) if place.name is None else place for name, place in every
+    places = tuple(
+        replace(place, name=name) if place.name is None else place for name, place in by_name
     )
-    if len(found) == 1:
-        return found[0]
-    region = AnyOf(tuple(each.region for each in found))
-    names = ", ".join(each.title for each in found)
-    return Where(region, _frame_of(found), names, found)
+    if len(places) == 1:
+        return places[0]
+    region = AnyOf(tuple(part.region for part in places))
+    names = ", ".join(part.title for part in places)
+    return Where(region, _frame_of(places), names, places)
 
 
-def _several(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
+def _places_by_name(limits: QuerySettings, value: JsonValue) -> dict[str, JsonValue] | None:
     """Returns places by name; None of a value that is to be one place."""
     if isinstance(value, str):
         names = [name.strip() for name in value.split(",")]
         if len(names) == 1 or _place_named(limits, value) is not None:
             return None
         return {name: name for name in names if name} or None
-    if isinstance(value, list) and value and all(isinstance(each, str) for each in value):
-        return {str(each): each for each in value}
+    if isinstance(value, list) and value and all(isinstance(name, str) for name in value):
+        return {str(name): name for name in value}
     if not isinstance(value, dict):
         return None
     is_one = any(not isinstance(value.get(name, {}), dict) for name in _OF_REGION)
-    are_places = any(isinstance(each, str | dict) for each in value.values())
+    are_places = any(isinstance(place_value, str | dict) for place_value in value.values())
     return value if are_places and not is_one else None
 
 
@@ -165,18 +165,18 @@ def _frame_of(several: Sequence[Where]) -> str | None:
     Raises:
         InvalidArgumentsError: they are in several frames.
     """
-    known = {each.frame_id: each.title for each in several if each.frame_id is not None}
-    if len(known) > 1:
-        listed = ", ".join(f"{name} is in {frame}" for frame, name in known.items())
+    name_by_frame = {part.frame_id: part.title for part in several if part.frame_id is not None}
+    if len(name_by_frame) > 1:
+        listed = ", ".join(f"{name} is in {frame}" for frame, name in name_by_frame.items())
         raise InvalidArgumentsError(f"where: {listed}: ask about places of one frame")
-    return next(iter(known), None)
+    return next(iter(name_by_frame), None)
 
 
-def _one(
+def _parse_place(
     limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        return _named(limits, value, what)
+        return _place_by_name(limits, value, what)
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - _OF_REGION
@@ -186,20 +186,19 @@ def _one(
     if isinstance(x, list) or isinstance(y, list):
         if "radius_m" in value:
             raise InvalidArgumentsError(f"{what} has a radius_m and a range; {_EXPECTED}")
-        return Where(Rectangle(*_bounds(f"{what}: x", x), *_bounds(f"{what}: y", y)))
+        return Where(Rectangle(*_parse_range(f"{what}: x", x), *_parse_range(f"{what}: y", y)))
     radius = value.get("radius_m", default_radius_m)
-    numbers = [_number(each) for each in (x, y, radius)]
-    if None in numbers or not (numbers[2] or 0) > 0:
+    at_x, at_y, radius_m = map(_finite_number, (x, y, radius))
+    if at_x is None or at_y is None or radius_m is None or radius_m <= 0:
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
-    at_x, at_y, size = (each or 0.0 for each in numbers)
-    return Where(Circle(at_x, at_y, size))
+    return Where(Circle(at_x, at_y, radius_m))
 
 
 def places_asked(
     limits: QuerySettings, where: Where | None, frames: Iterable[str]
 ) -> tuple[Place, ...]:
     """Returns the named places, and those that a question names in any of some frames."""
-    asked = [] if where is None or where.name is None else [where.places(one) for one in frames]
+    asked = [] if where is None or where.name is None else [where.places(frame) for frame in frames]
     return tuple(dict.fromkeys(chain(limits.places, *asked)))
 
 
@@ -210,30 +209,30 @@ def places_setting(limits: QuerySettings) -> str:
 
 def _place_named(limits: QuerySettings, name: str) -> Place | None:
     asked = " ".join(name.split()).casefold()
-    same = (one for one in limits.places if " ".join(one.name.split()).casefold() == asked)
+    same = (named for named in limits.places if " ".join(named.name.split()).casefold() == asked)
     return next(same, None)
 
 
-def _named(limits: QuerySettings, name: str, what: str) -> Where:
+def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
     place = _place_named(limits, name)
     if place is not None:
         return Where(place.region, place.frame_id, place.name)
-    known = ", ".join(sorted(each.name for each in limits.places))
+    names = ", ".join(sorted(named.name for named in limits.places))
     none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
-    listed = f"there are: {known}" if known else none
+    listed = f"there are: {names}" if names else none
     raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(name)}; {listed}")
 
 
-def _bounds(axis: str, value: JsonValue) -> tuple[float, float]:
-    ends = [_number(each) for each in value] if isinstance(value, list) else []
-    if len(ends) != 2 or ends[0] is None or ends[1] is None or ends[0] > ends[1]:
-        raise InvalidArgumentsError(
-            f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
-        )
-    return ends[0], ends[1]
+def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
+    match [_finite_number(bound) for bound in value] if isinstance(value, list) else []:
+        case [float(low), float(high)] if low <= high:
+            return low, high
+    raise InvalidArgumentsError(
+        f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"
+    )
 
 
-def _number(value: JsonValue) -> float | None:
+def _finite_number(value: JsonValue) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -250,14 +249,14 @@ def note_other_frame(
 
     As replies of get_position_* give them. `ask` says how to ask for what is there.
     """
-    own = placement.pose_frame
-    if where.frame_id is not None or own == placement.frame_id:
+    pose_frame = placement.pose_frame
+    if where.frame_id is not None or pose_frame == placement.frame_id:
         return
     with suppress(QueryTimeoutError):
-        if joined_in(view, own, window).inside(where.region, window):
+        if joined_in(view, pose_frame, window).inside(where.region, window):
             view.notes.add(
-                f"x and y were taken in {placement.frame_id}; the robot was at those in {own}, "
-                f"the frame of get_position_*: {ask}"
+                f"x and y were taken in {placement.frame_id}; the robot was at those in "
+                f"{pose_frame}, the frame of get_position_*: {ask}"
             )
 
 
@@ -294,17 +293,17 @@ class Scope:
         self.unknown: Spans = []
         self._inside: Spans | None = None
         if where is not None:
-            region = parse_where(view.limits, where)
-            joined = joined_in_region(view, region, window)
-            inside = joined.inside(region.region, window)
-            self._inside = united((each.start, each.stop + 1) for each in inside)
+            place = parse_where(view.limits, where)
+            joined = joined_in_region(view, place, window)
+            inside = joined.inside(place.region, window)
+            self._inside = united((stay.start, stay.stop + 1) for stay in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)
             known = placed_times(joined.track, mixed)
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
-        self._states = [_States(view, each) for each in during]
-        for state, each in zip(self._states, during, strict=True):
+        self._states = [_ConditionStates(view, condition) for condition in during]
+        for state, condition in zip(self._states, during, strict=True):
             known = state.known_in(window)
-            unknown = unknown_times(view, window, known, f"what {each.topic} said")
+            unknown = unknown_times(view, window, known, f"what {condition.topic} said")
             self.unknown = united([*self.unknown, *unknown])
 
     @property
@@ -367,7 +366,7 @@ def joined_in_region(view: View, where: Where, window: TimeWindow) -> JoinedTrac
     return joined
 
 
-class _States:
+class _ConditionStates:
     """Whether the newest message of a topic met a condition; moments are asked newest first.
 
     Messages are read bag by bag: those around the moment, and the newest one before.
@@ -398,8 +397,8 @@ class _States:
         """Returns when the topics said something: without silences, unless that holds on."""
         topics, timeline = self._search.topics, self._view.timeline
         if self._holds_on:
-            begins = [span[0] for topic in topics for span in timeline.recordings(topic).values()]
-            known = [(min(begins, default=MAX_NS), MAX_NS)]
+            spans = (span for topic in topics for span in timeline.recordings(topic).values())
+            known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
         else:
             known = _heard(self._view, topics, window.widened(SILENCE_NS))
         return without(known, note_robots_on(self._view, topics, window))
@@ -435,15 +434,15 @@ class _States:
         start = min((span.first for span in spans), default=time)
         stop = max((span.last + 1 for span in spans), default=time + 1)
         stop = max(stop, time + 1)
-        found = [*self._view.stream.messages(topics, TimeWindow(start, stop))]
-        if not found or found[0].time > start:
+        messages = [*self._view.stream.messages(topics, TimeWindow(start, stop))]
+        if not messages or messages[0].time > start:
             before = self._view.stream.first(topics, TimeWindow(MIN_NS, start), newest_first=True)
-            found = found if before is None else [before, *found]
+            messages = messages if before is None else [before, *messages]
         self._times, self._values = [], []
-        for each in found:
-            met = self._search.matches(each)
+        for message in messages:
+            met = self._search.matches(message)
             if met is not None:
-                self._times.append(each.time)
+                self._times.append(message.time)
                 self._values.append(met)
         self._known = TimeWindow(start, stop)
 
@@ -460,8 +459,8 @@ def _heard(view: View, topics: Iterable[str], window: TimeWindow) -> Spans:
         spans.append((firsts[~is_long], lasts[~is_long]))
         within = zip(firsts[is_long].tolist(), (lasts[is_long] + 1).tolist(), strict=True)
         if is_long.any():
-            every = scan(view, topic, window, columns=False, within=united(within))
-            spans += [pieces_of(rows.times, rows.times) for rows in every]
-    starts, stops = (np.concatenate(some) for some in zip(*spans, strict=True))
+            scanned = scan(view, topic, window, columns=False, within=united(within))
+            spans += [pieces_of(rows.times, rows.times) for rows in scanned]
+    starts, stops = (np.concatenate(bounds) for bounds in zip(*spans, strict=True))
     starts, stops = pieces_of(starts, stops)
     return list(zip(starts.tolist(), (stops + 1).tolist(), strict=True))

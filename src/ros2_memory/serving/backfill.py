@@ -32,7 +32,7 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
 from ros2_memory.insights.drive import drive_made
 from ros2_memory.insights.topic_events import events_made
-from ros2_memory.places.pose_frames import tracks_made
+from ros2_memory.places.pose_frames import make_tracks
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.things.seen import Watching
 
@@ -204,7 +204,7 @@ def make_fragments(
             make_statics(view, window)
             made = [
                 drive_made(view, window),
-                tracks_made(view, window),
+                make_tracks(view, window),
                 events_made(view, window, topics_with_changes(view)),
             ]
             if nth < len(pieces):

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.frames import Frames, Rotations
+from ros2_memory.analysis.frames import FrameTree, Rotations
 from ros2_memory.analysis.motion.odometry import FARTHEST_M
 from ros2_memory.analysis.poses import NO_POSES, Poses, headings, joined_poses
 from ros2_memory.analysis.sights import (
     AHEAD_MM,
     SLICE_NS,
+    DetectorMessages,
     Floats,
     Ints,
-    Seen,
     Sights,
     fixes_of,
     sights_of,
@@ -151,19 +151,19 @@ class Placer:
             poses, frames=poses.frames._replace(codes=poses.frames.codes * 0, words=words)
         )
 
-    def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, Frames]:
+    def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""
         own = poses.frames.words[0] if len(poses) else ""
         target = self._view.limits.map_frame or own
         if not among:
             target = own if len(poses) else target
-            return target, Frames((), {}, target)
+            return target, FrameTree((), {}, target)
         frames = frames_over(self._view, among, window, target)
         if not len(poses) or (own and (own == target or frames.reaches(own))):
             return target, frames
         return own, frames_over(self._view, among, window, own)
 
-    def _fixes(self, own: Session, frame: str, frames: Frames, seen: Ints) -> Ints:
+    def _fixes(self, own: Session, frame: str, frames: FrameTree, seen: Ints) -> Ints:
         """Returns where odometry was in the map around detections, where that changes."""
         first, last = int(seen.min()), int(seen.max()) + _AHEAD_NS
         step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
@@ -227,7 +227,7 @@ def is_named_for_detections(type_name: str) -> bool:
     return any(word in name for word in _OF_DETECTORS)
 
 
-def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:
+def _seen(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
     """Returns messages with the robot's poses and the detections placed in the target frame."""
     found = detected.found
     places = np.full(found.places.shape, math.nan)
@@ -243,10 +243,10 @@ def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:
             places[some] = np.where(known.valid[:, None], placed, math.nan)
     robot = _robot_at(poses, detected.times, frames)
     labels = found.labels.codes.astype(np.int64), found.labels.words
-    return Seen(detected.log_times, robot, found.rows, *labels, places, found.scores)
+    return DetectorMessages(detected.log_times, robot, found.rows, *labels, places, found.scores)
 
 
-def _robot_at(poses: Poses, times: Ints, frames: Frames) -> Floats:
+def _robot_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
 
     That is farther than 1 s from a pose, or where no transform leads from its frame.

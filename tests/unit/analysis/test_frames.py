@@ -18,7 +18,7 @@ from ros2_memory.analysis.frames import (
     HOLD_NS,
     TF_CACHE_NS,
     ClockOfTransforms,
-    Frames,
+    FrameTree,
     agreeing_clock,
     edges_of,
 )
@@ -61,10 +61,10 @@ class Tree:
     transforms: Sequence[StampedTransform]
     clock: ClockOfTransforms = "stamp"
 
-    def frames(self, target: str, hold_ns: int = AT_OR_BEFORE_SLACK_NS) -> Frames:
+    def frames(self, target: str, hold_ns: int = AT_OR_BEFORE_SLACK_NS) -> FrameTree:
         static = sorted((e for e in self.transforms if e.static), key=lambda e: e.log_time)
         moving = edges_of(e for e in self.transforms if not e.static)
-        return Frames(static, moving, target, self.clock, hold_ns)
+        return FrameTree(static, moving, target, self.clock, hold_ns)
 
     def lookup(self, parent: str, child: str, time: int) -> Transform:
         return self.frames(parent).lookup(child, time)

@@ -9,7 +9,7 @@ import pytest
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.transforms import connected
+from ros2_memory.history.transforms import connects_in_time
 from ros2_memory.history.view import View
 from ros2_memory.places.pose_frames import map_placement
 from tests.support.bags import odom, write_mcap
@@ -45,7 +45,7 @@ def test_the_map_is_known_from_the_newest_bags_alone(moving: Path) -> None:
     assert map_placement(view, "/odom", "map").frame_id == "map"
     nothing = _Looks()
     everything = View(memory, Call(Deadline.after(1e6, nothing)))
-    assert not connected(everything, ("map", "elsewhere"))
+    assert not connects_in_time(everything, ("map", "elsewhere"))
     assert looks.count < nothing.count / 4
 
 

@@ -19,9 +19,9 @@ from ros2_memory.analysis.motion.path_length import (
     FEWEST,
     SPEED_STEPS,
     End,
-    Marks,
-    Numbers,
-    Rows,
+    Flags,
+    Floats,
+    Vectors,
     measured,
 )
 from ros2_memory.core.arrays import row_sums
@@ -357,10 +357,10 @@ class MeasuredPath(NamedTuple):
     totals: MotionTotals
     step_mps: float
     parted: tuple[int, ...]
-    steps_m: Numbers
+    steps_m: Floats
 
 
-def measured_path(times: Times, positions: Rows, fastest_mps: float) -> MeasuredPath:
+def measured_path(times: Times, positions: Vectors, fastest_mps: float) -> MeasuredPath:
     """Measures poses: the more at a time, the better noise is distinguished from driving.
 
     Args:
@@ -373,14 +373,12 @@ def measured_path(times: Times, positions: Rows, fastest_mps: float) -> Measured
     plain_m = np.sqrt(row_sums(np.diff(positions, axis=0) ** 2))
     begin = 0
     for index in _odd_steps(apart, plain_m, fastest_mps):
-        sides = (
-            _poses(times, positions, max(begin, index - _NEARBY), index + 1),
-            _poses(times, positions, index + 1, index + 2 + _NEARBY),
-        )
+        earlier = _poses(times, positions, max(begin, index - _NEARBY), index + 1)
+        later = _poses(times, positions, index + 1, index + 2 + _NEARBY)
         # Too few poses do not show what is usual.
-        known = sum(map(len, sides)) >= _NEARBY
-        near = _motion_of(sides[0]).or_more(_motion_of(sides[1])) if known else None
-        here, there = sides[0][-1], sides[1][0]
+        are_enough = len(earlier) + len(later) >= _NEARBY
+        near = _motion_of(earlier).or_more(_motion_of(later)) if are_enough else None
+        here, there = earlier[-1], later[0]
         before = motion.totals.newest
         usual_ns = _usual_ns(apart, index, None if before is None else before.period_ns)
         kind = link(here, there, usual_ns, fastest_mps, near)
@@ -397,18 +395,18 @@ def measured_path(times: Times, positions: Rows, fastest_mps: float) -> Measured
     return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), steps_m)
 
 
-def _odd_steps(apart: Times, steps_m: Numbers, fastest_mps: float) -> list[int]:
+def _odd_steps(apart: Times, steps_m: Floats, fastest_mps: float) -> list[int]:
     """Returns after which poses a gap, a jump or a reset may be."""
     plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
     beside_m = np.maximum(
         np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
     )
     odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
-    found: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
-    return found
+    steps: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
+    return steps
 
 
-def _poses(times: Times, positions: Rows, begin: int, end: int) -> list[TimedPosition]:
+def _poses(times: Times, positions: Vectors, begin: int, end: int) -> list[TimedPosition]:
     places = zip(times[begin:end].tolist(), positions[begin:end].tolist(), strict=True)
     return [TimedPosition(time, (x, y, z)) for time, (x, y, z) in places]
 
@@ -427,21 +425,29 @@ class Motion:
         self.totals = MotionTotals()
         self.step_mps = 0.0
 
-    def add_leg(self, times: Times, positions: Rows) -> Numbers:
+    def add_leg(self, times: Times, positions: Vectors) -> Floats:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
-        found = measured((times - times[0]) / NS_PER_S, positions)
-        ends = (
-            _poses(times, positions, 0, _NEARBY + 1),
-            _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times)),
+        piece = measured((times - times[0]) / NS_PER_S, positions)
+        begin = _poses(times, positions, 0, _NEARBY + 1)
+        end = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
+        leg = Leg(
+            begin[0],
+            end[-1],
+            len(times),
+            int(np.median(apart)) if len(apart) else None,
+            piece.length_m,
+            piece.sum_m,
+            piece.head,
+            piece.tail,
+            piece.still,
+            _motion_of(begin),
+            _motion_of(end),
         )
-        period_ns = int(np.median(apart)) if len(apart) else None
-        near = _motion_of(ends[0]), _motion_of(ends[1])
-        leg = Leg(ends[0][0], ends[1][-1], len(times), period_ns, *found[:5], *near)
         if len(times) <= SPEED_STEPS:
-            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(ends[0])), 0.0)
-        self._go_on(None, leg, found.speed_mps)
-        return found.steps_m
+            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(begin)), 0.0)
+        self._go_on(None, leg, piece.speed_mps)
+        return piece.steps_m
 
     def join(self, later: MotionTotals) -> bool:
         """Takes the legs that come next; returns whether a jump or reset led there."""
@@ -469,28 +475,29 @@ class Motion:
         totals = self.totals
         if speed_mps is not None:
             totals.speed_mps = max(totals.speed_mps or 0.0, speed_mps)
-        kind: Link | None = None
-        if before is not None:
-            periods = [each for each in (before.period_ns, leg.period_ns) if each is not None]
-            near = None
-            if before.poses + leg.poses >= _NEARBY:
-                near = before.near_last.or_more(leg.near_first)
-            usual_ns = max(periods, default=None)
-            kind = link(before.last, leg.first, usual_ns, self._fastest_mps, near)
-            if kind != "driven":
-                self.count_break(kind, before.last, leg.first)
-            elif totals.tail is not None:
-                totals.tail = before.joined(leg)
+        kind = None if before is None else self._link_between(before, leg)
+        if before is not None and kind is not None:
+            if kind == "driven":
+                if totals.tail is None:
+                    totals.head = before.joined(leg)
+                else:
+                    totals.tail = before.joined(leg)
                 return False
-            else:
-                totals.head = before.joined(leg)
-                return False
+            self.count_break(kind, before.last, leg.first)
         if totals.head is None:
             totals.head = leg
         else:
             self._end_leg()
             totals.tail = leg
         return kind in ("jump", "reset")
+
+    def _link_between(self, before: Leg, after: Leg) -> Link:
+        periods = [leg.period_ns for leg in (before, after) if leg.period_ns is not None]
+        near = None
+        if before.poses + after.poses >= _NEARBY:
+            near = before.near_last.or_more(after.near_first)
+        usual_ns = max(periods, default=None)
+        return link(before.last, after.first, usual_ns, self._fastest_mps, near)
 
     def _end_leg(self) -> None:
         """Adds the last leg to those between."""
@@ -527,13 +534,13 @@ def _step_mps(step: tuple[TimedPosition, TimedPosition]) -> float:
 def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
     """Returns the usual time between poses around an interval, which itself counts least."""
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
-    own = near.pop(min(index, _NEARBY))
-    return median_low(near or [known or own])
+    own_ns = near.pop(min(index, _NEARBY))
+    return median_low(near or [known or own_ns])
 
 
-def are_places(positions: Rows) -> Marks:
+def are_places(positions: Vectors) -> Flags:
     """Returns which coordinates, as rows, are a place: finite, and on Earth."""
     x, y, z = np.abs(positions).T
     # A comparison with NaN is false, so this one refuses all three kinds.
-    marks: Marks = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
+    marks: Flags = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
     return marks

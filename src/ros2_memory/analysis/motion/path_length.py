@@ -42,9 +42,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import Vector3
 
-Numbers: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
-Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
-Marks: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
+Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
+Flags: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
 FEWEST: Final = 16
 """Positions below which no noise is estimated, and the plain sum is the length."""
@@ -161,10 +161,10 @@ class Measured(NamedTuple):
     tail: End
     still: bool
     speed_mps: float | None
-    steps_m: Numbers
+    steps_m: Floats
 
 
-def measured(seconds: Numbers, positions: Rows) -> Measured:
+def measured(seconds: Floats, positions: Vectors) -> Measured:
     """Measures the length of a path and the highest speed on it.
 
     Args:
@@ -190,7 +190,7 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
     creeps = [
         (begin, end, _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z)))
-        for begin, end in _rows(stationary)
+        for begin, end in _runs(stationary)
         if end - begin >= _STATIONARY_STEPS or end - begin == len(plain)
     ]
     moved = lengths.copy()
@@ -213,7 +213,7 @@ def measured(seconds: Numbers, positions: Rows) -> Measured:
     )
 
 
-def _noise(points: Rows) -> Rows:
+def _noise(points: Vectors) -> Vectors:
     """Returns the standard deviation of each axis at each position."""
     roots = np.sqrt(np.abs(np.diff(points, _ORDER, axis=0)))
     means = _moving_mean(roots, _NOISE_SPAN) ** 2 / (_ROOT_MEAN * _GROWTH)
@@ -221,7 +221,7 @@ def _noise(points: Rows) -> Rows:
     return means[at]
 
 
-def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, Marks]:
+def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flags, Flags]:
     """Returns the length of each step, whether it is the plain one, and whether it is noise."""
     variance = (noise[1:] ** 2 + noise[:-1] ** 2) / 2
     whole = row_sums(variance)
@@ -246,24 +246,24 @@ def _steps(points: Rows, plain: Numbers, noise: Rows) -> tuple[Numbers, Marks, M
         unsettled &= ~settled
     lengths[as_plain] = plain[as_plain]
     # A wide slope beside a sudden start counts part of the steps after it, which count already.
-    for begin, end in _rows(~as_plain):
-        most, found = plain[begin:end].sum(), lengths[begin:end].sum()
-        if found > most:
-            lengths[begin:end] *= most / found
+    for begin, end in _runs(~as_plain):
+        most, summed = plain[begin:end].sum(), lengths[begin:end].sum()
+        if summed > most:
+            lengths[begin:end] *= most / summed
     return lengths, as_plain, unsettled & (energy < _STATIONARY * share)
 
 
-def _scatters(points: Rows, places: Rows, noise: Rows) -> Marks:
+def _scatters(points: Vectors, places: Vectors, noise: Vectors) -> Flags:
     """Returns at which steps the positions spread around one place as far as their noise does."""
     spread = _moving_mean(points**2, _MEAN_SPAN) - places**2
     ratio = row_sums(spread) / np.maximum(row_sums(noise**2), 1e-300)
     low, high = _SPREAD
-    around: Marks = (low * low <= ratio) & (ratio <= high * high)
-    both: Marks = around[1:] & around[:-1]
+    around: Flags = (low * low <= ratio) & (ratio <= high * high)
+    both: Flags = around[1:] & around[:-1]
     return both
 
 
-def _slopes(points: Rows, width: int) -> Rows:
+def _slopes(points: Vectors, width: int) -> Vectors:
     """Returns for each step the slope of the line fitted to the `width` positions around it.
 
     Near an end of the path it is fitted to the first or last ones.
@@ -275,7 +275,7 @@ def _slopes(points: Rows, width: int) -> Rows:
     return fits[at]
 
 
-def _moving_mean(rows: Rows, span: int) -> Rows:
+def _moving_mean(rows: Vectors, span: int) -> Vectors:
     """Returns means over each row and `span` ones to either side; over as many at the ends."""
     width = min(2 * span + 1, len(rows))
     sums = np.zeros((len(rows) + 1, rows.shape[1]))
@@ -284,29 +284,29 @@ def _moving_mean(rows: Rows, span: int) -> Rows:
     return means[np.clip(np.arange(len(rows)) - span, 0, len(means) - 1)]
 
 
-def _rows(marks: Marks) -> Iterator[tuple[int, int]]:
+def _runs(marks: Flags) -> Iterator[tuple[int, int]]:
     """Returns the half-open ranges in which marks are set."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], marks, [False])).astype(np.int8)))
     return iter([(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)])
 
 
-def _creep(places: Rows, reach: Numbers, origin: Vector3) -> Creep:
+def _creep(places: Vectors, reach: Floats, origin: Vector3) -> Creep:
     """Returns which of the places a robot left: was farther from than its noise explains."""
-    found = [0]
+    left_at = [0]
     while True:
-        at = found[-1]
+        at = left_at[-1]
         off = np.sqrt(row_sums((places[at:] - places[at]) ** 2)) > reach[at:]
         if not off.any():
             break
-        found.append(at + int(off.argmax()))
+        left_at.append(at + int(off.argmax()))
     x, y, z = origin
-    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[found]]
+    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[left_at]]
     middle_m = math.fsum(distance(here, there) for here, there in pairwise(left[1:]))
     second = left[1] if len(left) > 1 else None
     return Creep(left[0], second, middle_m, left[-1], float(reach.max()))
 
 
-def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
+def _highest_speed(seconds: Floats, lengths: Floats) -> float:
     """Returns the highest speed over windows of a second, and of eight steps at least."""
     # A single step far longer than those around it is a correction of the position, not speed.
     usual = _moving_mean(np.sqrt(lengths)[:, None], SPEED_STEPS)[:, 0] ** 2
@@ -327,7 +327,7 @@ def _highest_speed(seconds: Numbers, lengths: Numbers) -> float:
     return float(travelled[-1] / max(seconds[-1] - seconds[0], _JITTER_S))
 
 
-def _sparse_speed(lengths: Numbers, apart: Numbers) -> float | None:
+def _sparse_speed(lengths: Floats, apart: Floats) -> float | None:
     """Returns the highest median speed of eight steps that take a second or longer, if any do."""
     if len(lengths) < SPEED_STEPS:
         return None

@@ -106,14 +106,20 @@ class TrackPart(NamedTuple):
         """About how much memory it takes."""
         return 300 + 34 * len(self.times)
 
+    @property
+    def columns(self) -> tuple[Times, Floats, Floats, Times, Mask, Mask]:
+        """The arrays of its vertices."""
+        return self[:6]
+
     def some(self, index: NDArray[np.intp]) -> TrackPart:
         """Returns some vertices of it, in the order given."""
-        return TrackPart._make((*(column[index] for column in self[:6]), *self[6:]))
+        columns = (column[index] for column in self.columns)
+        return TrackPart._make((*columns, self.left_out, self.recording))
 
 
 def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
-    """Returns the vertices of some parts, one at least, in their order; as of the first one."""
-    columns = map(np.concatenate, zip(*(part[:6] for part in parts), strict=True))
+    """Returns the vertices of parts, one at least, in their order, under the first's recording."""
+    columns = map(np.concatenate, zip(*(part.columns for part in parts), strict=True))
     left_out = sum(part.left_out for part in parts)
     return TrackPart._make((*columns, left_out, parts[0].recording))
 
@@ -129,12 +135,12 @@ def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     Of several of one time the first. They are in order of time, or of recordings and then of time.
     """
     numbers = np.broadcast_to(recordings, times.shape)
-    first = np.flatnonzero(_differ(times, numbers))
-    is_new = _differ(times[first] // _SLOT_NS, numbers[first])
+    first = np.flatnonzero(_is_new(times, numbers))
+    is_new = _is_new(times[first] // _SLOT_NS, numbers[first])
     return first[is_new | _is_last(is_new)]
 
 
-def _differ(*columns: Times) -> Mask:
+def _is_new(*columns: Times) -> Mask:
     """Returns which rows differ from the row before; the first one does."""
     differ = np.ones(len(columns[0]), np.bool_)
     differ[1:] = np.logical_or.reduce([np.diff(column) != 0 for column in columns])
@@ -173,7 +179,7 @@ def track_by(whole: TrackPart, recordings: Times, fastest_mps: float = math.inf)
     """
     order = _in_time(whole.times)
     whole, recordings = whole.some(order), recordings[order]
-    turns = _continuous(whole.turns, ~_differ(recordings))
+    turns = _continuous(whole.turns, ~_is_new(recordings))
     heading = np.where(whole.known, turns * (math.tau / _TURN), np.nan)
     begins = np.append([True], np.diff(whole.times) > SILENCE_NS)[: len(whole.times)]
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
@@ -184,16 +190,16 @@ def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, 
 
     With the number of the recording of each vertex. All at once: a week has thousands of them.
     """
-    every = [part for parts in recordings for part in parts]
-    if not every:
+    parts_in_order = [part for parts in recordings for part in parts]
+    if not parts_in_order:
         times, none = np.zeros(0, np.int64), np.zeros(0)
         return track_part(times, none, none, none), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
-    whole, numbers = united_parts(every), np.repeat(np.arange(len(recordings)), sizes)
+    whole, numbers = united_parts(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
-    are_known = whole.settled & ~_differ(numbers)
+    are_known = whole.settled & ~_is_new(numbers)
     are_known[1:] &= whole.settled[:-1]
     whole = whole._replace(turns=_continuous(whole.turns, are_known))
     vertices = _vertices(whole, whole.settled, numbers)
@@ -204,7 +210,7 @@ def _in_time(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
     """Returns the order of times in each recording, of equal ones the first alone."""
     numbers = np.broadcast_to(recordings, times.shape)
     order = np.lexsort((times, numbers))
-    return order[_differ(times[order], numbers[order])]
+    return order[_is_new(times[order], numbers[order])]
 
 
 def _continuous(turns: Times, are_known: Mask) -> Times:
@@ -219,7 +225,7 @@ def _continuous(turns: Times, are_known: Mask) -> Times:
 def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
     """Returns which poses are vertices: those to keep, and what their slices need besides."""
     times = part.times
-    is_first = _differ(times // TRACK_SLICE_NS, recordings)
+    is_first = _is_new(times // TRACK_SLICE_NS, recordings)
     kept = keeps | is_first | _is_last(is_first)
     turned = part.turns * (math.tau / _TURN * _WEIGHT)
     waiting = np.flatnonzero(~kept)
@@ -236,9 +242,9 @@ def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.int
         off = np.maximum(off, away * away)
         first = np.flatnonzero(np.append([True], after[1:] != after[:-1]))
         worst = np.maximum.reduceat(off, first)
-        each = np.repeat(worst, np.diff(first, append=waiting.size))
-        is_bent = each > TOLERANCE_M * TOLERANCE_M
-        splits = np.flatnonzero(is_bent & (off == each))
+        worst_here = np.repeat(worst, np.diff(first, append=waiting.size))
+        is_bent = worst_here > TOLERANCE_M * TOLERANCE_M
+        splits = np.flatnonzero(is_bent & (off == worst_here))
         of_step = after[splits]
         splits = splits[np.append([True], of_step[1:] != of_step[:-1])[: splits.size]]
         kept[waiting[splits]] = True

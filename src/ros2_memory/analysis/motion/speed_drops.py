@@ -53,13 +53,13 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     slots = times // SLOT_NS
     in_a_row = slots[_ROWS - 1 :] - slots[: 1 - _ROWS] < _ROWS
     falls = in_a_row & _falls(around[:, 1:]) & ~_falls(around[:, :-1])
-    found = np.flatnonzero(falls)
-    turned = headings(poses.turns[rows[found + 6]]) - headings(poses.turns[rows[found + 2]])
+    drops = np.flatnonzero(falls)
+    turned = headings(poses.turns[rows[drops + 6]]) - headings(poses.turns[rows[drops + 2]])
     # Where a heading is not known, it turns no more than others.
-    found = found[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
+    drops = drops[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
     return tuple(
         SpeedDrop(int(times[at + 3]), float(around[at, 1:3].min()), float(around[at, 4:].max()))
-        for at in found.tolist()
+        for at in drops.tolist()
     )
 
 
@@ -68,6 +68,6 @@ def _falls(
 ) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
     """Returns whether a robot that moved clearly is slow from the fourth of five speeds on."""
     before, after = speeds[:, :2].min(axis=1), speeds[:, 3:].max(axis=1)
-    found: np.ndarray[tuple[int], np.dtype[np.bool_]] = before >= MOVING_MPS
-    found &= after <= FRACTION * before
-    return found
+    is_slow: np.ndarray[tuple[int], np.dtype[np.bool_]] = before >= MOVING_MPS
+    is_slow &= after <= FRACTION * before
+    return is_slow

@@ -163,15 +163,15 @@ class Blocks:
     def are_still(self) -> Flags:
         """Returns whether drift and noise explain the boxes."""
         lows, highs = self.corners()
-        found: Flags = _lengths(highs - lows) <= np.minimum(
+        are_explained: Flags = _lengths(highs - lows) <= np.minimum(
             np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64)), LARGEST_M
         )
-        return found
+        return are_explained
 
     @property
     def memory_bytes(self) -> int:
         """How much memory the arrays take."""
-        return sum(getattr(self, each.name).nbytes for each in fields(self))
+        return sum(getattr(self, column.name).nbytes for column in fields(self))
 
 
 def _in_units(corners: Vectors) -> Corners:
@@ -214,7 +214,7 @@ def stands_of(poses: Poses, start: Ns, stop: Ns) -> Stands:
     places = inside.times[are_places(inside.positions)]
     return Stands(
         blocks_of(poses, start, stop),
-        tuple(each for each in speed_drops(poses) if start <= each.time < stop),
+        tuple(drop for drop in speed_drops(poses) if start <= drop.time < stop),
         int(places[-1]) if places.size else MIN_NS,
     )
 
@@ -237,29 +237,29 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     is_first = np.r_[links, False] & ~np.r_[False, links]
     is_last = np.r_[False, links] & ~np.r_[links, False]
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(is_last)
-    edges = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    is_long = slots.lasts[edges[1]] - slots.firsts[edges[0]] >= SHORTEST_NS
-    among = np.zeros(len(slots), np.bool_)
+    before, after = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
+    is_long = slots.lasts[after] - slots.firsts[before] >= SHORTEST_NS
+    is_inner = np.zeros(len(slots), np.bool_)
     for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
-        among[first + 1 : last] = True
-    found = _blocks(slots, np.flatnonzero(among), np.cumsum(is_first))
-    times, _ = found.span()
-    return rows_of(found, (times >= start) & (times < stop))
+        is_inner[first + 1 : last] = True
+    blocks = _blocks(slots, np.flatnonzero(is_inner), np.cumsum(is_first))
+    times, _ = blocks.span()
+    return rows_of(blocks, (times >= start) & (times < stop))
 
 
-def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:
-    if not among.size:
+def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
+    if not inner.size:
         return NO_BLOCKS
-    numbers = slots.numbers[among] * SLOT_NS // BLOCK_NS
-    is_new = np.ones(among.size, np.bool_)
-    is_new[1:] = (np.diff(numbers) != 0) | (np.diff(chains[among]) != 0)
+    numbers = slots.numbers[inner] * SLOT_NS // BLOCK_NS
+    is_new = np.ones(inner.size, np.bool_)
+    is_new[1:] = (np.diff(numbers) != 0) | (np.diff(chains[inner]) != 0)
     begins = np.flatnonzero(is_new)
-    firsts, lasts = among[begins], among[np.r_[begins[1:], among.size] - 1]
+    firsts, lasts = inner[begins], inner[np.r_[begins[1:], inner.size] - 1]
     first_times, last_times = slots.firsts[firsts], slots.lasts[lasts]
     starts_ns = numbers[begins] * BLOCK_NS
-    means = slots.means[among]
-    noises = slots.noises[among] / np.sqrt(slots.counts[among])
-    found = Blocks(
+    means = slots.means[inner]
+    noises = slots.noises[inner] / np.sqrt(slots.counts[inner])
+    blocks = Blocks(
         numbers[begins],
         (first_times - starts_ns).astype(np.uint32),
         (last_times - starts_ns).astype(np.uint32),
@@ -270,14 +270,14 @@ def _blocks(slots: _Slots, among: Ints, chains: Ints) -> Blocks:
         np.full(begins.size, MIN_NS),
     )
     chain = chains[firsts]
-    for begin, stop in zip(*_runs(found.are_still(), chain), strict=True):
+    for begin, stop in zip(*_runs(blocks.are_still(), chain), strict=True):
         is_inside = begin > 0 and stop < chain.size and chain[begin - 1] == chain[stop]
         if is_inside and last_times[stop - 1] - first_times[begin] < SHORTEST_NS:
             continue  # noise hides slow motion for as long
         first, last = int(firsts[begin]), int(lasts[stop - 1])
-        found.starts[begin] = slots.edge(first, last, -1)
-        found.ends[stop - 1] = slots.edge(last, first, 1)
-    return found
+        blocks.starts[begin] = slots.edge(first, last, -1)
+        blocks.ends[stop - 1] = slots.edge(last, first, 1)
+    return blocks
 
 
 class _Slots:
@@ -346,11 +346,11 @@ class _Slots:
             step: see above.
         """
         low, high = sorted((at, at - step * min(_PLACE_SLOTS - 1, abs(at - other))))
-        own = self.positions[self.begins[low] : self.stops[high]]
-        place = own.mean(axis=0)
+        at_end = self.positions[self.begins[low] : self.stops[high]]
+        place = at_end.mean(axis=0)
         bends, begins, stops = self._bends
         [noise] = _noises(bends, begins[low : low + 1], stops[high : high + 1]).tolist()
-        reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(own - place).max()))
+        reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(at_end - place).max()))
         far = np.searchsorted(self.numbers, self.numbers[at] + step * _OUTWARDS, side="left")
         low, high = sorted((at, int(far)))
         rows = np.arange(self.begins[low], self.stops[min(high, len(self) - 1)])[::step]
@@ -365,8 +365,8 @@ class _Slots:
 
 
 def _lengths(vectors: Vectors) -> Floats:
-    found: Floats = np.sqrt(row_sums(vectors * vectors))
-    return found
+    lengths: Floats = np.sqrt(row_sums(vectors * vectors))
+    return lengths
 
 
 def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
@@ -380,12 +380,12 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     rows = np.arange(groups.size) - np.repeat(before - begins, counts)
     values = bends[rows]
     values = values[np.lexsort((values, groups))]
-    known = counts > 0
-    middles = values[before[known] + (counts[known] - 1) // 2]
-    found = np.zeros(counts.size)
+    has_bends = counts > 0
+    middles = values[before[has_bends] + (counts[has_bends] - 1) // 2]
+    deviations = np.zeros(counts.size)
     # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-    found[known] = np.sqrt(middles / 6 / 0.6)
-    return found
+    deviations[has_bends] = np.sqrt(middles / 6 / 0.6)
+    return deviations
 
 
 def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
@@ -405,7 +405,7 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
     chain = np.cumsum(begins_chain)
     still = blocks.are_still()
     moves = _creeping(blocks, chain, still) | ~still
-    found: list[Standstill] = []
+    stands: list[Standstill] = []
     begins, stops = _runs(~moves, chain)
     starts, ends = blocks.starts[begins], blocks.ends[stops - 1]
     starts = np.where(starts == MIN_NS, firsts[begins], starts)
@@ -419,11 +419,11 @@ def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
         if end - start < SHORTEST_NS:
             continue
         if box.diagonal <= DRIFTED_M:
-            found.append(Standstill(start, end, box))
+            stands.append(Standstill(start, end, box))
         else:
-            found += _in_run(corners, firsts[begin:stop], begin, start, end)
-        until = found[-1].end
-    return tuple(found)
+            stands += _split_by_drift(corners, firsts[begin:stop], begin, start, end)
+        until = stands[-1].end
+    return tuple(stands)
 
 
 def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Iterator[Box3]:
@@ -432,7 +432,7 @@ def _boxes(corners: tuple[Vectors, Vectors], begins: Ints, stops: Ints) -> Itera
         return
     edges = np.stack([begins, stops], axis=1).reshape(-1)
     # One row more, since the last range may end where the blocks do.
-    lows, highs = (np.append(each, each[-1:], axis=0) for each in corners)
+    lows, highs = (np.append(corner, corner[-1:], axis=0) for corner in corners)
     lows, highs = np.minimum.reduceat(lows, edges)[::2], np.maximum.reduceat(highs, edges)[::2]
     for (a, b, c), (d, e, f) in zip(lows.tolist(), highs.tolist(), strict=True):
         yield Box3((a, b, c), (d, e, f))
@@ -445,7 +445,7 @@ def _runs(marks: Flags, chain: Ints) -> tuple[Ints, Ints]:
     return np.flatnonzero(marks & is_new), np.flatnonzero(marks & is_over) + 1
 
 
-def _in_run(
+def _split_by_drift(
     corners: tuple[Vectors, Vectors], firsts: Ints, first: int, start: Ns, end: Ns
 ) -> Iterator[Standstill]:
     """Yields the standstills of consecutive still blocks, of a robot that drifts away.
@@ -457,17 +457,17 @@ def _in_run(
         start: when the robot began to stand.
         end: when it ended.
     """
-    lows, highs = (each[first : first + firsts.size] for each in corners)
+    lows, highs = (corner[first : first + firsts.size] for corner in corners)
     begin = 0
     while begin < firsts.size:
-        some = _BLOCKS_AT_ONCE
+        count = _BLOCKS_AT_ONCE
         while True:
-            low = np.minimum.accumulate(lows[begin : begin + some])
-            high = np.maximum.accumulate(highs[begin : begin + some])
+            low = np.minimum.accumulate(lows[begin : begin + count])
+            high = np.maximum.accumulate(highs[begin : begin + count])
             fits = int((_lengths(high - low) <= DRIFTED_M).sum())
-            if fits < some or begin + fits == firsts.size:
+            if fits < count or begin + fits == firsts.size:
                 break
-            some *= 4
+            count *= 4
         (a, b, c), (d, e, f) = low[fits - 1].tolist(), high[fits - 1].tolist()
         begin += fits
         until = min(int(firsts[begin]), end) if begin < firsts.size else end
@@ -478,31 +478,37 @@ def _in_run(
 
 def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
     """Returns which blocks are part of a creep: the shortest ones that lead `LARGEST_M` away."""
-    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
-    low, high = blocks.corners()
-    centres, noises = (low + high) / 2, blocks.noises.astype(np.float64)
-    # Mostly the robot stands: no block is that far from another one as near in time.
-    groups = np.arange(0, len(blocks), _CREEP_BLOCKS)
-    lows, highs = (each.reduceat(centres, groups) for each in (np.minimum, np.maximum))
-    lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
-    has_moved = _lengths(highs - lows) > LARGEST_M
-    moved = np.flatnonzero(np.repeat(has_moved, _CREEP_BLOCKS)[: len(blocks)])
-    nearest = np.full(len(blocks), -1)
-    for lag in range(1, _CREEP_BLOCKS):
-        waiting = moved[(moved >= lag) & (nearest[moved] < 0)]
-        waiting = waiting[run[waiting] == run[waiting - lag]]
-        before = waiting - lag
-        near = blocks.numbers[waiting] - blocks.numbers[before] < _CREEP_BLOCKS
-        apart_m = _lengths(centres[waiting] - centres[before])
-        far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
-        nearest[waiting[far]] = before[far]
+    left = _left_blocks(blocks, chain, still)
     creeping = np.zeros(len(blocks), np.bool_)
     since, newest = MIN_NS, 0
-    for here in np.flatnonzero(nearest >= 0).tolist():
-        there = int(nearest[here])
+    for here in np.flatnonzero(left >= 0).tolist():
+        there = int(left[here])
         if chain[here] != newest:
             newest, since = chain[here], MIN_NS
         if blocks.numbers[there] > since:
             creeping[there : here + 1] = True
             since = int(blocks.numbers[there])
     return creeping
+
+
+def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
+    """Returns the newest block that each is `LARGEST_M` away from, within `CREEP_NS`; else -1."""
+    run = np.cumsum(np.r_[True, (np.diff(chain) != 0) | ~(still[1:] & still[:-1])])
+    low, high = blocks.corners()
+    centres, noises = (low + high) / 2, blocks.noises.astype(np.float64)
+    # Mostly the robot stands: no block is that far from another one as near in time.
+    groups = np.arange(0, len(blocks), _CREEP_BLOCKS)
+    lows, highs = (extreme.reduceat(centres, groups) for extreme in (np.minimum, np.maximum))
+    lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
+    has_moved = _lengths(highs - lows) > LARGEST_M
+    moved = np.flatnonzero(np.repeat(has_moved, _CREEP_BLOCKS)[: len(blocks)])
+    left = np.full(len(blocks), -1)
+    for lag in range(1, _CREEP_BLOCKS):
+        waiting = moved[(moved >= lag) & (left[moved] < 0)]
+        waiting = waiting[run[waiting] == run[waiting - lag]]
+        before = waiting - lag
+        near = blocks.numbers[waiting] - blocks.numbers[before] < _CREEP_BLOCKS
+        apart_m = _lengths(centres[waiting] - centres[before])
+        far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
+        left[waiting[far]] = before[far]
+    return left

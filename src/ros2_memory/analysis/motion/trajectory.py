@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from ros2_memory.analysis.motion.odometry import Motion, MotionTotals, are_places, measured_path
+from ros2_memory.analysis.motion.odometry import (
+    MeasuredPath,
+    Motion,
+    MotionTotals,
+    are_places,
+    measured_path,
+)
 from ros2_memory.analysis.motion.path_length import SPEED_STEPS
 from ros2_memory.analysis.poses import headings, joined_poses
 from ros2_memory.core.arrays import rows_of, stacked
@@ -165,8 +171,8 @@ class Line:
 
     def _at(self, times: IntArray, values: Floats) -> Floats:
         since = self.times[0]
-        found: Floats = np.interp(times - since, self.times - since, values)
-        return found
+        interpolated: Floats = np.interp(times - since, self.times - since, values)
+        return interpolated
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -238,45 +244,49 @@ def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
     A step that would take a higher speed than `fastest_mps` is a jump.
     """
     valid = np.flatnonzero(are_places(poses.positions))
-    known = poses if valid.size == len(poses) else poses.rows(valid)
-    stated = known.speeds[np.isfinite(known.speeds)]
+    placed = poses if valid.size == len(poses) else poses.rows(valid)
+    stated = placed.speeds[np.isfinite(placed.speeds)]
     totals, step_mps, line, error_m = MotionTotals(), 0.0, NO_LINE, 0.0
-    if len(known):
-        measured = measured_path(known.times, known.positions, fastest_mps)
+    if len(placed):
+        measured = measured_path(placed.times, placed.positions, fastest_mps)
         totals, step_mps = measured.totals, measured.step_mps
-        kept = np.arange(len(known))
-        if len(known) > _FEW:
-            parted = np.array(measured.parted, np.intp)
-            ends = np.unique(np.concatenate(([0, len(known) - 1], parted - 1, parted)))
-            seconds = (known.times - known.times[0]) / NS_PER_S
-            kept, error_m = simplified(
-                known.positions,
-                seconds,
-                ends,
-                tolerance_m=_KEPT_WITHIN_M,
-                at_most=_MOST_VERTICES,
-                of_time=_OF_TIME,
-            )
-        line = Line(
-            known.times[kept],
-            np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
-            known.positions[kept],
-            headings(known.turns[kept]),
-            np.isin(kept, measured.parted),
-        )
+        line, error_m = _line_through(placed, measured)
     return PathSlice(
         int(poses.times[0]) if len(poses) else 0,
         int(poses.times[-1]) if len(poses) else 0,
-        len(known),
-        len(poses) - len(known),
+        len(placed),
+        len(poses) - len(placed),
         totals,
         step_mps,
         float(stated.max()) if stated.size else None,
         poses.frames.names(),
         line,
         error_m,
-        poses if len(known) <= _FEW else None,
+        poses if len(placed) <= _FEW else None,
     )
+
+
+def _line_through(poses: Poses, measured: MeasuredPath) -> tuple[Line, float]:
+    """Returns the drawn path of some poses, and how far (m) they may be off it."""
+    kept, error_m = np.arange(len(poses)), 0.0
+    if len(poses) > _FEW:
+        parted = np.array(measured.parted, np.intp)
+        kept, error_m = simplified(
+            poses.positions,
+            (poses.times - poses.times[0]) / NS_PER_S,
+            np.unique(np.concatenate(([0, len(poses) - 1], parted - 1, parted))),
+            tolerance_m=_KEPT_WITHIN_M,
+            at_most=_MOST_VERTICES,
+            of_time=_OF_TIME,
+        )
+    line = Line(
+        poses.times[kept],
+        np.concatenate(([0.0], np.cumsum(measured.steps_m)))[kept],
+        poses.positions[kept],
+        headings(poses.turns[kept]),
+        np.isin(kept, measured.parted),
+    )
+    return line, error_m
 
 
 NO_LINE: Final = Line(
@@ -286,34 +296,34 @@ NO_LINE: Final = Line(
 
 def joined_slices(slices: Sequence[PathSlice], fastest_mps: float) -> PathSlice:
     """Joins slices in order, of which there is one at least; see `path_slice`."""
-    slices = [*_together(slices, fastest_mps)]
+    slices = [*_measured_together(slices, fastest_mps)]
     motion = Motion(fastest_mps)
     jumped: list[bool] = []
     added: list[float] = []
-    for some in slices:
-        jumped.append(motion.join(some.totals))
+    for part in slices:
+        jumped.append(motion.join(part.totals))
         # What joining adds to the slice's own length is driven up to its first vertex.
-        added.append(motion.totals.distance_m - some.totals.distance_m)
-    line = stacked([some.line for some in slices])
-    vertices = np.array([len(some.line) for some in slices])
+        added.append(motion.totals.distance_m - part.totals.distance_m)
+    line = stacked([part.line for part in slices])
+    vertices = np.array([len(part.line) for part in slices])
     firsts = (np.cumsum(vertices) - vertices)[vertices > 0]
     jumps = line.jumps.copy()
     jumps[firsts] |= np.array(jumped)[vertices > 0]
     metres = line.metres + np.repeat(added, vertices)
     # Where two places turn out to be one, joining takes some metres back.
     metres = np.maximum.accumulate(np.minimum(metres, motion.totals.distance_m))
-    twists = [some.twist for some in slices if some.twist is not None]
+    twists = [part.twist for part in slices if part.twist is not None]
     return PathSlice(
         slices[0].first,
         slices[-1].last,
-        sum(some.poses for some in slices),
-        sum(some.invalid for some in slices),
+        sum(part.poses for part in slices),
+        sum(part.invalid for part in slices),
         motion.totals,
-        max(some.step_mps for some in slices),
+        max(part.step_mps for part in slices),
         max(twists, default=None),
-        tuple(dict.fromkeys(frame for some in slices for frame in some.frames)),
+        tuple(dict.fromkeys(frame for part in slices for frame in part.frames)),
         replace(line, metres=metres, jumps=jumps),
-        max(some.error_m for some in slices),
+        max(part.error_m for part in slices),
     )
 
 
@@ -345,12 +355,12 @@ def drawn(line: Line, at_most: int, error_m: float = 0.0) -> tuple[tuple[Waypoin
     return waypoints, error_m + off_m
 
 
-def _together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
+def _measured_together(slices: Sequence[PathSlice], fastest_mps: float) -> Iterator[PathSlice]:
     """Yields the slices; of consecutive ones with few poses each one of all these poses."""
-    for are_few, some in groupby(slices, key=lambda each: each.few is not None):
-        found = [*some]
-        few = [each.few for each in found if each.few is not None]
-        if are_few and len(found) > 1:
+    for are_few, run in groupby(slices, key=lambda part: part.few is not None):
+        parts = [*run]
+        few = [part.few for part in parts if part.few is not None]
+        if are_few and len(parts) > 1:
             yield path_slice(joined_poses(few), fastest_mps)
         else:
-            yield from found
+            yield from parts

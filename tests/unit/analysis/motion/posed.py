@@ -17,7 +17,7 @@ from ros2_memory.analysis.motion.standstills import (
     standstills_of,
 )
 from ros2_memory.analysis.motion.trajectory import SLICE_NS, PathSlice, joined_slices, path_slice
-from ros2_memory.analysis.poses import Frames, Poses
+from ros2_memory.analysis.poses import FrameCodes, Poses
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -38,7 +38,7 @@ def posed(
         np.array(times, np.int64),
         np.array(positions, np.float64).reshape(-1, 3),
         np.full((count, 4), math.nan) if turns is None else np.array(turns, np.float64),
-        Frames(np.zeros(count, np.uint32), ("odom",)),
+        FrameCodes(np.zeros(count, np.uint32), ("odom",)),
         np.full(count, math.nan) if speeds is None else np.array(speeds, np.float64),
     )
 
