@@ -34,9 +34,9 @@ from ros2_memory.core.timebase import unix_from_ns, unix_from_text
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Reply
-from ros2_memory.tools.spec_tools import build_tools
 
 _SETTING: Final = re.compile(
     r"\+{0,2}((recording|data|reader|retention|server|fleet|lake|logging)\.\w"
@@ -102,14 +102,14 @@ def ask(
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
-    tools = {known.name: known for known in dispatcher.tools}
+    tools = {tool.name: tool for tool in dispatcher.tools}
     if not asked:
         rows: list[JsonValue] = []
-        for known in dispatcher.tools:
-            purpose, _, _ = known.description.removeprefix("Blocking. ").partition(". ")
-            taken = ", ".join(argument for argument, _ in _arguments(known))
+        for tool_listed in dispatcher.tools:
+            purpose, _, _ = tool_listed.description.removeprefix("Blocking. ").partition(". ")
+            taken = ", ".join(argument for argument, _ in _arguments(tool_listed))
             purpose = purpose.partition(";")[0].rstrip(".")
-            rows.append({"tool": known.name, "purpose": purpose, "arguments": taken})
+            rows.append({"tool": tool_listed.name, "purpose": purpose, "arguments": taken})
         if as_json:
             print_line(json.dumps(rows))
         else:

@@ -52,17 +52,20 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     latched topics and logs have none.
     """
     memory = bags.memory()
-    known: Sequence[TopicRow] = ()
+    topic_rows: Sequence[TopicRow] = ()
     rows: list[JsonObject] = []
     try:
-        known = list_recorded_topics(memory, Call())
+        topic_rows = list_recorded_topics(memory, Call())
         snapshot, latching = memory.index.snapshot(), memory.limits.latching
-        for each in known:
+        for topic_row in topic_rows:
+            remarks: JsonObject = {}
+            if topic_row.undecodable:
+                remarks["undecodable"] = topic_row.undecodable
+            if topic_row.notes:
+                remarks["notes"] = [*topic_row.notes]
             # Planners read the rate in `data_time_range` instead.
-            more: JsonObject = {"undecodable": each.undecodable, "notes": [*each.notes]}
-            rate = usual_rate(snapshot, each.topic, latching)
-            own = {key: value for key, value in more.items() if value}
-            rows.append({**shown(each, Scope()), **own, "rate_hz": rate})
+            rate = usual_rate(snapshot, topic_row.topic, latching)
+            rows.append({**shown(topic_row, Scope()), **remarks, "rate_hz": rate})
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
@@ -71,7 +74,7 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif rows:
         without = [{key: row[key] for key in row if key != "notes"} for row in rows]
         print_reply(stdout_console(), [*without])
-        if notes := _notes_of(known):
+        if notes := _notes_of(topic_rows):
             print_reply(stdout_console(), {"notes": notes})
     elif text != "[]":
         print_reply(stdout_console(), json.loads(text))
@@ -85,13 +88,13 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
     """Returns each note once: what is wrong with one bag is noted on each topic in it."""
-    on: dict[str, list[str]] = {}
+    topics_by_note: dict[str, list[str]] = {}
     for row in rows:
         for note in row.notes:
-            on.setdefault(note, []).append(row.topic)
+            topics_by_note.setdefault(note, []).append(row.topic)
     return [
         f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
-        for note, topics in on.items()
+        for note, topics in topics_by_note.items()
     ]
 
 
@@ -103,10 +106,10 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
-    stated = [*snapshot.timeline.totals(topic).values()]
-    if not stated:
+    totals = [*snapshot.timeline.totals(topic).values()]
+    if not totals:
         return None
-    last = max(each.last for each in stated)
+    last = max(total.last for total in totals)
     intervals, duration = 0, 0
     window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
     bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
@@ -126,9 +129,11 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     reports: dict[str, JsonObject] = {}
     are_bags = False
     for name in robots or ("",):
-        own = robot_settings(settings, name) if robots else settings
-        memory = open_memory(own, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None)
-        reports[name] = report = _report(own, memory)
+        of_robot = robot_settings(settings, name) if robots else settings
+        memory = open_memory(
+            of_robot, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None
+        )
+        reports[name] = report = _report(of_robot, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:
             stdout_console().rule(name, align="left")
@@ -158,8 +163,8 @@ def _report(settings: Settings, memory: Memory) -> JsonObject:
             for pair, topic in mixed_recordings(memory, Call())
         ],
         "contradicting_frames": [
-            {"frame": of.frame, "in_recordings": [*of.names], "parents": [*of.parents]}
-            for of in contradicting_frames(memory, Call())
+            {"frame": frame.frame, "in_recordings": [*frame.names], "parents": [*frame.parents]}
+            for frame in contradicting_frames(memory, Call())
         ],
         "counted_as_active": [
             {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
@@ -176,18 +181,18 @@ def _show(memory: Memory, report: JsonObject) -> None:
         print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
         return
     status, ranged, held, *lists = report.values()
-    found = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
+    report_shown = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
     left_out: list[str] = []
-    silent = found.get("topics_without_messages")
+    silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
-        found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    found |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
-    for name, rows in found.items():
+        report_shown["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
+    report_shown |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
+    for name, rows in report_shown.items():
         if isinstance(rows, list) and len(rows) > _MOST_ROWS:
-            found[name] = rows[:_MOST_ROWS]
+            report_shown[name] = rows[:_MOST_ROWS]
             left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
     notes: JsonObject = {"notes": [*left_out]} if left_out else {}
-    print_reply(stdout_console(), found | notes)
+    print_reply(stdout_console(), report_shown | notes)
 
 
 def _object(value: JsonValue) -> JsonObject:
@@ -256,9 +261,9 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
     if heartbeat is not None and heartbeat.is_live(memory.clock.now()):
         return
     patience = ns_from_unix(SPLITS_OF_PATIENCE * memory.limits.split_duration_s)
-    for each in snapshot.active:
+    for bag in snapshot.active:
         try:
-            yield each.path, each.path.stat().st_mtime_ns + patience
+            yield bag.path, bag.path.stat().st_mtime_ns + patience
         except OSError:
             continue  # the file was moved or deleted since the scan
 
@@ -318,7 +323,10 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
             "not_read": [row for row in rows if "start" not in row],
             "empty": [*empty],
         }
-        print_reply(stdout_console(), {title: some for title, some in lists.items() if some})
+        print_reply(
+            stdout_console(),
+            {title: rows for title, rows in lists.items() if rows},
+        )
     return not rows
 
 
@@ -327,7 +335,9 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     with suppress(OSError, RecorderError):
         own = OwnRecordings(root)
     left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
-    for path, bags in sorted(recordings_of(snapshot).items(), key=lambda found: found[1][0].start):
+    for path, bags in sorted(
+        recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
+    ):
         inside = [file for file in left if file.startswith(f"{path}/")]
         for file in inside:
             del left[file]
@@ -338,7 +348,7 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
         elif own is not None and own.owns_bag(bags[0].path):
             whose = "this recorder"
         is_open = any(bag.state is BagState.ACTIVE for bag in bags)
-        yield {
+        row: JsonObject = {
             "recording": name_of(path, bags, str(root)),
             "start": unix_from_ns(start),
             "end": None if is_open else unix_from_ns(end),
@@ -349,8 +359,10 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
             "topics": len({topic for bag in bags for topic in bag.summary.schema.positions}),
             "storage": storage_of(bags),
             "whose": whose,
-            **({"not_read": len(inside)} if inside else {}),
         }
+        if inside:
+            row["not_read"] = len(inside)
+        yield row
     for file, reason in sorted(left.items()):
         yield {"recording": file.removeprefix(f"{root}/"), "reason": reason}
 
@@ -358,9 +370,9 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
 def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     """Yields the recordings without any message; a loose bag file is one."""
     aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-    folders = {bag.path.parent for bag in snapshot.bags} | {each.path.parent for each in aside}
-    found = [each if each.parent == root else each.parent for each in snapshot.empty]
-    for path in dict.fromkeys(each for each in found if each not in folders):
+    folders = {bag.path.parent for bag in snapshot.bags} | {file.path.parent for file in aside}
+    recordings = [path if path.parent == root else path.parent for path in snapshot.empty]
+    for path in dict.fromkeys(path for path in recordings if path not in folders):
         yield {
             "recording": str(path).removeprefix(f"{root}/"),
             "messages": 0,

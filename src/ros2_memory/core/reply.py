@@ -346,12 +346,12 @@ def result(
     if where is not None:
         form = replace(form, other=(_getter(where[0]), where[1]))
 
-    def made(cls: type[T]) -> type[T]:
+    def declare(cls: type[T]) -> type[T]:
         whole = dataclass(frozen=True, slots=True)(cls)
         cast("type[Declared]", whole).reply = form
         return whole
 
-    return made
+    return declare
 
 
 def render(answer: object, bag_dir: Path, form: Keys | None = None) -> JsonObject:
@@ -379,8 +379,8 @@ def itself_if(attribute: str) -> Source:
 
 def unit(convert: Callable[[Never], JsonValue], suffix: str = "") -> Unit:
     """Returns a unit whose values depend on nothing else."""
-    known = cast("Callable[[object], JsonValue]", convert)
-    return Unit(lambda value, _: known(value), suffix)
+    any_convert = cast("Callable[[object], JsonValue]", convert)
+    return Unit(lambda value, _: any_convert(value), suffix)
 
 
 def digits(places: int) -> Unit:
@@ -457,8 +457,8 @@ def _inside(places: Sequence[str]) -> JsonValue:
     return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
 
 
-def _counted(known: tuple[int, bool]) -> JsonValue:
-    number, is_all = known
+def _counted(count: tuple[int, bool]) -> JsonValue:
+    number, is_all = count
     return {"total" if is_all else "at_least": number}
 
 
@@ -483,8 +483,8 @@ def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
     return scope.local.text(*times) or Absent.ABSENT
 
 
-def _local_of_days(found: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
-    times = (found,) if found is None or isinstance(found, int) else found
+def _local_of_days(at: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
+    times = (at,) if at is None or isinstance(at, int) else at
     texts = (scope.local.text(at) for at in times if at is not None)
     days = {text[:_DAY_CHARS] for text in texts if text is not None}
     if days <= scope.days:

@@ -86,14 +86,14 @@ def _made(type_name: str, body: Mapping[str, object]) -> object:
 
 def _field(form: FieldDesc, value: object) -> object:
     """Returns a field of a message; zero or empty where there is no value."""
-    kind, of = form
+    kind, detail = form
     if kind is Nodetype.NAME:
-        return _made(str(of), cast("Body", value or {}))
+        return _made(str(detail), cast("Body", value or {}))
     if kind is Nodetype.BASE:
-        return value or ("" if of[0] == "string" else 0)
-    inner, size = cast("tuple[FieldDesc, int]", of)
+        return value or ("" if detail[0] == "string" else 0)
+    inner, size = cast("tuple[FieldDesc, int]", detail)
     if inner[0] is Nodetype.NAME:
-        return [_field(inner, each) for each in cast("list[Body]", value)]
+        return [_field(inner, item) for item in cast("list[Body]", value)]
     return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
 
 
@@ -144,7 +144,7 @@ def _body(message: Message) -> Body:  # noqa: C901 - a case for each topic
 
 
 def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> Body:
-    found = [
+    detections = [
         {
             "label": thing.label,
             "score": thing.score,
@@ -153,7 +153,7 @@ def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) 
         }
         for thing in things
     ]
-    return {**_headed(message, "base_link"), "skill": skill, "detections": found}
+    return {**_headed(message, "base_link"), "skill": skill, "detections": detections}
 
 
 def _headed(message: Message, frame_id: str) -> Body:

@@ -184,33 +184,33 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     Raises:
         EpisodicError: the lake cannot be read, and these bags do not reach back so far.
     """
-    there = own.index.snapshot()
-    begin = since(own.now(own.clock.now(), there.latest))
+    on_robot = own.index.snapshot()
+    begin = since(own.now(own.clock.now(), on_robot.latest))
     if begin is None:
         return False
     try:
-        known = lake.index.snapshot()
+        in_lake = lake.index.snapshot()
     except (RefusedError, LakeError):
-        if there.earliest is None or begin < there.earliest:
+        if on_robot.earliest is None or begin < on_robot.earliest:
             raise
         return False
-    if known.older is not None and begin <= known.older:
+    if in_lake.older is not None and begin <= in_lake.older:
         return True
-    window = TimeWindow(begin, MIN_NS if known.latest is None else known.latest + 1)
+    window = TimeWindow(begin, MIN_NS if in_lake.latest is None else in_lake.latest + 1)
     # By their beginnings: bags that were never shipped do not stand for those that are gone.
-    here = dict(sorted((bag.start, bag.size) for bag in there.timeline.overlapping(window)))
-    return any(bag.size > here.get(bag.start, 0) for bag in known.timeline.overlapping(window))
+    sizes = dict(sorted((bag.start, bag.size) for bag in on_robot.timeline.overlapping(window)))
+    return any(bag.size > sizes.get(bag.start, 0) for bag in in_lake.timeline.overlapping(window))
 
 
 def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
     """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
     call.older = MAX_NS
     try:
-        found = ask(lake, call)
+        answer = ask(lake, call)
     except NoDataError as error:
         detail = "; ".join((error.detail, *FromLake.of(lake, call).notes))
         raise NoDataError(error.reason, detail, error.notes) from error
-    return found, FromLake.of(lake, call)
+    return answer, FromLake.of(lake, call)
 
 
 @dataclass(eq=False, repr=False)
@@ -246,10 +246,10 @@ class Fleet:
         if self.join is None:
             return ()
         with self._lock:
-            found = [*self.join(self.robots)]
+            joining = [*self.join(self.robots)]
             # A new dict: other threads iterate over the old one.
-            self.robots = {**self.robots, **{robot.name: robot for robot in found}}
-        return found
+            self.robots = {**self.robots, **{robot.name: robot for robot in joining}}
+        return joining
 
     def allowed(self, call: Call) -> list[Robot]:
         """Returns the robots that a call may ask about, in the order of the configuration."""

@@ -166,8 +166,8 @@ class Lake:
             table = self._table(name)
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(file.location for file in files)
-        found = DataFiles(TABLES[name].arrow_schema, locations, store)
-        return self.engine.select(sql, name, found, parameters or {})
+        data_files = DataFiles(TABLES[name].arrow_schema, locations, store)
+        return self.engine.select(sql, name, data_files, parameters or {})
 
     @contextmanager
     def _looking(self) -> Iterator[None]:

@@ -368,8 +368,14 @@ class ComparedThings:
     @property
     def is_any(self) -> bool:
         """Whether anything differs."""
-        found = (self.moved, self.appeared, self.missed, self.not_looked_at, self.not_comparable)
-        return any((*found, self.movers))
+        differences = (
+            self.moved,
+            self.appeared,
+            self.missed,
+            self.not_looked_at,
+            self.not_comparable,
+        )
+        return any((*differences, self.movers))
 
 
 class StandstillPlace(NamedTuple):
@@ -470,13 +476,13 @@ class Comparison(AnswerWithNotes):
     @property
     def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
         """The farthest points, with the window that they are of."""
-        found = zip(("this", "with"), self.farthest, strict=True)
-        return [(name, point) for name, point in found if point is not None]
+        points = zip(("this", "with"), self.farthest, strict=True)
+        return [(name, point) for name, point in points if point is not None]
 
     @property
     def frames(self) -> dict[str, JsonValue]:
         """The frames that places are in, where there are any; that of the path if it is another."""
         frames: list[str | None] = [self.frame_id or None] * self.things.is_any
         frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)
-        found = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
-        return {key: frame and named(frame) for key, frame in found}
+        by_key = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
+        return {key: frame and named(frame) for key, frame in by_key}

@@ -106,18 +106,24 @@ class Backfill:
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags of which columns are to be stored, the newest first."""
-        found = self._to_fill()
-        return [] if found is None else found[0].waiting(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return []
+        filling, timeline = to_fill
+        return filling.waiting(timeline)
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        found = self._to_fill()
-        return [] if found is None else found[0].batches(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return []
+        filling, timeline = to_fill
+        return filling.batches(timeline)
 
     def store(self, batch: Batch) -> int:
-        """Stores the columns of some bags; as `Filling.fill`."""
-        found = self._to_fill()
-        return 0 if found is None else found[0].fill(batch, found[1])
+        """Stores the columns of a batch of bags; returns how many bags, as `Filling.fill`."""
+        if (to_fill := self._to_fill()) is None:
+            return 0
+        filling, timeline = to_fill
+        return filling.fill(batch, timeline)
 
     def follow(self) -> bool:
         """Makes what follows from whole parts, and keeps the store within what it may take.
@@ -128,10 +134,9 @@ class Backfill:
         Returns:
             Whether there is more of that.
         """
-        found = self._to_fill()
-        if found is None:
+        if (to_fill := self._to_fill()) is None:
             return False
-        filling, timeline = found
+        filling, timeline = to_fill
         columns = self._memory.columns
         coverage = columns.coverage(timeline)
         waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
@@ -151,8 +156,9 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        if (found := self._to_fill()) is not None:
-            found[0].store.look_after(thorough=thorough)
+        if (to_fill := self._to_fill()) is not None:
+            filling, _ = to_fill
+            filling.store.look_after(thorough=thorough)
 
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
@@ -168,9 +174,11 @@ class Backfill:
 
         Does nothing where there are no bags, for the same reason.
         """
-        found = self._to_fill()
-        if found is not None and found[1].bags:
-            found[0].prune(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return
+        filling, timeline = to_fill
+        if timeline.bags:
+            filling.prune(timeline)
             self._memory.store_listings(self._memory.index.snapshot())
 
 
@@ -183,7 +191,7 @@ def make_fragments(
     times (ns) where they begin.
     """
     around = [window.widened(PART_NS) for window in windows]
-    ends = {(one.start // STRETCH_NS, one.stop // STRETCH_NS) for one in around}
+    ends = {(window.start // STRETCH_NS, window.stop // STRETCH_NS) for window in around}
     touched = {number for first, last in ends for number in range(first, last + 1)}
     touched -= {start // STRETCH_NS for start in waiting}
     # What is joined of a stretch needs all parts of it, and those that reach into it.

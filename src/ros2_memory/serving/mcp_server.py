@@ -183,7 +183,9 @@ class EpisodicServer(MCPServer[object]):
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
         offered = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
         readable = dispatcher.readable
-        self._resources = [each for each in offered if TOOLS_OF_RESOURCES[each.uri] in readable]
+        self._resources = [
+            resource for resource in offered if TOOLS_OF_RESOURCES[resource.uri] in readable
+        ]
         self._templates = [
             template
             for template, tool, *_ in _TEMPLATES.values()
@@ -258,11 +260,11 @@ class EpisodicServer(MCPServer[object]):
         for prefix, (template, tool, argument, _) in _TEMPLATES.items():
             if template in self._templates and uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
-        offered = [each.uri for each in self._resources]
+        offered = [resource.uri for resource in self._resources]
         if uri in offered:
             return TOOLS_OF_RESOURCES[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-        known = ", ".join([*offered, *(each.uri_template for each in self._templates)])
+        known = ", ".join([*offered, *(template.uri_template for template in self._templates)])
         raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {known}")
 
     async def _complete(
@@ -272,12 +274,18 @@ class EpisodicServer(MCPServer[object]):
         _context: CompletionContext | None,
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
-        of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        known = (row for row in _TEMPLATES.values() if row[0] in self._templates)
-        asked = next((row for row in known if row[0].uri_template == of), None)
-        if asked is None:
+        uri = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
+        completed = next(
+            (
+                (key, tool)
+                for template, _, key, tool in _TEMPLATES.values()
+                if template in self._templates and template.uri_template == uri
+            ),
+            None,
+        )
+        if completed is None:
             return None
-        _, _, key, tool = asked
+        key, tool = completed
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
         rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
         typed = argument.value.casefold()

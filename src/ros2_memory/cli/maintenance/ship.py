@@ -140,7 +140,7 @@ def _forget(
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:
-        known = {*Partitions().look(lake.current("bags")), *(one.name for one in robots)}
+        known = {*Partitions().look(lake.current("bags")), *(robot.name for robot in robots)}
         if robot not in known:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
@@ -199,8 +199,8 @@ class _Shipping:
 
         with self.location.writable() as lake:
             tombstones = read_tombstones(self.location.state_dir)
-            for tombstone, is_done in tombstones.items():
-                if not is_done:
+            for tombstone in tombstones:
+                if not tombstone.done:
                     forget_in_lake(lake, tombstone)
             yield Shipper(
                 lake,
@@ -271,9 +271,9 @@ def _new_robots(
         new = {name: bags for name, bags in settings.fleet.robots.items() if name not in known}
         if not new:
             return []
-        found = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
+        built = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
     except ConfigError as error:
         log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
         return []
-    log.info("shipping", robots=len(robots) + len(found), warehouse=settings.lake.warehouse)
-    return found
+    log.info("shipping", robots=len(robots) + len(built), warehouse=settings.lake.warehouse)
+    return built

@@ -79,9 +79,9 @@ _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
 
 class Shown(NamedTuple):
-    """A part of an answer, and the reason if it is incomplete."""
+    """Keys of an answer, and the reasons if they are incomplete."""
 
-    part: JsonObject
+    keys: JsonObject
     notes: tuple[str, ...] = ()
 
 
@@ -166,11 +166,13 @@ def span_shown(
         days: list[JsonValue] = [
             [_s(start), _s(stop)] for start, stop in snapshot.timeline.thinned_times
         ]
-        shown["range"] = {
+        shown_range: JsonObject = {
             **render(ranged, memory.index.bag_dir),
             "gaps": _gaps(ranged),
-            **({"thinned": days} if days else {}),
         }
+        if days:
+            shown_range["thinned"] = days
+        shown["range"] = shown_range
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
         return shown
@@ -189,15 +191,15 @@ def span_shown(
     if not request.things:
         del parts["things"]
     whole_s = 0.0
-    for name, (found, took_s) in _in_time(parts, call, request):
-        shown |= found.part
-        notes += found.notes
+    for name, part, took_s in _in_time(parts, call, request):
+        shown |= part.keys
+        notes += part.notes
         whole_s += took_s if name in _OF_WHOLE else 0.0
     if request.things:
         shown["whole_ms"] = round(whole_s * 1000)
     if request.signals:
         shown["signals"] = [
-            signal_in(memory, call, each, fresh, window) for each in request.signals
+            signal_in(memory, call, signal, fresh, window) for signal in request.signals
         ]
     shown["notes"] = [*dict.fromkeys(notes)]
     return shown
@@ -205,8 +207,8 @@ def span_shown(
 
 def _in_time(
     parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
-) -> Iterator[tuple[str, tuple[Shown, float]]]:
-    """Yields each part, or why it is not known yet, with the processor time (s) that it took."""
+) -> Iterator[tuple[str, Shown, float]]:
+    """Yields each part by name, or why it is not known yet, and the processor time (s) it took."""
     budget_s = _PART_S if request.patient else _QUICK_S
     whole = call.deadline.within(budget_s)
     for name, part in parts.items():
@@ -214,10 +216,10 @@ def _in_time(
         if request.first:
             budget_s = max(whole.left_s(), 0.0) / 2
         try:
-            found = part(replace(call, deadline=call.deadline.within(budget_s)))
+            shown = part(replace(call, deadline=call.deadline.within(budget_s)))
         except QueryTimeoutError as error:
-            found = Shown({}, (f"the {name} are not known yet: {error}",))
-        yield name, (found, time.thread_time() - begun)
+            shown = Shown({}, (f"the {name} are not known yet: {error}",))
+        yield name, shown, time.thread_time() - begun
 
 
 def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
@@ -229,7 +231,7 @@ def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> Tim
         return window
     since = min(max(ns_from_unix(since_s), window.start), window.stop - 1)
     bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
-    begins = min((each.start for each in bags), default=since)
+    begins = min((bag.start for bag in bags), default=since)
     return TimeWindow(max(begins, window.start), window.stop)
 
 
@@ -258,8 +260,8 @@ def _start_s(window: TimeWindow) -> float:
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
     """Returns the longest gaps in order, as pairs of times."""
-    longest = sorted(ranged.gaps, key=lambda each: each.start - each.end)[:MOST_GAPS]
-    return [[_s(each.start), _s(each.end)] for each in sorted(longest, key=lambda each: each.start)]
+    longest = sorted(ranged.gaps, key=lambda gap: gap.start - gap.end)[:MOST_GAPS]
+    return [[_s(gap.start), _s(gap.end)] for gap in sorted(longest, key=lambda gap: gap.start)]
 
 
 def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
@@ -270,34 +272,36 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
         return _path_by_fixes(view, window, latest)
     tracks = RobotTracks(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
-    found = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
-    track = cut(found.track, window)
+    tracked = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
+    track = cut(tracked.track, window)
     newest = track
     if window.stop <= latest or not len(track.times):
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
-    path = _drawn(track, places.map_frame, is_whole=found.since is None)
+    path = _drawn(track, places.map_frame, is_whole=tracked.since is None)
     named: list[JsonValue] = [
-        _place(at) for at in memory.limits.places if at.frame_id == places.map_frame
+        _place(place) for place in memory.limits.places if place.frame_id == places.map_frame
     ]
     shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
     notes = [*view.notes.sentences()]
-    if found.since is not None:
+    if tracked.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
     return Shown(shown, tuple(notes))
 
 
 def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
     """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
-    found = local_track(view, view.pose_topic, window)
-    if found is None:
+    local = local_track(view, view.pose_topic, window)
+    if local is None:
         try:
             why = f"{resolve_pose_topic(view)} has no poses"
         except NoDataError as error:  # names the setting or tool that gives a path
             why = error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
-    frame, track = found
-    newest = local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1))
-    robot = None if newest is None else _last(newest[1])
+    frame, track = local
+    robot = None
+    if newest := local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1)):
+        _, newest_track = newest
+        robot = _last(newest_track)
     shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
     return Shown(shown, view.notes.sentences())
 
@@ -312,8 +316,8 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
     places = robot_places(view, window)
     if places is None:
         return None
-    found = RobotTracks(view, places.map_frame).over(window)
-    return _drawn(cut(found.track, window), places.map_frame, is_whole=found.since is None)
+    tracked = RobotTracks(view, places.map_frame).over(window)
+    return _drawn(cut(tracked.track, window), places.map_frame, is_whole=tracked.since is None)
 
 
 def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
@@ -325,7 +329,7 @@ def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
         "x": np.round(track.x[kept], 2).tolist(),
         "y": np.round(track.y[kept], 2).tolist(),
-        "yaw": [degrees(each) for each in track.heading[kept].tolist()],
+        "yaw": [degrees(heading) for heading in track.heading[kept].tolist()],
         "begins": _begins(track, kept),
         "continues": bool(len(kept)) and not bool(track.begins[0]),
         "whole": is_whole,
@@ -419,17 +423,19 @@ def _place(place: Place) -> JsonObject:
 
 
 def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
-    found = recap(memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False)
+    summary = recap(
+        memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
+    )
     shown: JsonObject = {
-        "events": [event_shown(each) for each in found.events],
+        "events": [event_shown(event) for event in summary.events],
         "events_since": _start_s(window),
-        "throughout": [*found.throughout],
-        "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
-        "max_speed": None if found.max_speed is None else rounded(found.max_speed, 2),
-        "stood_s": None if found.stood is None else round(unix_from_ns(found.stood), 1),
-        "counts": dict(found.counts),
+        "throughout": [*summary.throughout],
+        "distance_m": None if summary.distance_m is None else rounded(summary.distance_m, 1),
+        "max_speed": None if summary.max_speed is None else rounded(summary.max_speed, 2),
+        "stood_s": None if summary.stood is None else round(unix_from_ns(summary.stood), 1),
+        "counts": dict(summary.counts),
     }
-    return Shown(shown, found.notes)
+    return Shown(shown, summary.notes)
 
 
 def event_shown(event: Event) -> JsonObject:
@@ -440,7 +446,7 @@ def event_shown(event: Event) -> JsonObject:
     if event.goes_on:
         shown["goes_on"] = True
     if event.point is not None:
-        shown["x"], shown["y"] = (rounded(each, 2) for each in event.point)
+        shown["x"], shown["y"] = (rounded(coordinate, 2) for coordinate in event.point)
     if event.places:
         shown["in"] = event.places[0]
     return shown
@@ -451,12 +457,12 @@ def _moments(memory: Memory, call: Call) -> Shown:
         stored = list_moments(memory, call).moments
     except EpisodicError as error:
         return Shown({"moments": []}, (str(error),))
-    requests = [each.moment.request for each in stored]
+    requests = [saved.moment.request for saved in stored]
     return Shown(
         {
             "moments": [
-                {"start": _s(each.start), "end": _s(each.end), "label": each.label}
-                for each in requests
+                {"start": _s(request.start), "end": _s(request.end), "label": request.label}
+                for request in requests
             ]
         }
     )
@@ -465,7 +471,7 @@ def _moments(memory: Memory, call: Call) -> Shown:
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
     """Returns the things that were seen in a window."""
     try:
-        found = find_things(
+        answer = find_things(
             memory,
             call,
             start_s=unix_from_ns(window.start),
@@ -476,10 +482,10 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         return Shown({"things": []}, (str(error),))
     return Shown(
         {
-            "things": [_thing(each) for each in found.things],
-            "things_total": found.total,
+            "things": [_thing(thing) for thing in answer.things],
+            "things_total": answer.total,
         },
-        found.notes,
+        answer.notes,
     )
 
 
