@@ -157,7 +157,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
     shared = shared_parts(settings)
     engine = settings.lake.engine
     lake = None if engine is None else open_lake(settings, engine)
-    robots = [_robot(settings, name, shared, lake) for name in settings.fleet.robots]
+    robots = [_build_robot(settings, name, shared, lake) for name in settings.fleet.robots]
     join = None if lake is None else partial(_robots_of, lake, settings, shared)
     fleet = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
     fleet.joined()
@@ -178,10 +178,10 @@ def _robots_of(
     lake.refresh(_JOINED_AGAIN_S)
     for name in lake.days("bags"):
         if name not in known and is_robot_name(name):
-            yield _robot(settings, name, shared, lake)
+            yield _build_robot(settings, name, shared, lake)
 
 
-def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
+def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
     """Returns a robot with bags of its own, in a lake, or both.
 
     Raises:

@@ -69,8 +69,8 @@ class Sources:
     def __call__(self, key: str) -> str:
         """Returns who set a key; for a file also the key that it takes its value from."""
         for override in reversed(self.overrides):
-            own, other = f"{key}.", f"{override.key}."
-            is_related = own.startswith(other) or other.startswith(own)
+            path, override_path = f"{key}.", f"{override.key}."
+            is_related = path.startswith(override_path) or override_path.startswith(path)
             if override.key not in GROUPS and is_related:
                 return override.source
         variable = self.appended.get(key)

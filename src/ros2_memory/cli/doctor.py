@@ -480,8 +480,8 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     except EpisodicError as problem:
         yield error(str(problem), "correct recording.topics_file")
         return
-    if live is not None and (other := _other_list(robot, selection, live)):
-        yield other
+    if live is not None and (finding := _other_list(robot, selection, live)):
+        yield finding
         return
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(robot, selection, heard)

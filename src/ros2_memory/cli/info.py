@@ -151,7 +151,7 @@ def _report(settings: Settings, memory: Memory) -> JsonObject:
     snapshot = memory.index.snapshot()
     return {
         **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
-        "held": _held(snapshot),
+        "held": _amount_recorded(snapshot),
         "overlapping_recordings": [
             {
                 "recording": pair.names[0],
@@ -180,8 +180,12 @@ def _show(memory: Memory, report: JsonObject) -> None:
     if not any((snapshot.bags, *aside)):
         print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
         return
-    status, ranged, held, *lists = report.values()
-    report_shown = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
+    status, ranged, recorded, *lists = report.values()
+    report_shown = {
+        **_object(recorded),
+        **_for_people(_object(status)),
+        **_for_people(_object(ranged)),
+    }
     left_out: list[str] = []
     silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
@@ -199,11 +203,11 @@ def _object(value: JsonValue) -> JsonObject:
     return value if isinstance(value, dict) else {}
 
 
-def _held(snapshot: Snapshot) -> JsonObject:
+def _amount_recorded(snapshot: Snapshot) -> JsonObject:
     """Returns how much is recorded, as `ros2 bag info` does."""
     bags, first, last = snapshot.bags, snapshot.earliest, snapshot.latest
     span = None if first is None or last is None else round(unix_from_ns(last - first), 3)
-    held: JsonObject = {
+    amount: JsonObject = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
         "storage": storage_of(bags) or None,
@@ -213,10 +217,10 @@ def _held(snapshot: Snapshot) -> JsonObject:
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
     }
     if snapshot.empty:
-        held["empty_bags"] = len(snapshot.empty)
+        amount["empty_bags"] = len(snapshot.empty)
     if snapshot.silent_topics:
-        held["topics_without_messages"] = [*sorted(snapshot.silent_topics)]
-    return held
+        amount["topics_without_messages"] = [*sorted(snapshot.silent_topics)]
+    return amount
 
 
 def storage_of(bags: Sequence[BagFile]) -> str:
@@ -331,9 +335,9 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 
 def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
-    own = None  # where it cannot be known which this program made
+    own_recordings = None  # where it cannot be known which this program made
     with suppress(OSError, RecorderError):
-        own = OwnRecordings(root)
+        own_recordings = OwnRecordings(root)
     left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
     for path, bags in sorted(
         recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
@@ -342,10 +346,10 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
         for file in inside:
             del left[file]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
-        whose = None if own is None else _OTHERS
+        whose = None if own_recordings is None else _OTHERS
         if Path(path).is_relative_to(root / MOMENTS_FOLDER):
             whose = "saved moment"
-        elif own is not None and own.owns_bag(bags[0].path):
+        elif own_recordings is not None and own_recordings.owns_bag(bags[0].path):
             whose = "this recorder"
         is_open = any(bag.state is BagState.ACTIVE for bag in bags)
         row: JsonObject = {

@@ -154,10 +154,12 @@ def load_to_look(
     loaded = load_for(named, given)
     if any(word.partition("=")[0] in GROUPS for word in given):
         return loaded
-    folder = loaded[0].recording.bag_dir
+    settings, _ = loaded
+    folder = settings.recording.bag_dir
     if named is not None and bag_dir is None:
-        own = load_for(None, None)[0].recording.bag_dir
-        is_of_others = named.absolute() != own.absolute() and not _is_recorded_now(folder)
+        defaults, _ = load_for(None, None)
+        deployed = defaults.recording.bag_dir.absolute()
+        is_of_others = named.absolute() != deployed and not _is_recorded_now(folder)
     elif is_deployment_chosen(given) or has_recorded(folder) or not folder.is_dir():
         is_of_others = False
     else:
@@ -295,8 +297,8 @@ def open_memory(
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:
         bag_dir = memory.index.bag_dir
-        there = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
-        near = get_close_matches(settings.data.recording, there, n=3)
+        names = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
+        near = get_close_matches(settings.data.recording, names, n=3)
         which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
         raise InvalidArgumentsError(f"{snapshot.problem}; {which}")
     return memory

@@ -175,7 +175,7 @@ def plot_path(
     bags: Bags,
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     with spinner("looking for the path"):
         path, happened = path_in(asked, topic, frame), asked.recap()
     with _picture(out, f"Path, {asked.title}", path.line, (8.5, 7.0)) as figure:
@@ -200,7 +200,7 @@ def plot_signal(
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     topic, bags = bags.with_topic(topic, "plot signal")
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         total, signals, notes = signals_of(asked, name, field or ())
@@ -220,7 +220,7 @@ def plot_signal(
 @as_command("plot timeline")
 def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     with spinner("looking what was recorded when"):
         happened = asked.recap()
         rows = [*event_rows(asked, happened), *topic_rows(asked)]
@@ -247,7 +247,7 @@ def plot_recap(
     """Draw a day in one picture: where the robot drove, what happened, what was recorded."""
     if day is not None and times != Times():
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
-    asked = _asked(out, bags, times if times != Times() else day)
+    asked = _checked_request(out, bags, times if times != Times() else day)
     with spinner("recalling the day"):
         happened = asked.recap()
         rows = event_rows(asked, happened)
@@ -377,7 +377,7 @@ def _label_times(axis: "Axis", start: float, end: float) -> None:
     axis.set_major_formatter(DateFormatter(form, tz=zone))
 
 
-def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
+def _checked_request(out: Path, bags: Bags, when: Times | str | None) -> Asked:
     """Returns what is asked for, in a window or on a day; checks that it can be drawn.
 
     Raises:

@@ -153,10 +153,10 @@ _GRID: Final = "nav_msgs/msg/OccupancyGrid"
 def judge(topics: Collection[Offered]) -> Proposal:
     """Returns what is proposed of each topic, whatever the budget is."""
     names = {topic.topic for topic in topics}
-    return {topic: _judged(topic, names) for topic in topics}
+    return {topic: _verdict_on(topic, names) for topic in topics}
 
 
-def _judged(topic: Offered, names: Collection[str]) -> Verdict:
+def _verdict_on(topic: Offered, names: Collection[str]) -> Verdict:
     for pattern, verdict in _RULES:
         if pattern.search(f"{topic.type} {topic.topic}"):
             return verdict

@@ -122,9 +122,9 @@ def up(
         _show_list(robot, measured, disk)
     else:
         _require_messages(robot, measured)
-        _propose(robot, measured, disk, yes=yes)
+        _write_proposal(robot, measured, disk, yes=yes)
     is_open = not settings.memory.keep and sources("memory.keep").startswith("in ")
-    if is_open and _remembers(bags, yes=yes):
+    if is_open and _may_keep_memory(bags, yes=yes):
         robot.words.append("memory.keep=true")
         if script is None:  # else the folder would not be that of the service's user
             (bags / MEMORY_FOLDER).mkdir(exist_ok=True)
@@ -196,7 +196,7 @@ def _owners_of_segments() -> set[int]:
     return owners
 
 
-def _propose(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
+def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
     """Shows the proposal, asks, and writes it.
 
     Raises:
@@ -223,7 +223,7 @@ def _propose(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
     print_line(f"wrote {robot.list_file}")
 
 
-def _remembers(bags: Path, *, yes: bool) -> bool:
+def _may_keep_memory(bags: Path, *, yes: bool) -> bool:
     """Returns whether something of the bags is to outlive them: only a person says so, once."""
     if (bags / MEMORY_FOLDER).is_dir():
         print_line(f"{bags / MEMORY_FOLDER} goes on: memory.keep=false would delete it")
@@ -262,8 +262,8 @@ def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measu
         sign = "record" if topic in recorded else choice.replace("record", "-")
         rate = f"{topic.hz:8.3g} Hz {topic.payload_bytes:7.0f} B" if topic.messages else ""
         daily = f"{_amount(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
-        told = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
-        print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {told}"))
+        detail = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
+        print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
     files = disk.files_per_day
     silent = [topic.topic for topic in recorded if not topic.messages]
     takes = (

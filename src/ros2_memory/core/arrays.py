@@ -68,9 +68,10 @@ def stacked(tables: Sequence[T]) -> T:
     """Returns the rows of such tables, of which there is one at least, one after the other."""
     if len(tables) == 1:
         return tables[0]
-    names = [column.name for column in fields(tables[0])]
+    first, *_ = tables
+    names = [column.name for column in fields(first)]
     columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
-    return replace(tables[0], **columns)
+    return replace(first, **columns)
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:

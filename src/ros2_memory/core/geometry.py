@@ -222,7 +222,7 @@ def _worst_first(
     """
     indices = kept.tolist()
     worst: list[tuple[float, int, int, int]] = []
-    known = {
+    measured = {
         (start, end): (-most, where)
         for batch in looked_at
         for start, end, most, where in zip(*(column.tolist() for column in batch), strict=True)
@@ -235,7 +235,7 @@ def _worst_first(
     def look(*edges: int) -> None:
         for start, end in pairwise(edges):
             if end - start > 1:
-                off, where = known.get((start, end)) or farthest(start, end)
+                off, where = measured.get((start, end)) or farthest(start, end)
                 heapq.heappush(worst, (off, where, start, end))
 
     look(*indices)

@@ -102,10 +102,10 @@ class Rectangle:
             along = to - at
             moves = along != 0
             size = np.where(moves, along, 1.0)
-            one, other = (low - at) / size, (high - at) / size
+            to_low, to_high = (low - at) / size, (high - at) / size
             still = (at >= low) & (at <= high)
-            start = np.maximum(start, np.where(moves, np.minimum(one, other), ~still * 2.0))
-            stop = np.minimum(stop, np.where(moves, np.maximum(one, other), 1.0))
+            start = np.maximum(start, np.where(moves, np.minimum(to_low, to_high), ~still * 2.0))
+            stop = np.minimum(stop, np.where(moves, np.maximum(to_low, to_high), 1.0))
         return start, stop
 
 

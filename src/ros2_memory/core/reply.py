@@ -286,7 +286,7 @@ class Keys:
     Attributes:
         keys: all of them.
         span: the oldest time and the newest, which decide whether it has local times.
-        other: an attribute, and the keys that take the place of these where it is true.
+        other: gets an attribute, and the keys that take the place of these where it is true.
     """
 
     keys: tuple[Key, ...]
@@ -296,7 +296,10 @@ class Keys:
     @property
     def all(self) -> tuple[Key, ...]:
         """These keys, and those that may take their place."""
-        return self.keys if self.other is None else (*self.keys, *self.other[1].keys)
+        if self.other is None:
+            return self.keys
+        _, other_keys = self.other
+        return (*self.keys, *other_keys.keys)
 
     @property
     def short(self) -> Keys:
@@ -305,8 +308,10 @@ class Keys:
 
     def render(self, owner: object, scope: Scope) -> JsonObject:
         """Returns an object with these keys."""
-        if self.other is not None and self.other[0](owner):
-            return self.other[1].render(owner, scope)
+        if self.other is not None:
+            takes_others, other_keys = self.other
+            if takes_others(owner):
+                return other_keys.render(owner, scope)
         if self.span is not None:
             first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
             now = getattr(owner, "now", scope.now)
@@ -344,7 +349,8 @@ def result(
     """
     form = keys(*declared, span=span)
     if where is not None:
-        form = replace(form, other=(_getter(where[0]), where[1]))
+        attribute, other_keys = where
+        form = replace(form, other=(_getter(attribute), other_keys))
 
     def declare(cls: type[T]) -> type[T]:
         whole = dataclass(frozen=True, slots=True)(cls)

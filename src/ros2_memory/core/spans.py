@@ -22,10 +22,12 @@ def united(spans: Iterable[tuple[Ns, Ns]], apart: Ns = 0) -> Spans:
     """Returns spans, sorted; those that touch, or are no farther apart, are merged."""
     merged: Spans = []
     for start, stop in sorted(spans):
-        if merged and start - merged[-1][1] <= apart:
-            merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
-        else:
-            merged.append((start, stop))
+        if merged:
+            last_start, last_stop = merged[-1]
+            if start - last_stop <= apart:
+                merged[-1] = last_start, max(last_stop, stop)
+                continue
+        merged.append((start, stop))
     return merged
 
 

@@ -302,7 +302,7 @@ def topics(reply: JsonValue, call: CallContext) -> str:
     return f"{total:,} messages on {len(counts)} topics, {of_odom:,} on /odom."
 
 
-def _ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
+def _judge_ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
     """Judges the message of a topic so long ago; `tell` checks what it holds."""
 
     def judge(reply: JsonValue, call: CallContext) -> str:
@@ -334,9 +334,9 @@ def _charge(reply: JsonValue, message: Message, _when: str) -> str:
     return f"{charge:.1%}."
 
 
-position: Final = partial(_ago, ODOM, _pose)
-velocity: Final = partial(_ago, ODOM, _twist)
-battery: Final = partial(_ago, BATTERY, _charge)
+position: Final = partial(_judge_ago, ODOM, _pose)
+velocity: Final = partial(_judge_ago, ODOM, _twist)
+battery: Final = partial(_judge_ago, BATTERY, _charge)
 
 
 def _last(topic: str, holds: Callable[[float], bool], tell: Tell, then: str | None = None) -> Judge:
@@ -370,7 +370,7 @@ def seen_near(place: Planar) -> Judge:
     def tell(reply: JsonValue, message: Message, when: str) -> str:
         return f"{_labels(reply, message).capitalize()}, {when}."
 
-    return _last(ODOM, _near(place), tell, SCENE_OBJECTS)
+    return _last(ODOM, _is_near(place), tell, SCENE_OBJECTS)
 
 
 def last_near(place: Planar) -> Judge:
@@ -380,7 +380,7 @@ def last_near(place: Planar) -> Judge:
         _at_place(at(reply, "value", "position"), message)
         return f"{when.capitalize()}."
 
-    return _last(ODOM, _near(place), tell)
+    return _last(ODOM, _is_near(place), tell)
 
 
 def _clear(reply: JsonValue, _message: Message, when: str) -> str:
@@ -507,7 +507,7 @@ def nothing_on(topic: str) -> Judge:
     return judge
 
 
-def _near(place: Planar) -> Callable[[float], bool]:
+def _is_near(place: Planar) -> Callable[[float], bool]:
     spot = in_odom(place)
 
     def holds(t: float) -> bool:

@@ -79,7 +79,7 @@ class FromLake(NamedTuple):
         return cls(latest, None if call.older == MAX_NS else call.older)
 
     def since(self, begin: Ns) -> FromLake:
-        """Returns that of an answer from a log time on."""
+        """Returns the report for an answer that needs nothing before a log time."""
         is_whole = self.older is None or begin > self.older
         return self._replace(older=None) if is_whole else self
 
@@ -142,7 +142,7 @@ class Robot:
             return ask(self.memory(), call), None
 
         def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
-            return _of_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
+            return _ask_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
 
         is_mounted = self.is_mounted()
         own = self.memory().index.snapshot() if is_mounted else None
@@ -202,7 +202,7 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     return any(bag.size > sizes.get(bag.start, 0) for bag in in_lake.timeline.overlapping(window))
 
 
-def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
+def _ask_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
     """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
     call.older = MAX_NS
     try:
@@ -257,7 +257,7 @@ class Fleet:
         return [robot for name, robot in self.robots.items() if robots is None or name in robots]
 
     def named(self, name: object, call: Call) -> Robot:
-        """Returns the robot of a name.
+        """Returns the robot with a name.
 
         Raises:
             InvalidArgumentsError: there is none, or the call may not ask about it, which the
@@ -267,10 +267,12 @@ class Fleet:
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
-        if found := next((robot for robot in allowed if robot.name == name), None):
-            return found
-        there = names_of(allowed)
-        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; there {there}")
+        for robot in allowed:
+            if robot.name == name:
+                return robot
+        raise InvalidArgumentsError(
+            f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
+        )
 
 
 def names_of(robots: Iterable[Robot]) -> str:
@@ -317,7 +319,7 @@ class FanOut:
                 own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
                 own.used_active = own.used_thinned = False
                 until_s = now_s + own_s + left_s * _GRACE
-                running[robot.name] = _asked(robot, work, own), own, own_s, until_s
+                running[robot.name] = _start_asking(robot, work, own), own, own_s, until_s
             # Without a deadline there is nothing to wake up for but an answer.
             first_s = min((until_s for *_, until_s in running.values()), default=now_s)
             futures = [future for future, *_ in running.values()]
@@ -351,7 +353,9 @@ class FanOut:
         return None
 
 
-def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:
+def _start_asking(
+    robot: Robot, work: Callable[[Robot, Call], T], call: Call
+) -> Future[T | EpisodicError]:
     """Returns what a robot will answer, in a thread of its own."""
     answer: Future[T | EpisodicError] = Future()
 

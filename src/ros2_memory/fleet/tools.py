@@ -419,8 +419,8 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
     """Returns the rows of all in order, those of robots whose clock is ahead last; and the rest."""
     values = {reply.name: _as_rows(reply) for reply in replies}
     times = {key.name: key.row_time for key in declared if key.row_time}
-    there = {name for value in values.values() for name in value}
-    key = next((name for name in times if name in there), next(iter(times)))
+    present = {name for value in values.values() for name in value}
+    key = next((name for name in times if name in present), next(iter(times)))
     merging = {key.name: key.merging for key in declared if key.merging}
     names = {name for name, how in merging.items() if how == "inherited"}
     order: list[tuple[bool, float, JsonObject]] = []
@@ -537,10 +537,10 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
     return table | _rest({}, replies, rest)
 
 
-def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def by_reason(reasons: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """Returns the names of robots by reason, from pairs of a name and a reason."""
     names_by_reason: dict[str, list[str]] = {}
-    for name, reason in said:
+    for name, reason in reasons:
         names_by_reason.setdefault(reason, []).append(name)
     return names_by_reason
 

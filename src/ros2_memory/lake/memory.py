@@ -211,23 +211,23 @@ class LakeIndex:
             BagVanishedError: it is not in the lake any more.
         """
         for window in self._windows.values():
-            if found := window.bags.get(str(path)):
-                return found
+            if bag := window.bags.get(str(path)):
+                return bag
         raise BagVanishedError(str(path), _GONE)
 
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
-        known = self._windows.get(until, _Window())
+        before = self._windows.get(until, _Window())
         of_robot = self.lake.days("bags").get(self.robot, {})
         made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
-        window = replace(known, older=None if day_before is None else end_of(day_before))
-        if made_of != known.made_of:
-            new = {day: files for day, files in made_of.items() if known.made_of.get(day) != files}
+        window = replace(before, older=None if day_before is None else end_of(day_before))
+        if made_of != before.made_of:
+            new = {day: files for day, files in made_of.items() if before.made_of.get(day) != files}
             same = made_of.keys() - new.keys()
-            bags = {path: bag for path, bag in known.bags.items() if bag.day in same}
-            bags |= self._read(new, known.bags)
-            gone, come = _missing(known.bags, bags), _missing(bags, known.bags)
-            timeline = known.timeline.changed(gone, come)
+            bags = {path: bag for path, bag in before.bags.items() if bag.day in same}
+            bags |= self._read(new, before.bags)
+            gone, come = _missing(before.bags, bags), _missing(bags, before.bags)
+            timeline = before.timeline.changed(gone, come)
             joined = {bag.file.recording: bag.joined for bag in bags.values() if bag.joined}
             window = _Window(window.older, made_of, timeline, bags, joined)
         # A new dict: other threads look for the bags of their answers in the old one.
@@ -340,8 +340,8 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        here = self.index.bag(path)
-        wanted = [head for head in self._heads_of(here) if head.channel.topic in topics]
+        lake_bag = self.index.bag(path)
+        wanted = [head for head in self._heads_of(lake_bag) if head.channel.topic in topics]
         names = sorted({head.channel.topic for head in wanted})
         for head in wanted:
             topic = head.channel.topic
@@ -349,7 +349,7 @@ class LakeReader(BagReader):
                 do = "name it in lake.messages of ros2-memory ship, ask about other topics"
                 why = f"the lake has only the times of {topic}, whose messages are large"
                 raise NotInLakeError(f"{why}: {do}, or ask the robot's own memory")
-            data = self._packed_of(here, head.number, names)
+            data = self._packed_of(lake_bag, head.number, names)
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
             if is_large(data):

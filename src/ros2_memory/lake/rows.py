@@ -162,8 +162,8 @@ class _BagRows:
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
         # Of each topic that can have some.
         events = {
-            topic: found.limited(MAX_PER_BAG, MAX_PER_BAG)
-            for topic, found in events_of_bag(self._view, self._bag, topics).items()
+            topic: bag_events.limited(MAX_PER_BAG, MAX_PER_BAG)
+            for topic, bag_events in events_of_bag(self._view, self._bag, topics).items()
         }
         for topic, found in events.items():
             self._rows["events"] += self._events_of(topic, found)
@@ -313,13 +313,13 @@ class _BagRows:
                 where = {"frame_id": detection.frame_id, **dict(zip("xyz", place, strict=False))}
                 self._rows["sightings"].append({**row, **named, **where})
 
-    def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
-        for seen in found.visible.intervals():
+    def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
+        for seen in events.visible.intervals():
             best = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
             yield _event(topic, "thing", seen.first, seen.label, **best)
-        for flip in found.of_kind(FLAG)[1]:
+        for flip in events.of_kind(FLAG)[1]:
             yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
-        for error in found.errors:
+        for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)
 

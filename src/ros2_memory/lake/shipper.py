@@ -83,7 +83,7 @@ class _KnownState(NamedTuple):
     is_forgotten: bool
 
 
-class _Ready(NamedTuple):
+class _PreparedBag(NamedTuple):
     """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
     robot: RobotBags
@@ -135,7 +135,7 @@ class Shipper:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
         done = Shipped()
-        batch: list[_Ready] = []
+        batch: list[_PreparedBag] = []
         size = 0
         robots = [robot for robot in self.robots if self._forget(robot, done)]
         for ready in chain.from_iterable(robot.ready(self, done) for robot in robots):
@@ -194,7 +194,7 @@ class Shipper:
             self.look_again()
         return True
 
-    def _commit(self, batch: Sequence[_Ready], done: Shipped, *, is_full: bool) -> None:
+    def _commit(self, batch: Sequence[_PreparedBag], done: Shipped, *, is_full: bool) -> None:
         """Commits a batch.
 
         Raises:
@@ -270,14 +270,14 @@ class RobotBags:
         self.known: dict[str, ShippedBag] = {}
         self._receipts: dict[str, Receipt] | None = None
 
-    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_Ready]:
+    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBag]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
             done.problems.append(f"{self.name}: {snapshot.problem}")
             return
         bags = self._settled(snapshot, done)
-        self._look_up(bags, shipper.lake)
+        self._load_known(bags, shipper.lake)
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         ids, confirmed = set[str](), list[ShippedBag]()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
@@ -295,7 +295,7 @@ class RobotBags:
                     done.problems.append(f"{self.name}: {why}")
                     continue
                 ids.add(bag_id)
-                shipped = self._described(bag, bag_id, before, shipper.messages)
+                shipped = self._row_of(bag, bag_id, before, shipper.messages)
                 if before is not None and _is_same(before, shipped):
                     confirmed.append(shipped)
                     continue
@@ -313,7 +313,7 @@ class RobotBags:
             start, end = shipped.start_ns, shipped.end_ns
             if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
                 replaced.add(of_file)
-            yield _Ready(self, shipped, rows, [*replaced])
+            yield _PreparedBag(self, shipped, rows, [*replaced])
         self.confirm(confirmed, shipper, done)
         self._drop_gone(bags)
 
@@ -335,7 +335,7 @@ class RobotBags:
         done.problems += [f"{self.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
         return bags
 
-    def _look_up(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
+    def _load_known(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
         """Asks the lake what it has of the time of new bags.
 
         Raises:
@@ -379,7 +379,7 @@ class RobotBags:
             known = self._states[bag.file] = _KnownState(state, bag_id, forgotten)
         return known.bag_id, known.is_forgotten
 
-    def _described(
+    def _row_of(
         self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
     ) -> ShippedBag:
         """Returns what a bag would be known as."""

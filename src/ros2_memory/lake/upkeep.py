@@ -250,12 +250,14 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     """
     # `channels` has a row of each bag of which anything is in the lake: it is the first to be
     # committed, and the last from which is deleted.
-    bags = _bags(lake, "channels", _of(tombstone, "first_ns", "last_ns"))
+    bags = _bags_where(lake, "channels", _rows_of_tombstone(tombstone, "first_ns", "last_ns"))
     # In `bags` alone: of which no message counts, and what a killed process was about to replace.
-    listed = _bags(lake, "bags", _of(replace(tombstone, topics=()), "start_ns", "end_ns"))
+    listed = _bags_where(
+        lake, "bags", _rows_of_tombstone(replace(tombstone, topics=()), "start_ns", "end_ns")
+    )
     if tombstone.topics and listed:
         ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
-        listed -= _bags(lake, "channels", ids)
+        listed -= _bags_where(lake, "channels", ids)
     bags |= listed
     for name in reversed([*TABLES]):
         lake.delete(name, of_bags(bags))
@@ -276,13 +278,15 @@ def _refs_to_old_versions(lake: LakeTables) -> Iterator[str]:
                 yield f"{name}: {ref}"
 
 
-def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
+def _bags_where(
+    lake: LakeTables, name: str, condition: BooleanExpression
+) -> set[tuple[str, date, str]]:
     """Returns robot, day and id of the bags that have some rows."""
     rows = lake.rows(name, condition, ("robot", "day", "bag_id")).to_pylist()
     return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
 
 
-def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+def _rows_of_tombstone(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
     """Returns the condition on rows of what is forgotten; the columns have their span."""
     if tombstone.bags:
         return of_ids(tombstone.robot, tombstone.bags)

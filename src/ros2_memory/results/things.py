@@ -267,14 +267,14 @@ class Pair(NamedTuple):
     other: float | None
 
 
-def _pair(places: int) -> Unit:
+def _unit_of_pairs(places: int) -> Unit:
     """Returns the unit of pairs whose numbers are rounded to so many places."""
     return an_object(keys(digits(places)("this"), digits(places)("with", "other")))
 
 
 def _named_pairs(places: int) -> Unit:
     """Returns the unit of pairs by name."""
-    return by_name(_pair(places), _LONGEST_NAME)
+    return by_name(_unit_of_pairs(places), _LONGEST_NAME)
 
 
 def _spot(name: str, time: str) -> Unit:
@@ -403,7 +403,7 @@ _STANDSTILLS: Final = objects(
     keys(
         _XY.spread("place"),
         INSIDE("inside"),
-        _pair(0).spread("seconds"),
+        _unit_of_pairs(0).spread("seconds"),
         TIME("this_since", lambda stood: stood.since[0]).if_known,
         TIME("with_since", lambda stood: stood.since[1]).if_known,
         LOCAL_OF_DAYS("local", lambda stood: next(filter(None, stood.since), None)),
@@ -426,8 +426,8 @@ def compared(most: int) -> Keys:
     A part in which nothing differs is left out.
     """
     return keys(
-        _pair(1)("duration_s", "lengths"),
-        _pair(1)("recorded_s", "recorded").in_short,
+        _unit_of_pairs(1)("duration_s", "lengths"),
+        _unit_of_pairs(1)("recorded_s", "recorded").in_short,
         PAIRS.spread("frames"),
         an_object(_differences(most))("things"),
         PLAIN("things_unchanged", "things.same").in_short,

@@ -210,15 +210,15 @@ def make_fragments(
         try:
             view = View(memory, Call(stored=True))
             make_statics(view, window)
-            made = [
+            fragments = [
                 drive_made(view, window),
                 tracks_made(view, window),
                 events_made(view, window, topics_with_changes(view)),
             ]
             if nth < len(pieces):
-                made.append(Watching(view).made(window))
+                fragments.append(Watching(view).made(window))
             # Each goes back in time as far as the others: what they read is still remembered.
-            deque(merge(*made, reverse=True), maxlen=0)
+            deque(merge(*fragments, reverse=True), maxlen=0)
             if nth < len(pieces):
                 memory.columns.make_outlines(view.timeline, window)
         except EpisodicError as error:
@@ -284,11 +284,11 @@ class Filler:
     async def fill(self) -> None:
         """Stores the closed bags that there are. Raises nothing but cancellation."""
         try:
-            await self._fill()
+            await self._fill_round()
         except Exception:
             log.exception("filling_failed")
 
-    async def _fill(self) -> None:
+    async def _fill_round(self) -> None:
         backfill = self._backfill
         due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
         in_thread = backfill.in_thread

@@ -124,9 +124,10 @@ class BoundedConnection(H11Protocol):
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
         if len(unknown) > MAX_UNKNOWN:
-            held = Counter(connection._address for connection in unknown)
+            of_address = Counter(connection._address for connection in unknown)
             min(
-                unknown, key=lambda connection: (-held[connection._address], connection._made_s)
+                unknown,
+                key=lambda connection: (-of_address[connection._address], connection._made_s),
             )._abort()
         self._watch()
 

@@ -82,7 +82,7 @@ class Health:
         backfill: Backfill | None = None,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
-        self._report = partial(_health, memory, version, backfill)
+        self._report = partial(_health_report, memory, version, backfill)
         self._version = version
         self._timeout_s = timeout_s
         self._queue = FairQueue("health", 1)
@@ -134,7 +134,7 @@ class FleetHealth:
         return _status(self._version, problems, {"robots": robots})
 
 
-def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
+def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.heartbeat()

@@ -264,8 +264,8 @@ class EpisodicServer(MCPServer[object]):
         if uri in offered:
             return TOOLS_OF_RESOURCES[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-        known = ", ".join([*offered, *(template.uri_template for template in self._templates)])
-        raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {known}")
+        uris = ", ".join([*offered, *(template.uri_template for template in self._templates)])
+        raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {uris}")
 
     async def _complete(
         self,
@@ -341,7 +341,7 @@ class Storing:
         return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s left"
 
 
-def _request(context: object) -> Request | None:
+def _http_request(context: object) -> Request | None:
     """Returns the HTTP request of a call; None over stdio."""
     request = context.request_context.request if isinstance(context, Context) else None
     return request if isinstance(request, Request) else None
@@ -353,7 +353,7 @@ def _client(context: object) -> Hashable:
     None over stdio, which has one client. It serves to give out turns fairly, and nothing else: a
     client may claim to be another.
     """
-    request = _request(context)
+    request = _http_request(context)
     if request is None:
         return None
     # The body was parsed. Starlette would keep up to 1 MiB of it for as long as the call waits.
@@ -368,13 +368,13 @@ def _client(context: object) -> Hashable:
 
 def _robots(context: object) -> frozenset[str] | None:
     """Returns the robots that the token of a request is for; None where it is for all."""
-    request = _request(context)
+    request = _http_request(context)
     return None if request is None else robots_of(request.scope)
 
 
 def _is_page(context: object) -> bool:
     """Returns whether the server's own page asks: only browsers name the site of a request."""
-    request = _request(context)
+    request = _http_request(context)
     return request is not None and request.headers.get("sec-fetch-site") == "same-origin"
 
 

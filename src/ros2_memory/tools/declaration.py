@@ -90,7 +90,9 @@ class Signature:
         """Returns a call with the required arguments alone."""
         needed = {*self._required, *self._either[:1]}
         return {
-            name: _example(schema) for name, schema in self._properties.items() if name in needed
+            name: _example_value(schema)
+            for name, schema in self._properties.items()
+            if name in needed
         }
 
     def json_schema(self) -> JsonObject:
@@ -189,10 +191,11 @@ class Signature:
 def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
     """Returns the JSON schema of each argument; an optional one has a default and no null."""
     schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
-    return {name: _flat(described) for name, described in schema.items()}
+    return {name: _without_null(described) for name, described in schema.items()}
 
 
-def _flat(schema: JsonObject) -> JsonObject:
+def _without_null(schema: JsonObject) -> JsonObject:
+    """Returns the schema of an argument without its title, and without null as an alternative."""
     kinds = schema.get("anyOf")
     kept = {key: item for key, item in schema.items() if key != "title"}
     if isinstance(kinds, list) and {"type": "null"} in kinds:
@@ -239,7 +242,7 @@ def _expected(schema: JsonObject) -> str:
     text = f"{what} of {' and '.join(bounds)}" if bounds else what
     if "description" in schema:
         text += f" ({str(schema['description']).rstrip('.')})"
-    return f"{text}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else text
+    return f"{text}, e.g. {to_json_text(_example_value(schema))}" if "examples" in schema else text
 
 
 def _kind(schema: JsonObject) -> str:
@@ -259,7 +262,7 @@ def _kind(schema: JsonObject) -> str:
     return _KINDS[str(kinds)]
 
 
-def _example(schema: JsonObject) -> JsonValue:
+def _example_value(schema: JsonObject) -> JsonValue:
     examples = schema.get("examples")
     return examples[0] if isinstance(examples, list) and examples else schema.get("default")
 
@@ -359,13 +362,13 @@ class ToolDeclaration:
             yield Tool(
                 tool_name.name,
                 tool_name.title,
-                partial(self._describe, tool_name, signature, defaults),
+                partial(self._compose_description, tool_name, signature, defaults),
                 self.blocking,
                 partial(self._question, signature),
                 self.writes,
             )
 
-    def _describe(
+    def _compose_description(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
         """Returns what planners read: in full for the first name; the others refer to it."""

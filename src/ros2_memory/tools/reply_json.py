@@ -84,9 +84,9 @@ def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
         case results.Match(found=found) if found is not None:
             return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
         case results.ValueWhen(matched=matched, value=value) if matched is not None:
-            held = () if value is None else value.notes
+            value_notes = () if value is None else value.notes
             return replace(
-                answer, notes=tuple(dict.fromkeys((*matched.notes, *held, *answer.notes)))
+                answer, notes=tuple(dict.fromkeys((*matched.notes, *value_notes, *answer.notes)))
             )
         case results.TrajectorySummary():
             return replace(answer, notes=(*answer.notes, *_path_notes(answer.trajectory)))

@@ -107,7 +107,7 @@ def sightings_shown(
     notes: list[str] = []
     total: int | None = 0
     for topic in detectors:
-        found = find_matches(
+        sightings = find_matches(
             memory,
             call,
             topic,
@@ -117,11 +117,11 @@ def sightings_shown(
             end_s=end_s,
             limit=MOST_SIGHTINGS,
         )
-        sightings = render(found, memory.index.bag_dir)["sightings"]
-        if isinstance(sightings, list):
-            rows += [{"topic": topic, **row} for row in sightings if isinstance(row, dict)]
-        total = None if total is None or found.total is None else total + found.total
-        notes += found.notes
+        rendered = render(sightings, memory.index.bag_dir)["sightings"]
+        if isinstance(rendered, list):
+            rows += [{"topic": topic, **row} for row in rendered if isinstance(row, dict)]
+        total = None if total is None or sightings.total is None else total + sightings.total
+        notes += sightings.notes
     rows.sort(key=_last_seen, reverse=True)
     return {
         "label": label,

@@ -164,7 +164,7 @@ def span_shown(
     if request.status:
         ranged = data_time_range(memory, call)
         days: list[JsonValue] = [
-            [_s(start), _s(stop)] for start, stop in snapshot.timeline.thinned_times
+            [_unix_s(start), _unix_s(stop)] for start, stop in snapshot.timeline.thinned_times
         ]
         shown_range: JsonObject = {
             **render(ranged, memory.index.bag_dir),
@@ -248,7 +248,7 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
     return "-".join(map(str, counts))
 
 
-def _s(at: Ns) -> float:
+def _unix_s(at: Ns) -> float:
     """Returns Unix seconds to the millisecond: a pixel of the page is more."""
     return round(unix_from_ns(at), 3)
 
@@ -261,7 +261,9 @@ def _start_s(window: TimeWindow) -> float:
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
     """Returns the longest gaps in order, as pairs of times."""
     longest = sorted(ranged.gaps, key=lambda gap: gap.start - gap.end)[:MOST_GAPS]
-    return [[_s(gap.start), _s(gap.end)] for gap in sorted(longest, key=lambda gap: gap.start)]
+    return [
+        [_unix_s(gap.start), _unix_s(gap.end)] for gap in sorted(longest, key=lambda gap: gap.start)
+    ]
 
 
 def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
@@ -279,9 +281,11 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
     path = _drawn(track, places.map_frame, is_whole=tracked.since is None)
     named: list[JsonValue] = [
-        _place(place) for place in memory.limits.places if place.frame_id == places.map_frame
+        _place_outline(place)
+        for place in memory.limits.places
+        if place.frame_id == places.map_frame
     ]
-    shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
+    shown: JsonObject = {"path": path, "robot": _newest_pose(newest), "places": named}
     notes = [*view.notes.sentences()]
     if tracked.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
@@ -301,7 +305,7 @@ def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
     robot = None
     if newest := local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1)):
         _, newest_track = newest
-        robot = _last(newest_track)
+        robot = _newest_pose(newest_track)
     shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
     return Shown(shown, view.notes.sentences())
 
@@ -386,7 +390,7 @@ def driven_cells(track: RobotTrack) -> JsonObject:
         "size": size,
         "x": (numbers // height + low[0]).tolist(),
         "y": (numbers % height + low[1]).tolist(),
-        "until": _s(int(track.times[-1])),
+        "until": _unix_s(int(track.times[-1])),
     }
 
 
@@ -398,18 +402,18 @@ def _begins(track: RobotTrack, kept: NDArray[np.intp]) -> list[JsonValue]:
     return [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist()]
 
 
-def _last(track: RobotTrack) -> JsonObject | None:
+def _newest_pose(track: RobotTrack) -> JsonObject | None:
     if not len(track.times):
         return None
     return {
-        "t": _s(int(track.times[-1])),
+        "t": _unix_s(int(track.times[-1])),
         "x": rounded(float(track.x[-1]), 3),
         "y": rounded(float(track.y[-1]), 3),
         "yaw": degrees(math.remainder(float(track.heading[-1]), math.tau)),
     }
 
 
-def _place(place: Place) -> JsonObject:
+def _place_outline(place: Place) -> JsonObject:
     """Returns a named place as a circle or as corners."""
     match place.region:
         case Circle(x, y, radius_m):
@@ -440,9 +444,9 @@ def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
 
 def event_shown(event: Event) -> JsonObject:
     """Returns an event as the page takes it."""
-    shown: JsonObject = {"kind": event.kind, "t": _s(event.start), "text": event.text}
+    shown: JsonObject = {"kind": event.kind, "t": _unix_s(event.start), "text": event.text}
     if event.end is not None:
-        shown["end"] = _s(event.end)
+        shown["end"] = _unix_s(event.end)
     if event.goes_on:
         shown["goes_on"] = True
     if event.point is not None:
@@ -461,7 +465,11 @@ def _moments(memory: Memory, call: Call) -> Shown:
     return Shown(
         {
             "moments": [
-                {"start": _s(request.start), "end": _s(request.end), "label": request.label}
+                {
+                    "start": _unix_s(request.start),
+                    "end": _unix_s(request.end),
+                    "label": request.label,
+                }
                 for request in requests
             ]
         }
@@ -482,21 +490,21 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         return Shown({"things": []}, (str(error),))
     return Shown(
         {
-            "things": [_thing(thing) for thing in answer.things],
+            "things": [_thing_row(thing) for thing in answer.things],
             "things_total": answer.total,
         },
         answer.notes,
     )
 
 
-def _thing(thing: Thing) -> JsonObject:
+def _thing_row(thing: Thing) -> JsonObject:
     shown: JsonObject = {
         "label": thing.label,
         "x": rounded(thing.place[0], 2),
         "y": rounded(thing.place[1], 2),
         "frame": thing.frame_id,
-        "first": _s(thing.first),
-        "last": _s(thing.last),
+        "first": _unix_s(thing.first),
+        "last": _unix_s(thing.last),
         "times": thing.count,
     }
     if thing.inside:

@@ -56,7 +56,9 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     """
     view = View(memory, replace(call, deadline=call.deadline.within(_PATIENT_S)), window.stop)
     least = memory.limits.min_score
-    in_view = [found.visible for found in found_events(view, window).values() if found is not None]
+    in_view = [
+        events.visible for events in found_events(view, window).values() if events is not None
+    ]
     if least:
         in_view = [visible.scoring(least) for visible in in_view]
     rows = [
