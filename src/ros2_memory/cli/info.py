@@ -149,19 +149,15 @@ def _report(settings: Settings, memory: Memory) -> JsonObject:
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
     replies = call_tools(build_dispatcher(settings, memory), tools)
     snapshot = memory.index.snapshot()
+    overlapping: list[JsonValue] = []
+    for pair, topic in mixed_recordings(memory, Call()):
+        first, second = pair.names
+        times = {"from": unix_from_ns(pair.start), "to": unix_from_ns(pair.end)}
+        overlapping.append({"recording": first, "and": second, **times, "robots_differ_on": topic})
     return {
         **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
         "held": _amount_recorded(snapshot),
-        "overlapping_recordings": [
-            {
-                "recording": pair.names[0],
-                "and": pair.names[1],
-                "from": unix_from_ns(pair.start),
-                "to": unix_from_ns(pair.end),
-                "robots_differ_on": topic,
-            }
-            for pair, topic in mixed_recordings(memory, Call())
-        ],
+        "overlapping_recordings": overlapping,
         "contradicting_frames": [
             {"frame": frame.frame, "in_recordings": [*frame.names], "parents": [*frame.parents]}
             for frame in contradicting_frames(memory, Call())

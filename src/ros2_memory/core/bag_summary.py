@@ -256,11 +256,10 @@ class BagSummary:
         at = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
         begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
         (base,) = _BASE.unpack_from(packed)
-        return (
-            int.from_bytes(packed[at:begin], "little"),
-            base + int.from_bytes(packed[begin:end], "little"),
-            base + int.from_bytes(packed[end : end + _TIME_BYTES], "little"),
-        )
+        count = int.from_bytes(packed[at:begin], "little")
+        first = base + int.from_bytes(packed[begin:end], "little")
+        last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
+        return count, first, last
 
     def pack(self) -> None:
         """Takes about half of the memory from now on, and some microseconds for each look."""

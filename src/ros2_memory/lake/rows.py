@@ -95,7 +95,7 @@ def sha256_of(path: Path) -> str:
 
 
 def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
-    """Returns what the rows of a bag depend on besides its bytes.
+    """Returns a digest of what the rows of a bag depend on besides its bytes.
 
     That is which of its messages count, the handovers of its recording, the static transforms in
     force, what the robot is placed by, the spellings of labels, the settings (`config`) and the

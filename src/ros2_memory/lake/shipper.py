@@ -299,8 +299,8 @@ class RobotBags:
                 if before is not None and _is_same(before, shipped):
                     confirmed.append(shipped)
                     continue
-                of_file = by_file.get(shipped.file)
-                if of_file is not None and self._is_cut(of_file, bag):
+                same_file = by_file.get(shipped.file)
+                if same_file is not None and self._is_cut(same_file, bag):
                     continue
                 by_table = rows_of(self.memory, bag, shipped, shipper.messages)
                 # As Python has them, they take many times as much.
@@ -310,9 +310,8 @@ class RobotBags:
                 continue
             replaced = {before} if before is not None else set()
             # As where its first messages were deleted by request: what is left lies within it.
-            start, end = shipped.start_ns, shipped.end_ns
-            if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
-                replaced.add(of_file)
+            if same_file is not None and _covers(same_file, shipped):
+                replaced.add(same_file)
             yield _PreparedBag(self, shipped, rows, [*replaced])
         self.confirm(confirmed, shipper, done)
         self._drop_gone(bags)
@@ -382,12 +381,13 @@ class RobotBags:
     def _row_of(
         self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
     ) -> ShippedBag:
-        """Returns what a bag would be known as."""
+        """Returns the row that a bag would have in `bags`; its file is hashed where it is new."""
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and is_read else sha256_of(bag.path)
-        of_file = self.name_of(bag), bag.size, sha256, bag.mtime_ns
+        file_columns = self.name_of(bag), bag.size, sha256, bag.mtime_ns
         made = made_of(self.memory, bag, self.config, messages)
-        return ShippedBag(self.name, bag_id, day_of(bag.start), *of_file, made, bag.start, bag.end)
+        day = day_of(bag.start)
+        return ShippedBag(self.name, bag_id, day, *file_columns, made, bag.start, bag.end)
 
     def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
         """Returns whether only retention took messages out of a bag after it was shipped.
@@ -428,6 +428,11 @@ def _list_one(folder: Path) -> None:
     """Lists one entry of a folder, which takes as long as its disk does; errors are no matter."""
     with suppress(OSError), os.scandir(folder) as entries:
         next(entries, None)
+
+
+def _covers(before: ShippedBag, now: ShippedBag) -> bool:
+    """Returns whether all of a bag lies within the time of an earlier one."""
+    return before.start_ns <= now.start_ns and now.end_ns <= before.end_ns
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

@@ -154,25 +154,12 @@ def span_shown(
         "version": version,
         "now": now,
         "latest": moment(latest),
-        "filling": None
-        # Without the newest of many bags, as while recording, the store is as good as full.
-        if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
-        else {"closed": filling.closed, "waiting": filling.waiting},
+        "filling": _filling_shown(filling),
     }
     if questions is not None and questions.is_on:
         shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
-        ranged = data_time_range(memory, call)
-        days: list[JsonValue] = [
-            [_unix_s(start), _unix_s(stop)] for start, stop in snapshot.timeline.thinned_times
-        ]
-        shown_range: JsonObject = {
-            **render(ranged, memory.index.bag_dir),
-            "gaps": _gaps(ranged),
-        }
-        if days:
-            shown_range["thinned"] = days
-        shown["range"] = shown_range
+        shown["range"] = _range_shown(memory, call, snapshot)
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
         return shown
@@ -181,7 +168,6 @@ def span_shown(
     # Rounded away from the span, so that one that is asked again holds all that it did.
     end_s = -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
     shown |= {"start": _start_s(window), "end": end_s, "since": _start_s(fresh)}
-    notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
         "events": lambda call: _events(memory, call, window if request.things else fresh),
@@ -190,6 +176,39 @@ def span_shown(
     }
     if not request.things:
         del parts["things"]
+    all_parts = _united_parts(parts, call, request)
+    shown |= all_parts.keys
+    if request.signals:
+        shown["signals"] = [
+            signal_in(memory, call, signal, fresh, window) for signal in request.signals
+        ]
+    shown["notes"] = [*all_parts.notes]
+    return shown
+
+
+def _filling_shown(filling: Progress | None) -> JsonObject | None:
+    """Returns how far the store of columns is filled; None where that is as good as full."""
+    # So it is without the newest of many bags, as while recording.
+    if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10):
+        return None
+    return {"closed": filling.closed, "waiting": filling.waiting}
+
+
+def _range_shown(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
+    """Returns the recorded range with its longest gaps, and the days that were thinned, if any."""
+    ranged = data_time_range(memory, call)
+    shown: JsonObject = {**render(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
+    if thinned := snapshot.timeline.thinned_times:
+        shown["thinned"] = [[_unix_s(start), _unix_s(stop)] for start, stop in thinned]
+    return shown
+
+
+def _united_parts(
+    parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
+) -> Shown:
+    """Returns all parts as one, with how long (ms) those of the whole span took."""
+    shown: JsonObject = {}
+    notes: list[str] = []
     whole_s = 0.0
     for name, part, took_s in _in_time(parts, call, request):
         shown |= part.keys
@@ -197,12 +216,7 @@ def span_shown(
         whole_s += took_s if name in _OF_WHOLE else 0.0
     if request.things:
         shown["whole_ms"] = round(whole_s * 1000)
-    if request.signals:
-        shown["signals"] = [
-            signal_in(memory, call, signal, fresh, window) for signal in request.signals
-        ]
-    shown["notes"] = [*dict.fromkeys(notes)]
-    return shown
+    return Shown(shown, tuple(dict.fromkeys(notes)))
 
 
 def _in_time(

@@ -146,9 +146,9 @@ def signal_in(
 def _signal_parts(
     view: View, topic: str, field: str, window: TimeWindow, width: Ns
 ) -> tuple[list[Part], Ns | None, Sequence[UndecodableError]]:
-    """Returns the numbers of a field, of times that no edge of a bin cuts, in order.
+    """Returns the parts of a field's numbers in order; no edge of a bin cuts one.
 
-    And since when they are known, if not all were read, and failures.
+    Besides from which log time on they are known (None where all were read), and failures.
     """
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
