@@ -405,14 +405,17 @@ def merged(
         short = [{key: row[key] for key in keys if key in row} for row in whole]
         do = "each robot shortly; pass robot for all of it"
         return with_notes({"robots": [*short], **failed}, [do, *notes])
-    own = by_reason(
+    notes_of_robots = by_reason(
         (reply.name, note)
         for reply in order
         # `str(note)` would lose that it is quoted.
         for note in _items(reply.body, "notes")
         if isinstance(note, str)
     )
-    return with_notes({**reply_body, **failed}, [*map(_of_robots, own.values(), own), *notes])
+    return with_notes(
+        {**reply_body, **failed},
+        [*map(_of_robots, notes_of_robots.values(), notes_of_robots), *notes],
+    )
 
 
 def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
@@ -442,7 +445,7 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
     rest = {name: _without(value, {key, *names}) for name, value in values.items()}
     is_cut = ordered[: page.limit] != ordered or any(value.get("more") for value in values.values())
     marks_more = is_cut and any(key.name == "more" for key in declared)
-    reply_body = {**rows, **_rest(merging, replies, rest)}
+    reply_body = {**rows, **_combined(merging, replies, rest)}
     if marks_more:
         reply_body["more"] = True
     return reply_body
@@ -458,7 +461,7 @@ def _as_rows(reply: RobotReply) -> JsonObject:
     return reply.body
 
 
-def _rest(
+def _combined(
     merging: Mapping[str, Merging], replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
 ) -> JsonObject:
     """Returns what the replies have besides rows, and what of it is not the same for all.
@@ -472,20 +475,24 @@ def _rest(
     for key in dict.fromkeys(key for value in values.values() for key in value):
         if key in _LEFT_OUT:
             continue
-        own = {name: value[key] for name, value in values.items() if key in value}
+        of_robots = {name: value[key] for name, value in values.items() if key in value}
         match merging.get(key, "added" if key == AT_LEAST else ""):
             case "who":
-                combined[key] = [name for name, is_so in own.items() if is_so]
+                combined[key] = [name for name, is_so in of_robots.items() if is_so]
             case "counted":
                 sums: Counter[str] = Counter()
-                for counts in own.values():
+                for counts in of_robots.values():
                     sums.update(counts if isinstance(counts, dict) else {})
                 combined[key] = dict(sums.most_common())
             case ("earliest" | "newest") as how:
-                numbers = [_number(own[name]) for name in dated if own.get(name) is not None]
+                numbers = [
+                    _number(of_robots[name]) for name in dated if of_robots.get(name) is not None
+                ]
                 combined[key] = (min if how == "earliest" else max)(numbers, default=None)
-            case "" if len(own) == len(values) and len({*map(to_json_text, own.values())}) == 1:
-                combined[key] = next(iter(own.values()))
+            case "" if (
+                len(of_robots) == len(values) and len({*map(to_json_text, of_robots.values())}) == 1
+            ):
+                combined[key] = next(iter(of_robots.values()))
             case how:
                 # Where a robot has not counted all, there is no total, but at least so many.
                 totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
@@ -493,8 +500,8 @@ def _rest(
                     AT_LEAST in value for value in values.values()
                 )
                 if how == "added" and is_counted:
-                    combined[key] = round(sum(map(_number, (*own.values(), *totals))), 2)
-                for name, value in own.items():
+                    combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
+                for name, value in of_robots.items():
                     by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
 
@@ -534,7 +541,7 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
             totals[name] = [*map(dict(zip(header[1:], total, strict=True)).get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": totals}
-    return table | _rest({}, replies, rest)
+    return table | _combined({}, replies, rest)
 
 
 def by_reason(reasons: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

@@ -190,15 +190,7 @@ def make_fragments(
     It is joined by stretches of the clock, but for those in which bags or slices are `waiting`: log
     times (ns) where they begin.
     """
-    around = [window.widened(PART_NS) for window in windows]
-    ends = {(window.start // STRETCH_NS, window.stop // STRETCH_NS) for window in around}
-    touched = {number for first, last in ends for number in range(first, last + 1)}
-    touched -= {start // STRETCH_NS for start in waiting}
-    # What is joined of a stretch needs all parts of it, and those that reach into it.
-    stretches = [
-        TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
-        for number in sorted(touched, reverse=True)
-    ]
+    stretches = _stretches_around(windows, waiting)
     # The newest `STRETCH_NS` of a window, and so on: few fragments wait to be written.
     pieces = [
         TimeWindow(max(window.start, stop - STRETCH_NS), stop)
@@ -208,19 +200,7 @@ def make_fragments(
     unwritten: Ns = 0
     for nth, window in enumerate([*pieces, *stretches]):
         try:
-            view = View(memory, Call(stored=True))
-            make_statics(view, window)
-            fragments = [
-                drive_made(view, window),
-                tracks_made(view, window),
-                events_made(view, window, topics_with_changes(view)),
-            ]
-            if nth < len(pieces):
-                fragments.append(Watching(view).made(window))
-            # Each goes back in time as far as the others: what they read is still remembered.
-            deque(merge(*fragments, reverse=True), maxlen=0)
-            if nth < len(pieces):
-                memory.columns.make_outlines(view.timeline, window)
+            _make_fragments_in(memory, window, is_joined=nth >= len(pieces))
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.
@@ -230,6 +210,42 @@ def make_fragments(
             unwritten = 0
         memory.large.release()
     memory.columns.write_fragments()
+
+
+def _stretches_around(windows: Sequence[TimeWindow], waiting: Sequence[Ns]) -> Sequence[TimeWindow]:
+    """Returns the stretches that windows touch and in which nothing is waiting, the newest first.
+
+    What is joined of a stretch needs all parts of it, and those that reach into it.
+    """
+    around = [window.widened(PART_NS) for window in windows]
+    ends = {(window.start // STRETCH_NS, window.stop // STRETCH_NS) for window in around}
+    touched = {number for first, last in ends for number in range(first, last + 1)}
+    touched -= {start // STRETCH_NS for start in waiting}
+    return [
+        TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
+        for number in sorted(touched, reverse=True)
+    ]
+
+
+def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -> None:
+    """Makes the fragments of a window; sights and outlines where these are not joined of others.
+
+    Raises:
+        EpisodicError: they cannot be made.
+    """
+    view = View(memory, Call(stored=True))
+    make_statics(view, window)
+    fragments = [
+        drive_made(view, window),
+        tracks_made(view, window),
+        events_made(view, window, topics_with_changes(view)),
+    ]
+    if not is_joined:
+        fragments.append(Watching(view).made(window))
+    # Each goes back in time as far as the others: what they read is still remembered.
+    deque(merge(*fragments, reverse=True), maxlen=0)
+    if not is_joined:
+        memory.columns.make_outlines(view.timeline, window)
 
 
 async def keep_backfilled(
