@@ -57,15 +57,7 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     try:
         topic_rows = list_recorded_topics(memory, Call())
         snapshot, latching = memory.index.snapshot(), memory.limits.latching
-        for topic_row in topic_rows:
-            remarks: JsonObject = {}
-            if topic_row.undecodable:
-                remarks["undecodable"] = topic_row.undecodable
-            if topic_row.notes:
-                remarks["notes"] = [*topic_row.notes]
-            # Planners read the rate in `data_time_range` instead.
-            rate = usual_rate(snapshot, topic_row.topic, latching)
-            rows.append({**shown(topic_row, Scope()), **remarks, "rate_hz": rate})
+        rows = [_row_with_rate(row, snapshot, latching) for row in topic_rows]
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
@@ -84,6 +76,17 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         for aside in (*snapshot.damaged, *snapshot.unread):
             print_line(f"  {aside.path.name}: {aside.reason}")
     return not rows
+
+
+def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> JsonObject:
+    """Returns a topic's row as the tool has it, with its rate: planners read that elsewhere."""
+    row = shown(topic, Scope())
+    if topic.undecodable:
+        row["undecodable"] = topic.undecodable
+    if topic.notes:
+        row["notes"] = [*topic.notes]
+    row["rate_hz"] = usual_rate(snapshot, topic.topic, latching)
+    return row
 
 
 def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:

@@ -384,23 +384,33 @@ class LakeReader(BagReader):
         return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
+        """Returns the channels of a bag; those of the bags beside it are read with it, and cached.
+
+        Raises:
+            BagVanishedError: it is not in the lake any more.
+        """
         heads = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
         if heads is None:
-            heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-            for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
-                schema = Schema(row["type"], row["schema_encoding"], row["schema"])
-                more = tuple((key, value) for key, value in json.loads(row["metadata"]))
-                channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
-                head = _Head(row["channel"], shared(channel), row["has_payloads"])
-                heads_by_bag[row["bag_id"]].append(head)
-            for bag_id, heads in heads_by_bag.items():
-                size_bytes = _HEAD_BYTES * (1 + len(heads))
-                self._heads.put((bag_id, bag.together[bag_id]), heads, size_bytes)
+            heads_by_bag = self._read_heads(bag)
+            for bag_id, read in heads_by_bag.items():
+                size_bytes = _HEAD_BYTES * (1 + len(read))
+                self._heads.put((bag_id, bag.together[bag_id]), read, size_bytes)
             heads = heads_by_bag[bag.bag_id]
         if not heads and bag.file.summary.count:
             # Deleted, or replaced under another id, since the index of this robot was read.
             raise BagVanishedError(bag.file.file, _GONE)
         return heads
+
+    def _read_heads(self, bag: LakeBag) -> dict[str, list[_Head]]:
+        """Returns the channels of a bag and of those that are read with it, by the ids of bags."""
+        heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+            metadata = tuple((key, value) for key, value in json.loads(row["metadata"]))
+            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], metadata)
+            head = _Head(row["channel"], shared(channel), row["has_payloads"])
+            heads_by_bag[row["bag_id"]].append(head)
+        return heads_by_bag
 
     def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
         """Returns the packed messages of a channel; None where they are gone.

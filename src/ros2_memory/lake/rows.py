@@ -315,9 +315,10 @@ class _BagRows:
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():
-            best = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
-            yield _event(topic, "thing", seen.first, seen.label, **best)
-        for flip in events.of_kind(FLAG)[1]:
+            columns = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
+            yield _event(topic, "thing", seen.first, seen.label, **columns)
+        _, flips = events.of_kind(FLAG)
+        for flip in flips:
             yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
         for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}

@@ -81,11 +81,11 @@ class Backfill:
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
 
-        def done() -> T:
+        def work_in_turn() -> T:
             with self._memory.large.during():
                 return work()
 
-        return await anyio.to_thread.run_sync(done, abandon_on_cancel=True)
+        return await anyio.to_thread.run_sync(work_in_turn, abandon_on_cancel=True)
 
     def progress(self) -> Progress:
         """Returns how much is stored."""
