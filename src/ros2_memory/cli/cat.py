@@ -153,8 +153,8 @@ def _csv(rows: Iterable[Row]) -> Iterator[str]:
             columns = [*cells]
             yield _csv_line(["time", *columns])
         beside.update(cells.keys() - columns)
-        seconds, rest = divmod(time, NS_PER_S)
-        yield _csv_line([f"{seconds}.{rest:09d}", *map(cells.get, columns)])
+        seconds, nanoseconds = divmod(time, NS_PER_S)
+        yield _csv_line([f"{seconds}.{nanoseconds:09d}", *map(cells.get, columns)])
     if beside:
         names = listed(sorted(beside))
         print_notes([f"no column, as the first message has no such field: {names}"])

@@ -186,24 +186,26 @@ def quoted_keys(reply: JsonValue) -> list[str]:
     if isinstance(reply, dict) and isinstance(columns, list) and isinstance(rows, list):
         for row in rows:
             for name, cell in zip(columns, row if isinstance(row, list) else (), strict=True):
-                _find(cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", paths)
+                _add_quoted_paths(
+                    cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", paths
+                )
         reply = {key: value for key, value in reply.items() if key != "rows"}
-    _find(reply, "", paths)
+    _add_quoted_paths(reply, "", paths)
     if len(paths) > _MOST_KEYS or sum(map(len, paths)) > _MOST_KEYS_CHARS:
         paths = dict.fromkeys(path.partition(".")[0] for path in paths)
     return [*paths]
 
 
-def _find(value: JsonValue, path: str, paths: dict[str, None]) -> None:
+def _add_quoted_paths(value: JsonValue, path: str, paths: dict[str, None]) -> None:
     if isinstance(value, Quoted):
         paths[path] = None
     elif isinstance(value, list):
         for part in value:
-            _find(part, path, paths)
+            _add_quoted_paths(part, path, paths)
     elif isinstance(value, dict):
         for name, part in value.items():
             if isinstance(name, Quoted):
                 paths[path] = None
-                _find(part, path, paths)
+                _add_quoted_paths(part, path, paths)
             else:
-                _find(part, f"{path}.{name}" if path else name, paths)
+                _add_quoted_paths(part, f"{path}.{name}" if path else name, paths)

@@ -267,13 +267,7 @@ class _BagRows:
                 has_payloads = is_whole or channel.type not in BULKY_TYPES
                 by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             by_channel[id(channel)].add(batch)
-            droppable = [messages for messages in by_channel.values() if not messages.is_whole]
-            while (
-                droppable and sum(messages.size for messages in by_channel.values()) > _MOST_BYTES
-            ):
-                largest = max(droppable, key=attrgetter("size"))
-                largest.payloads, largest.size = None, 0
-                droppable.remove(largest)
+            _drop_payloads(by_channel.values())
         order = sorted(
             by_channel.values(),
             key=lambda messages: (messages.channel.topic, messages.channel.type),
@@ -323,6 +317,15 @@ class _BagRows:
         for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)
+
+
+def _drop_payloads(channels: Collection[_Messages]) -> None:
+    """Drops payloads of the largest channels until `_MOST_BYTES` hold all; those whole stay."""
+    droppable = [messages for messages in channels if not messages.is_whole]
+    while droppable and sum(messages.size for messages in channels) > _MOST_BYTES:
+        largest = max(droppable, key=attrgetter("size"))
+        largest.payloads, largest.size = None, 0
+        droppable.remove(largest)
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
