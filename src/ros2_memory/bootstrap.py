@@ -94,10 +94,10 @@ def build_reader(
     Raises:
         ConfigError: it cannot be built.
     """
-    own: dict[str, object] = {"large": large}
+    options: dict[str, object] = {"large": large}
     if cache_mb is not None:
-        own["cache_mb"] = cache_mb
-    return instantiated("storage", settings.storage, BagReader, **own)  # type: ignore[type-abstract]  # only compared with
+        options["cache_mb"] = cache_mb
+    return instantiated("storage", settings.storage, BagReader, **options)  # type: ignore[type-abstract]  # only compared with
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
@@ -178,7 +178,7 @@ def build_housekeeper(
         split_duration_s=settings.recording.split_duration_s,
         own=own,
         moments_bytes=moments_bytes,
-        rule_bytes={each.name: each.max_bytes for each in rules},
+        rule_bytes={rule.name: rule.max_bytes for rule in rules},
         watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,
         screening=_screening_of(settings, bag_dir, reader, writer),
         static_topics=settings.data.tf_static_topics,
@@ -309,7 +309,7 @@ def rules_of(settings: Settings, moments_bytes: int) -> tuple[Rule, ...]:
                 max_per_hour=given.max_per_hour,
             )
         )
-    wanted = sum(each.max_bytes for each in rules)
+    wanted = sum(rule.max_bytes for rule in rules)
     if wanted > moments_bytes:
         raise ConfigError(
             f"{path}: max_gb of all rules together is {wanted / GB:g}, and all moments may take "
@@ -355,20 +355,20 @@ def exclusions_of(settings: Settings) -> tuple[ExclusionRule, ...]:
             "something: lower recording.session_duration_s"
         )
     rules: list[ExclusionRule] = []
-    for name, each in given.items():
-        if not load_topics(recording.topics_file).matches(each.topic):
+    for name, value in given.items():
+        if not load_topics(recording.topics_file).matches(value.topic):
             raise ConfigError(
-                f"{path}: the rule {name!r}: {each.topic} is not recorded, so its value would be "
+                f"{path}: the rule {name!r}: {value.topic} is not recorded, so its value would be "
                 f"unknown at all times: list it in {recording.topics_file}"
             )
         rules.append(
             ExclusionRule(
                 name=name,
-                topic=each.topic,
-                condition=_condition_of(settings, each, f"{path}: the rule {name!r}"),
-                margin=ns_from_unix(each.margin_s),
-                stale=ns_from_unix(each.stale_s),
-                excludes_unknown=each.on_unknown == "exclude",
+                topic=value.topic,
+                condition=_condition_of(settings, value, f"{path}: the rule {name!r}"),
+                margin=ns_from_unix(value.margin_s),
+                stale=ns_from_unix(value.stale_s),
+                excludes_unknown=value.on_unknown == "exclude",
             )
         )
     return tuple(rules)
@@ -679,7 +679,7 @@ def places_of(settings: Settings) -> tuple[Place, ...]:
             return Rectangle(*shape.x, *shape.y)
         # The model allows no other shape.
         numbers = (shape.x, shape.y, shape.radius_m)
-        x, y, radius_m = (each if isinstance(each, float) else 0.0 for each in numbers)
+        x, y, radius_m = (number if isinstance(number, float) else 0.0 for number in numbers)
         return Circle(x, y, radius_m)
 
     default = settings.data.map_frame or ""
@@ -697,8 +697,8 @@ def build_dispatcher(
 ) -> Dispatcher:
     """Returns what answers tool calls from a memory, or from those of a fleet's robots."""
     from ros2_memory.serving.dispatch import Dispatcher
+    from ros2_memory.tools.build import build_tools, readable_tools
     from ros2_memory.tools.replies import Replies
-    from ros2_memory.tools.spec_tools import build_tools, readable_tools
 
     server = settings.server
     tools = build_tools(

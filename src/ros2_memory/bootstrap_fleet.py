@@ -77,19 +77,19 @@ def _secrets_of(path: Path) -> dict[str, str]:
         ConfigError: it cannot be read, or has something else.
     """
     try:
-        found: object = yaml.safe_load(path.read_text(encoding="utf-8"))
+        secrets: object = yaml.safe_load(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"lake.secrets_file: {path}: {error.strerror}") from None
     except (ValueError, yaml.YAMLError):
-        found = None
-    if not isinstance(found, dict) or not all(
-        isinstance(text, str) for pair in found.items() for text in pair
+        secrets = None
+    if not isinstance(secrets, dict) or not all(
+        isinstance(text, str) for pair in secrets.items() for text in pair
     ):
         raise ConfigError(
             f'lake.secrets_file: {path} must have lines like s3.access-key-id: "...", names and '
             "texts alone"
         )
-    return {str(name): str(value) for name, value in found.items()}
+    return {str(name): str(value) for name, value in secrets.items()}
 
 
 def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
@@ -157,10 +157,10 @@ def build_fleet(settings: Settings) -> Fleet | None:
     shared = shared_parts(settings)
     engine = settings.lake.engine
     lake = None if engine is None else open_lake(settings, engine)
-    robots = [_robot(settings, name, shared, lake) for name in settings.fleet.robots]
+    robots = [_build_robot(settings, name, shared, lake) for name in settings.fleet.robots]
     join = None if lake is None else partial(_robots_of, lake, settings, shared)
-    found = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
-    found.joined()
+    fleet = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
+    fleet.joined()
     if lake is not None and not lake.days("bags"):
         log.warning(
             "lake_empty",
@@ -168,7 +168,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
             reason="the lake has no bag: only the robots' own bags answer. Check lake.warehouse, "
             "unless ros2-memory ship has yet to write there",
         )
-    return found
+    return fleet
 
 
 def _robots_of(
@@ -178,10 +178,10 @@ def _robots_of(
     lake.refresh(_JOINED_AGAIN_S)
     for name in lake.days("bags"):
         if name not in known and is_robot_name(name):
-            yield _robot(settings, name, shared, lake)
+            yield _build_robot(settings, name, shared, lake)
 
 
-def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
+def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None) -> Robot:
     """Returns a robot with bags of its own, in a lake, or both.
 
     Raises:
@@ -210,7 +210,7 @@ def _robot(settings: Settings, name: str, shared: SharedParts, lake: Lake | None
         decoder=shared.reader,
         large=shared.large,
         store=build_columns(own, shared.reader, of_lake=name),
-        settings=reading_of(own, shared.schemas),
+        reading=reading_of(own, shared.schemas),
         caches=shared.caches,
     )
     if bag_dir is None:
@@ -226,8 +226,9 @@ def robot_settings(settings: Settings, name: str) -> Settings:
     fleet, data = settings.fleet, settings.data
     bag_dir = fleet.robots.get(name, settings.recording.bag_dir)
     if fleet.places is not None:
-        own = Path(fleet.places.replace("*", name))
-        data = replace(data, places_file=own) if own.is_file() else data
+        places_file = Path(fleet.places.replace("*", name))
+        if places_file.is_file():
+            data = replace(data, places_file=places_file)
     return replace(
         settings,
         recording=replace(settings.recording, bag_dir=bag_dir),

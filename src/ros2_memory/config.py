@@ -83,8 +83,8 @@ def _in_config_dir(path: Path, info: ValidationInfo[Sequence[Path]]) -> Path:
     """Resolves `config/x` against the first of the given folders that has it, or the last one."""
     if path.parts[0] != "config":
         return path
-    found = [folder.joinpath(*path.parts[1:]) for folder in info.context]
-    return next((each for each in found if each.is_file()), found[-1])
+    files = [folder.joinpath(*path.parts[1:]) for folder in info.context]
+    return next((file for file in files if file.is_file()), files[-1])
 
 
 def _below(name: str) -> str:
@@ -134,10 +134,10 @@ def _robots_found(value: object) -> object:
     before, star, after = pattern.partition("*")
     if not star or any(mark in after for mark in "*?[") or any(mark in before for mark in "?["):
         raise ValueError("must have one *, which stands for the robot's name, as /data/*/bags has")
-    folders = [each for each in sorted(glob.glob(pattern)) if Path(each).is_dir()]  # noqa: PTH207
+    folders = [folder for folder in sorted(glob.glob(pattern)) if Path(folder).is_dir()]  # noqa: PTH207
     if not folders:
         raise ValueError("must match the folders of robots, and matches none")
-    return {each[len(before) : len(each) - len(after)]: each for each in folders}
+    return {folder[len(before) : len(folder) - len(after)]: folder for folder in folders}
 
 
 def _without_streamable(transport: object) -> object:
@@ -153,7 +153,7 @@ def _without_password(uri: str) -> str:
 
 def _without_secrets(properties: dict[str, str]) -> dict[str, str]:
     for name, value in properties.items():
-        if any(each in name.lower() for each in _SECRET_WORDS):
+        if any(word in name.lower() for word in _SECRET_WORDS):
             raise OpenSecretError(f"must not contain {name}: put it into lake.secrets_file")
         _without_password(value)
     return properties
@@ -169,16 +169,16 @@ def _each_spelling_once(labels: dict[str, tuple[str, ...]]) -> dict[str, tuple[s
     """Checks that no spelling leads to two names; case, spacing and plurals do not count."""
     known: dict[str, tuple[str, str]] = {}
     for name, spellings in labels.items():
-        for each in (name, *spellings):
-            key = singular(each)
+        for spelling in (name, *spellings):
+            key = singular(spelling)
             if not key:
                 raise ValueError(f"must not contain an empty spelling, as under {name!r}")
-            first, other = known.setdefault(key, (each, name))
+            first, other = known.setdefault(key, (spelling, name))
             if other != name:
-                also = "" if first == each else f" (as {first!r})"
+                also = "" if first == spelling else f" (as {first!r})"
                 raise ValueError(
-                    f"must list each spelling under one label: {each!r} is under {other!r}{also} "
-                    f"and {name!r}; case, spacing and plurals do not count"
+                    f"must list each spelling under one label: {spelling!r} is under {other!r}"
+                    f"{also} and {name!r}; case, spacing and plurals do not count"
                 )
     return labels
 
@@ -688,7 +688,9 @@ def load_explained(
     )
     with foreign_errors_as_config_error(str(folder), sources):
         with initialize_config_dir(version_base="1.3", config_dir=str(folder)):
-            composed = compose("config", overrides=[each.text for each in sources.overrides])
+            composed = compose(
+                "config", overrides=[override.text for override in sources.overrides]
+            )
         _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
         raw = OmegaConf.to_container(composed, resolve=False)
@@ -712,7 +714,7 @@ def is_deployment_chosen(
     """
     given = given_variables(os.environ if env is None else env)
     parsed = parse_overrides(overrides, given, config_dir(given))
-    return "MEMORY_CONFIG_DIR" in given or any(each.key in GROUPS for each in parsed)
+    return "MEMORY_CONFIG_DIR" in given or any(override.key in GROUPS for override in parsed)
 
 
 def plain_values(settings: Settings) -> dict[str, JsonValue]:

@@ -111,10 +111,12 @@ def line_of(path: Path, key: str) -> int | None:
     except (OSError, ValueError, YAMLError):
         return None
     while isinstance(node, yaml.MappingNode):
-        named = [each for each in node.value if f"{rest}.".startswith(f"{each[0].value}.")]
-        if not named:
+        leading = [
+            (name, value) for name, value in node.value if f"{rest}.".startswith(f"{name.value}.")
+        ]
+        if not leading:
             break
-        name, node = max(named, key=lambda each: len(each[0].value))
+        name, node = max(leading, key=lambda entry: len(entry[0].value))
         line, rest = name.start_mark.line + 1, rest[len(name.value) + 1 :]
     return line
 

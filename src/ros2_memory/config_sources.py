@@ -69,8 +69,8 @@ class Sources:
     def __call__(self, key: str) -> str:
         """Returns who set a key; for a file also the key that it takes its value from."""
         for override in reversed(self.overrides):
-            own, other = f"{key}.", f"{override.key}."
-            is_related = own.startswith(other) or other.startswith(own)
+            path, override_path = f"{key}.", f"{override.key}."
+            is_related = path.startswith(override_path) or override_path.startswith(path)
             if override.key not in GROUPS and is_related:
                 return override.source
         variable = self.appended.get(key)
@@ -88,9 +88,9 @@ class Sources:
         return option, f"in {self.folder / f'{file}.yaml'}"
 
     def _file(self, key: str) -> str:
-        for each in reversed(self._composed.defaults if self._composed else ()):
-            path = self.folder / f"{each.config_path}.yaml"
-            found, value = _lookup(path, each.package or "", key)
+        for default in reversed(self._composed.defaults if self._composed else ()):
+            path = self.folder / f"{default.config_path}.yaml"
+            found, value = _lookup(path, default.package or "", key)
             if found:
                 link = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
                 return f"in {path}{f', as {link[1]}' if link else ''}"
@@ -100,7 +100,7 @@ class Sources:
     def _composed(self) -> DefaultsList | None:
         """Returns the files that Hydra composes, later wins; None where it cannot."""
         folder = initialize_config_dir(version_base="1.3", config_dir=str(self.folder))
-        texts = [each.text for each in self.overrides]
+        texts = [override.text for override in self.overrides]
         with suppress(HydraException, YAMLError, ValueError, RecursionError), folder:
             loader = GlobalHydra.instance().config_loader()
             composed: DefaultsList = loader.compute_defaults_list("config", texts, RunMode.RUN)

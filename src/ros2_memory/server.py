@@ -228,18 +228,18 @@ def _parts_of_fleet(
     fillers: dict[str, tuple[Memory, Filler]] = {}
     for name in settings.fleet.robots:  # of others there is no bag here
         robot = fleet.robots[name]
-        own = robot.memory()
-        backfill = build_backfill(robot_settings(settings, name), own)
-        reports[name] = Health(own, package_version(), backfill)
+        robot_memory = robot.memory()
+        backfill = build_backfill(robot_settings(settings, name), robot_memory)
+        reports[name] = Health(robot_memory, package_version(), backfill)
         helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
-        fillers[name] = own, Filler(backfill, helper)
+        fillers[name] = robot_memory, Filler(backfill, helper)
     shipped: dict[str, tuple[Memory, Filler]] = {}
 
     def all_fillers() -> list[tuple[Memory, Filler]]:
-        for each in [*fleet.robots.values()]:  # more robots may have joined
-            if each.lake is not None and each.name not in shipped:
-                backfill = build_backfill(settings, each.lake, are_files=False)
-                shipped[each.name] = each.lake, Filler(backfill)
+        for robot in [*fleet.robots.values()]:  # more robots may have joined
+            if robot.lake is not None and robot.name not in shipped:
+                backfill = build_backfill(settings, robot.lake, are_files=False)
+                shipped[robot.name] = robot.lake, Filler(backfill)
         return [*fillers.values(), *shipped.values()]
 
     async def background() -> None:
@@ -313,10 +313,10 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
         robots: Sequence[Robot] = [*fleet.robots.values()]
         while True:
             limiter.total_tokens += 2 * len(robots)
-            for each in robots:
-                shipped = each.lake
-                if each.memory() is not shipped:
-                    tasks.start_soon(keep_fresh, each.memory(), every_s, limiter)
+            for robot in robots:
+                shipped = robot.lake
+                if robot.memory() is not shipped:
+                    tasks.start_soon(keep_fresh, robot.memory(), every_s, limiter)
                 if shipped is not None:
                     tasks.start_soon(keep_fresh, shipped, lake_s, limiter)
             if fleet.join is None:
@@ -337,7 +337,7 @@ def _joined_logged(fleet: Fleet) -> Sequence[Robot]:
         log.warning("lake_not_looked_at", reason=str(error))
         return ()
     if robots:
-        log.info("robots_joined", robots=[each.name for each in robots])
+        log.info("robots_joined", robots=[robot.name for robot in robots])
     return robots
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.things import known
-from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.tools.build import build_tools
 from tests.support.examples import LONG
 from tests.support.program import Program, exits
 

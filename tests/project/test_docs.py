@@ -11,7 +11,7 @@ import pytest
 import ros2_memory
 from ros2_memory.config import Settings
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.tools.build import build_tools
 from tests.project.reference_tables import configured_keys
 from tests.support.memories import ROOT
 

@@ -22,7 +22,7 @@ from ros2_memory.serving.mcp_server import (
     TOOLS_OF_RESOURCES,
     TOPICS,
 )
-from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.tools.build import build_tools
 from tests.project import reference_tables as reference
 from tests.support.documented_history import CALLS, MISTAKES, replies, shown_files, write_history
 from tests.support.memories import ROOT

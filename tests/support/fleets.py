@@ -16,9 +16,9 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import (
     McapLayout,
     Msg,

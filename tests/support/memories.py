@@ -28,8 +28,8 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies, Reply
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:

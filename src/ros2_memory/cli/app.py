@@ -213,7 +213,9 @@ class LazyCommand(TyperCommand):
         # Of a group, the commands have the options.
         commands = getattr(command, "commands", {self._name: command}).values()
         is_verbose = parent is not None and parent.params.get("verbose")
-        if is_verbose and all("verbose" in [of.name for of in one.params] for one in commands):
+        if is_verbose and all(
+            any(option.name == "verbose" for option in subcommand.params) for subcommand in commands
+        ):
             args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if word in _HELP else word for word in args]

@@ -34,9 +34,9 @@ from ros2_memory.core.timebase import unix_from_ns, unix_from_text
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.arguments import TIME_KINDS
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Tool
 from ros2_memory.tools.replies import Reply
-from ros2_memory.tools.spec_tools import build_tools
 
 _SETTING: Final = re.compile(
     r"\+{0,2}((recording|data|reader|retention|server|fleet|lake|logging)\.\w"
@@ -102,14 +102,14 @@ def ask(
     fleet = build_fleet(loaded)
     memory = open_memory(loaded, verbose=verbose, scans=fleet is None)
     dispatcher = build_dispatcher(loaded, memory, fleet=fleet)
-    tools = {known.name: known for known in dispatcher.tools}
+    tools = {tool.name: tool for tool in dispatcher.tools}
     if not asked:
         rows: list[JsonValue] = []
-        for known in dispatcher.tools:
-            purpose, _, _ = known.description.removeprefix("Blocking. ").partition(". ")
-            taken = ", ".join(argument for argument, _ in _arguments(known))
+        for tool_listed in dispatcher.tools:
+            purpose, _, _ = tool_listed.description.removeprefix("Blocking. ").partition(". ")
+            taken = ", ".join(argument for argument, _ in _arguments(tool_listed))
             purpose = purpose.partition(";")[0].rstrip(".")
-            rows.append({"tool": known.name, "purpose": purpose, "arguments": taken})
+            rows.append({"tool": tool_listed.name, "purpose": purpose, "arguments": taken})
         if as_json:
             print_line(json.dumps(rows))
         else:
@@ -144,8 +144,8 @@ def question_for(
     Raises:
         InvalidArgumentsError: a word is no argument, or a text is no time.
     """
-    known = {} if tool is None else tool.arguments
-    arguments = with_times(parse_arguments(words, known), known, unix_from_ns(present(memory)))
+    schemas = {} if tool is None else tool.arguments
+    arguments = with_times(parse_arguments(words, schemas), schemas, unix_from_ns(present(memory)))
     if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
         first, last = day_of(memory, None).asked()
         arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
@@ -164,12 +164,12 @@ def call_tools(dispatcher: Dispatcher, calls: Mapping[str, Mapping[str, object]]
         dispatcher.stop()
 
 
-def parse_arguments(given: Sequence[str], known: Mapping[str, JsonObject]) -> dict[str, object]:
+def parse_arguments(given: Sequence[str], schemas: Mapping[str, JsonObject]) -> dict[str, object]:
     """Parses the arguments of a tool: one JSON object, or `key=value` each.
 
     Args:
         given: the words of the command line.
-        known: the JSON schemas of the tool's arguments: what is taken as text is not parsed.
+        schemas: the JSON schemas of the tool's arguments: what is taken as text is not parsed.
 
     Raises:
         InvalidArgumentsError: a word is neither.
@@ -188,12 +188,12 @@ def parse_arguments(given: Sequence[str], known: Mapping[str, JsonObject]) -> di
                 "key=value, such as seconds_ago=10, or one JSON object, or name a bag or a folder "
                 "of bags"
             )
-        arguments[key] = text if _takes_text(known.get(key, {})) else _from_json(text, text)
+        arguments[key] = text if _takes_text(schemas.get(key, {})) else _from_json(text, text)
     return arguments
 
 
 def with_times(
-    arguments: Mapping[str, object], known: Mapping[str, JsonObject], now: float
+    arguments: Mapping[str, object], schemas: Mapping[str, JsonObject], now: float
 ) -> dict[str, object]:
     """Returns a tool's arguments, with times and durations as people write them in seconds.
 
@@ -202,7 +202,7 @@ def with_times(
     Raises:
         InvalidArgumentsError: a text is no time.
     """
-    return {key: _in_seconds(value, known.get(key), now) for key, value in arguments.items()}
+    return {key: _in_seconds(value, schemas.get(key), now) for key, value in arguments.items()}
 
 
 def _in_seconds(value: object, schema: object, now: float) -> object:

@@ -62,8 +62,8 @@ def cat(
     timeline = view.timeline
     if any(mark in topic for mark in "*?[") and topic not in timeline.types:
         matched = match_topics(timeline.topics(), topic)
-        some = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
-        raise InvalidArgumentsError(f"cat prints one topic, and {topic} is a pattern; {some}")
+        which = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
+        raise InvalidArgumentsError(f"cat prints one topic, and {topic} is a pattern; {which}")
     name = resolve_topic(view, topic)
     window = times.window(memory)
     messages = view.stream.messages([name], window, newest_first=tail is not None)
@@ -153,8 +153,8 @@ def _csv(rows: Iterable[Row]) -> Iterator[str]:
             columns = [*cells]
             yield _csv_line(["time", *columns])
         beside.update(cells.keys() - columns)
-        seconds, rest = divmod(time, NS_PER_S)
-        yield _csv_line([f"{seconds}.{rest:09d}", *map(cells.get, columns)])
+        seconds, nanoseconds = divmod(time, NS_PER_S)
+        yield _csv_line([f"{seconds}.{nanoseconds:09d}", *map(cells.get, columns)])
     if beside:
         names = listed(sorted(beside))
         print_notes([f"no column, as the first message has no such field: {names}"])

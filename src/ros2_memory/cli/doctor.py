@@ -121,19 +121,21 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         for name in robots:
             yield from _of_robot(name, robot_settings(settings, name), verbose=bags.verbose)
         with spinner("asking the lake"):
-            yield from _found({"lake": check_lake} | _OF_SETTINGS, settings)
+            yield from _findings_of({"lake": check_lake} | _OF_SETTINGS, settings)
         return
     with spinner("asking the disk, ros2, the recorder and the server"):
         robot = Examined(settings, memory, memory.index.snapshot(), memory.clock.now())
-        yield from _found(_OF_BAGS, robot)
+        yield from _findings_of(_OF_BAGS, robot)
         if robot.records:
-            yield from _found(_OF_RECORDER, robot)
+            yield from _findings_of(_OF_RECORDER, robot)
         else:
             yield ok("recorder=none: nothing is recorded here", about="recorder")
-        yield from _found(_OF_SETTINGS, settings)
+        yield from _findings_of(_OF_SETTINGS, settings)
 
 
-def _found(checks: Mapping[str, Callable[[T], Iterator[Finding]]], what: T) -> Iterator[Finding]:
+def _findings_of(
+    checks: Mapping[str, Callable[[T], Iterator[Finding]]], what: T
+) -> Iterator[Finding]:
     """Yields the findings of checks by their concerns."""
     for about, check in checks.items():
         for finding in check(what):
@@ -144,16 +146,16 @@ def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
     """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
     memory = open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
-    found: Iterable[Finding]
+    findings: Iterable[Finding]
     if snapshot.problem:
         do = "is the disk mounted? The other robots are answered for meanwhile"
-        found = [warning(f"{bag_dir}: {snapshot.problem}", do)]
+        findings = [warning(f"{bag_dir}: {snapshot.problem}", do)]
     elif not (snapshot.bags or snapshot.active):
         do = f"{ROBOTS_SETTING} names another directory for it"
-        found = [warning(f"{bag_dir}: {nothing_here(snapshot)}", do)]
+        findings = [warning(f"{bag_dir}: {nothing_here(snapshot)}", do)]
     else:
-        found = _found(_OF_BAGS, Examined(own, memory, snapshot, memory.clock.now()))
-    for finding in found:
+        findings = _findings_of(_OF_BAGS, Examined(own, memory, snapshot, memory.clock.now()))
+    for finding in findings:
         if finding.level is not Level.OK or finding.about == "bags":
             yield finding._replace(about="robot", seen=f"{name}: {finding.seen}")
 
@@ -273,7 +275,7 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         do = "storage=rosbag2 reads sqlite and compressed bags, too"
         yield warning(f"{files} not read: {names}", do)
     odd = bags_with_remarks(snapshot)
-    for forms, some, do in (
+    for forms, bags, do in (
         (
             ("bag is not whole", "bags are not whole"),
             [*filterfalse(is_whole, odd)],
@@ -285,9 +287,9 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
             "nothing is missing: what it states of itself is wrong, not its messages",
         ),
     ):
-        if some:
-            names = listed([f"{bag.path.name} ({'; '.join(bag.summary.notes)})" for bag in some])
-            yield warning(f"{counted(len(some), *forms)}: {names}", do)
+        if bags:
+            names = listed([f"{bag.path.name} ({'; '.join(bag.summary.notes)})" for bag in bags])
+            yield warning(f"{counted(len(bags), *forms)}: {names}", do)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield warning(sentence, "copy the missing data from its source")
     for is_mended, do in (
@@ -295,9 +297,11 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         (False, "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"),
     ):
         # The reason names the key where a configured folder would help.
-        topics = [one for one in covered.undecodable if (_MSG_FOLDERS in one.reason) is is_mended]
+        topics = [
+            topic for topic in covered.undecodable if (_MSG_FOLDERS in topic.reason) is is_mended
+        ]
         if topics:
-            names = listed([f"{one.topic} ({one.reason})" for one in topics])
+            names = listed([f"{topic.topic} ({topic.reason})" for topic in topics])
             yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
     yield from _check_recordings(memory, snapshot)
 
@@ -476,8 +480,8 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     except EpisodicError as problem:
         yield error(str(problem), "correct recording.topics_file")
         return
-    if live is not None and (other := _other_list(robot, selection, live)):
-        yield other
+    if live is not None and (finding := _other_list(robot, selection, live)):
+        yield finding
         return
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(robot, selection, heard)

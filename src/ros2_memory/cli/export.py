@@ -118,6 +118,17 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
     return sorted(chosen)
 
 
+def _static_transforms(
+    view: View, topic: str, window: TimeWindow
+) -> Iterator[tuple[str, StoredMessage]]:
+    """Yields the child frames of a topic of transforms, each with its message, by log time."""
+    for stored in view.stream.messages([topic], window):
+        with suppress(UndecodableError):
+            message = view.memory.reader.decode(stored.record)
+            for edge in view.extractor.transforms(message, stored.time, static=True):
+                yield edge.child, stored
+
+
 def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[StoredMessage]:
     """Returns the latched messages that are valid when a window starts, by log time.
 
@@ -132,11 +143,8 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
             continue
         if any(name.endswith("/TFMessage") for name in snapshot.timeline.types_of(topic)):
             if latching.is_latched(snapshot, topic):
-                for stored in view.stream.messages([topic], before):
-                    with suppress(UndecodableError):
-                        message = view.memory.reader.decode(stored.record)
-                        edges = view.extractor.transforms(message, stored.time, static=True)
-                        valid.update(((topic, edge.child), stored) for edge in edges)
+                for child, stored in _static_transforms(view, topic, before):
+                    valid[topic, child] = stored
         elif (newest := view.stream.newest(topic, before)) and latching.holds(snapshot, newest):
             valid[topic, ""] = newest
     # A message is valid for several frames, and is exported once.

@@ -97,15 +97,16 @@ def check_shipping(robot: Examined) -> Iterator[Finding]:
         seen = f"{bag_dir / SHIPPED_FILE} cannot be read: {problem.strerror or problem}"
         yield error(seen, "correct its permissions: until then no bag is shipped")
         return
-    closed = [
-        (name, bag)
+    by_name = {
+        relative(bag.file, str(bag_dir)): bag
         for bag in snapshot.bags
         if bag.state is BagState.CLOSED and not is_carried(bag.path)
-        for name in [relative(bag.file, str(bag_dir))]
-        if not name.startswith(f"{MOMENTS_FOLDER}/")
-    ]
-    waiting = [bag for name, bag in closed if not is_shipped(receipts, name, bag.size)]
-    newest = max((each.at for each in receipts.values()), default=None)
+    }
+    closed = {
+        name: bag for name, bag in by_name.items() if not name.startswith(f"{MOMENTS_FOLDER}/")
+    }
+    waiting = [bag for name, bag in closed.items() if not is_shipped(receipts, name, bag.size)]
+    newest = max((receipt.at for receipt in receipts.values()), default=None)
     count = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
     if newest is None:
         seen = f"{count}, and there is no receipt: no bag is deleted for its age"

@@ -52,17 +52,12 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     latched topics and logs have none.
     """
     memory = bags.memory()
-    known: Sequence[TopicRow] = ()
+    topic_rows: Sequence[TopicRow] = ()
     rows: list[JsonObject] = []
     try:
-        known = list_recorded_topics(memory, Call())
+        topic_rows = list_recorded_topics(memory, Call())
         snapshot, latching = memory.index.snapshot(), memory.limits.latching
-        for each in known:
-            # Planners read the rate in `data_time_range` instead.
-            more: JsonObject = {"undecodable": each.undecodable, "notes": [*each.notes]}
-            rate = usual_rate(snapshot, each.topic, latching)
-            own = {key: value for key, value in more.items() if value}
-            rows.append({**shown(each, Scope()), **own, "rate_hz": rate})
+        rows = [_row_with_rate(row, snapshot, latching) for row in topic_rows]
         text = json.dumps(rows)
     except NoDataError as error:
         text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
@@ -71,7 +66,7 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif rows:
         without = [{key: row[key] for key in row if key != "notes"} for row in rows]
         print_reply(stdout_console(), [*without])
-        if notes := _notes_of(known):
+        if notes := _notes_of(topic_rows):
             print_reply(stdout_console(), {"notes": notes})
     elif text != "[]":
         print_reply(stdout_console(), json.loads(text))
@@ -83,15 +78,26 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     return not rows
 
 
+def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> JsonObject:
+    """Returns a topic's row as the tool has it, with its rate: planners read that elsewhere."""
+    row = shown(topic, Scope())
+    if topic.undecodable:
+        row["undecodable"] = topic.undecodable
+    if topic.notes:
+        row["notes"] = [*topic.notes]
+    row["rate_hz"] = usual_rate(snapshot, topic.topic, latching)
+    return row
+
+
 def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
     """Returns each note once: what is wrong with one bag is noted on each topic in it."""
-    on: dict[str, list[str]] = {}
+    topics_by_note: dict[str, list[str]] = {}
     for row in rows:
         for note in row.notes:
-            on.setdefault(note, []).append(row.topic)
+            topics_by_note.setdefault(note, []).append(row.topic)
     return [
         f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
-        for note, topics in on.items()
+        for note, topics in topics_by_note.items()
     ]
 
 
@@ -103,10 +109,10 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
-    stated = [*snapshot.timeline.totals(topic).values()]
-    if not stated:
+    totals = [*snapshot.timeline.totals(topic).values()]
+    if not totals:
         return None
-    last = max(each.last for each in stated)
+    last = max(total.last for total in totals)
     intervals, duration = 0, 0
     window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
     bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
@@ -126,9 +132,11 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     reports: dict[str, JsonObject] = {}
     are_bags = False
     for name in robots or ("",):
-        own = robot_settings(settings, name) if robots else settings
-        memory = open_memory(own, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None)
-        reports[name] = report = _report(own, memory)
+        of_robot = robot_settings(settings, name) if robots else settings
+        memory = open_memory(
+            of_robot, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None
+        )
+        reports[name] = report = _report(of_robot, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:
             stdout_console().rule(name, align="left")
@@ -144,22 +152,18 @@ def _report(settings: Settings, memory: Memory) -> JsonObject:
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
     replies = call_tools(build_dispatcher(settings, memory), tools)
     snapshot = memory.index.snapshot()
+    overlapping: list[JsonValue] = []
+    for pair, topic in mixed_recordings(memory, Call()):
+        first, second = pair.names
+        times = {"from": unix_from_ns(pair.start), "to": unix_from_ns(pair.end)}
+        overlapping.append({"recording": first, "and": second, **times, "robots_differ_on": topic})
     return {
         **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
-        "held": _held(snapshot),
-        "overlapping_recordings": [
-            {
-                "recording": pair.names[0],
-                "and": pair.names[1],
-                "from": unix_from_ns(pair.start),
-                "to": unix_from_ns(pair.end),
-                "robots_differ_on": topic,
-            }
-            for pair, topic in mixed_recordings(memory, Call())
-        ],
+        "held": _amount_recorded(snapshot),
+        "overlapping_recordings": overlapping,
         "contradicting_frames": [
-            {"frame": of.frame, "in_recordings": [*of.names], "parents": [*of.parents]}
-            for of in contradicting_frames(memory, Call())
+            {"frame": frame.frame, "in_recordings": [*frame.names], "parents": [*frame.parents]}
+            for frame in contradicting_frames(memory, Call())
         ],
         "counted_as_active": [
             {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
@@ -175,30 +179,34 @@ def _show(memory: Memory, report: JsonObject) -> None:
     if not any((snapshot.bags, *aside)):
         print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
         return
-    status, ranged, held, *lists = report.values()
-    found = {**_object(held), **_for_people(_object(status)), **_for_people(_object(ranged))}
+    status, ranged, recorded, *lists = report.values()
+    report_shown = {
+        **_object(recorded),
+        **_for_people(_object(status)),
+        **_for_people(_object(ranged)),
+    }
     left_out: list[str] = []
-    silent = found.get("topics_without_messages")
+    silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
-        found["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    found |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
-    for name, rows in found.items():
+        report_shown["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
+    report_shown |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
+    for name, rows in report_shown.items():
         if isinstance(rows, list) and len(rows) > _MOST_ROWS:
-            found[name] = rows[:_MOST_ROWS]
+            report_shown[name] = rows[:_MOST_ROWS]
             left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
     notes: JsonObject = {"notes": [*left_out]} if left_out else {}
-    print_reply(stdout_console(), found | notes)
+    print_reply(stdout_console(), report_shown | notes)
 
 
 def _object(value: JsonValue) -> JsonObject:
     return value if isinstance(value, dict) else {}
 
 
-def _held(snapshot: Snapshot) -> JsonObject:
+def _amount_recorded(snapshot: Snapshot) -> JsonObject:
     """Returns how much is recorded, as `ros2 bag info` does."""
     bags, first, last = snapshot.bags, snapshot.earliest, snapshot.latest
     span = None if first is None or last is None else round(unix_from_ns(last - first), 3)
-    held: JsonObject = {
+    amount: JsonObject = {
         "recordings": len(recordings_of(snapshot)),
         "bags": len(bags),
         "storage": storage_of(bags) or None,
@@ -208,10 +216,10 @@ def _held(snapshot: Snapshot) -> JsonObject:
         "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
     }
     if snapshot.empty:
-        held["empty_bags"] = len(snapshot.empty)
+        amount["empty_bags"] = len(snapshot.empty)
     if snapshot.silent_topics:
-        held["topics_without_messages"] = [*sorted(snapshot.silent_topics)]
-    return held
+        amount["topics_without_messages"] = [*sorted(snapshot.silent_topics)]
+    return amount
 
 
 def storage_of(bags: Sequence[BagFile]) -> str:
@@ -256,9 +264,9 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
     if heartbeat is not None and heartbeat.is_live(memory.clock.now()):
         return
     patience = ns_from_unix(SPLITS_OF_PATIENCE * memory.limits.split_duration_s)
-    for each in snapshot.active:
+    for bag in snapshot.active:
         try:
-            yield each.path, each.path.stat().st_mtime_ns + patience
+            yield bag.path, bag.path.stat().st_mtime_ns + patience
         except OSError:
             continue  # the file was moved or deleted since the scan
 
@@ -318,27 +326,32 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
             "not_read": [row for row in rows if "start" not in row],
             "empty": [*empty],
         }
-        print_reply(stdout_console(), {title: some for title, some in lists.items() if some})
+        print_reply(
+            stdout_console(),
+            {title: rows for title, rows in lists.items() if rows},
+        )
     return not rows
 
 
 def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
-    own = None  # where it cannot be known which this program made
+    own_recordings = None  # where it cannot be known which this program made
     with suppress(OSError, RecorderError):
-        own = OwnRecordings(root)
+        own_recordings = OwnRecordings(root)
     left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
-    for path, bags in sorted(recordings_of(snapshot).items(), key=lambda found: found[1][0].start):
+    for path, bags in sorted(
+        recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
+    ):
         inside = [file for file in left if file.startswith(f"{path}/")]
         for file in inside:
             del left[file]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
-        whose = None if own is None else _OTHERS
+        whose = None if own_recordings is None else _OTHERS
         if Path(path).is_relative_to(root / MOMENTS_FOLDER):
             whose = "saved moment"
-        elif own is not None and own.owns_bag(bags[0].path):
+        elif own_recordings is not None and own_recordings.owns_bag(bags[0].path):
             whose = "this recorder"
         is_open = any(bag.state is BagState.ACTIVE for bag in bags)
-        yield {
+        row: JsonObject = {
             "recording": name_of(path, bags, str(root)),
             "start": unix_from_ns(start),
             "end": None if is_open else unix_from_ns(end),
@@ -349,8 +362,10 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
             "topics": len({topic for bag in bags for topic in bag.summary.schema.positions}),
             "storage": storage_of(bags),
             "whose": whose,
-            **({"not_read": len(inside)} if inside else {}),
         }
+        if inside:
+            row["not_read"] = len(inside)
+        yield row
     for file, reason in sorted(left.items()):
         yield {"recording": file.removeprefix(f"{root}/"), "reason": reason}
 
@@ -358,9 +373,9 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
 def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     """Yields the recordings without any message; a loose bag file is one."""
     aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-    folders = {bag.path.parent for bag in snapshot.bags} | {each.path.parent for each in aside}
-    found = [each if each.parent == root else each.parent for each in snapshot.empty]
-    for path in dict.fromkeys(each for each in found if each not in folders):
+    folders = {bag.path.parent for bag in snapshot.bags} | {file.path.parent for file in aside}
+    recordings = [path if path.parent == root else path.parent for path in snapshot.empty]
+    for path in dict.fromkeys(path for path in recordings if path not in folders):
         yield {
             "recording": str(path).removeprefix(f"{root}/"),
             "messages": 0,

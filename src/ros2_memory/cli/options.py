@@ -154,14 +154,16 @@ def load_to_look(
     loaded = load_for(named, given)
     if any(word.partition("=")[0] in GROUPS for word in given):
         return loaded
-    found = loaded[0].recording.bag_dir
+    settings, _ = loaded
+    folder = settings.recording.bag_dir
     if named is not None and bag_dir is None:
-        own = load_for(None, None)[0].recording.bag_dir
-        is_of_others = named.absolute() != own.absolute() and not _is_recorded_now(found)
-    elif is_deployment_chosen(given) or has_recorded(found) or not found.is_dir():
+        defaults, _ = load_for(None, None)
+        deployed = defaults.recording.bag_dir.absolute()
+        is_of_others = named.absolute() != deployed and not _is_recorded_now(folder)
+    elif is_deployment_chosen(given) or has_recorded(folder) or not folder.is_dir():
         is_of_others = False
     else:
-        is_of_others = next(folders_with_bags(found), None) is not None
+        is_of_others = next(folders_with_bags(folder), None) is not None
     return load_for(named, [*LOOKING, *given]) if is_of_others else loaded
 
 
@@ -295,8 +297,8 @@ def open_memory(
         snapshot = memory.index.refresh()
     if settings.data.recording is not None and snapshot.problem:
         bag_dir = memory.index.bag_dir
-        there = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
-        near = get_close_matches(settings.data.recording, there, n=3)
+        names = [str(folder.relative_to(bag_dir)) for folder in folders_with_bags(bag_dir)]
+        near = get_close_matches(settings.data.recording, names, n=3)
         which = f"similar: {', '.join(near)}" if near else "`ros2-memory recordings` lists them"
         raise InvalidArgumentsError(f"{snapshot.problem}; {which}")
     return memory
@@ -309,8 +311,8 @@ def present(memory: "Memory") -> Ns:
 
 def parse_duration(text: str) -> float | None:
     """Returns the seconds of a duration as people write it (`90s`, `10m`, `2h`, `3d`) or None."""
-    found = _AGO.fullmatch(text.strip().lower())
-    return None if found is None else float(found[1]) * _SECONDS_OF[found[2][0]]
+    match = _AGO.fullmatch(text.strip().lower())
+    return None if match is None else float(match[1]) * _SECONDS_OF[match[2][0]]
 
 
 def parse_time(text: str, now: float) -> float:
@@ -518,7 +520,7 @@ def reported_errors(command: str) -> Iterator[None]:
         raise typer.Exit(EXIT_CANNOT_RUN) from None
     finally:
         if events := withheld_warnings():
-            names = listed([each if n == 1 else f"{n} x {each}" for each, n in events.items()])
+            names = listed([event if n == 1 else f"{n} x {event}" for event, n in events.items()])
             advice = "" if command == "doctor" else ", `ros2-memory doctor` says what to do"
             logged = counted(events.total(), "warning")
             print(

@@ -138,7 +138,7 @@ def _objects(values: Sequence[JsonValue]) -> list[dict[str, JsonValue]]:
 
 def with_local_times(sentence: str) -> str:
     """Returns a sentence for a terminal, with times in this machine's zone, and commands."""
-    local = _TIME_IN_NOTE.sub(lambda found: format_time(float(found[0])), sentence)
+    local = _TIME_IN_NOTE.sub(lambda time: format_time(float(time[0])), sentence)
     return escape(with_commands(local))
 
 
@@ -146,7 +146,7 @@ def with_commands(sentence: str) -> str:
     """Returns a sentence with commands for the tools that it names, where there is one."""
     if _LISTS_TOOLS in sentence:
         return sentence
-    return _TOOL_IN_NOTE.sub(lambda found: _COMMANDS[found[0]], sentence)
+    return _TOOL_IN_NOTE.sub(lambda tool: _COMMANDS[tool[0]], sentence)
 
 
 def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]:
@@ -155,13 +155,13 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
     Where a row has a time in two columns, only the exact one is shown.
     """
     names = "columns" if "columns" in value else "fields"
-    fields, rows, every = value.get(names), value.get("rows"), value.get(_ALL)
+    fields, rows, totals = value.get(names), value.get("rows"), value.get(_ALL)
     if not isinstance(fields, list) or not isinstance(rows, list):
         return value
     shown = {key: inner for key, inner in value.items() if key not in (names, "rows")}
-    if isinstance(every, list):  # a row of its own, without its name
+    if isinstance(totals, list):  # a row of its own, without its name
         del shown[_ALL]
-        rows = [*rows, [_ALL, *every]]
+        rows = [*rows, [_ALL, *totals]]
     named = [
         dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
     ]
@@ -263,17 +263,17 @@ def _all_keys(rows: Sequence[Mapping[str, JsonValue]]) -> list[str]:
 def _flattened(value: Mapping[str, JsonValue]) -> dict[str, JsonValue]:
     """Returns an object whose small objects are keys with dots; positions stay objects."""
     flat: dict[str, JsonValue] = {}
-    for key, each in value.items():
+    for key, inner in value.items():
         if (
-            not isinstance(each, dict)
-            or not 0 < len(each) <= _MAX_FLATTENED_KEYS
-            or _is_vector(each)
+            not isinstance(inner, dict)
+            or not 0 < len(inner) <= _MAX_FLATTENED_KEYS
+            or _is_vector(inner)
         ):
-            flat[key] = each
-        elif each.keys() == {"value"}:  # a message that has this one field
-            flat[key] = each["value"]
+            flat[key] = inner
+        elif inner.keys() == {"value"}:  # a message that has this one field
+            flat[key] = inner["value"]
         else:
-            flat.update((f"{key}.{inner}", item) for inner, item in _flattened(each).items())
+            flat.update((f"{key}.{name}", item) for name, item in _flattened(inner).items())
     return flat
 
 
@@ -311,7 +311,7 @@ def _format_object(value: Mapping[str, JsonValue]) -> str:
     """Formats an object: `x 1.5, y 2, yaw_deg 90 (map)`, `label: cup; score: 0.9`."""
     if _is_vector(value):
         text = ", ".join(
-            f"{key} {format_value(each)}" for key, each in value.items() if key != "frame_id"
+            f"{key} {format_value(inner)}" for key, inner in value.items() if key != "frame_id"
         )
         frame = value.get("frame_id")
         return text if frame is None else f"{text} ({format_value(frame)})"
@@ -354,7 +354,8 @@ def format_duration(seconds: float) -> str:
 def escape(text: str) -> str:
     """Returns the text with control characters spelled out, so that a terminal ignores them."""
     return "".join(
-        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+        character if character.isprintable() else character.encode("unicode_escape").decode()
+        for character in text
     )
 
 

@@ -110,17 +110,18 @@ class Dataset:
             InvalidArgumentsError: the partition of a message existed before.
         """
         parts: OrderedDict[tuple[str, Ns], _PartFile] = OrderedDict()
-        made: dict[Path, Path] = {}
+        written: dict[Path, Path] = {}  # by its final path, where each file lies meanwhile
         self._root.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=self._root, prefix=".") as temporary:
             for stored in messages:
                 key = stored.bag.recording.name, stored.time // _DAY_NS
                 if key not in parts:
-                    made_here = Path(temporary) / str(len(made))
-                    made[self._new_file(*key, made)] = made_here
-                    parts[key] = _PartFile(made_here)
+                    temporary_file = Path(temporary) / str(len(written))
+                    written[self._new_file(*key, written)] = temporary_file
+                    parts[key] = _PartFile(temporary_file)
                     if len(parts) > _MAX_OPEN_FILES:
-                        parts.popitem(last=False)[1].close()
+                        _, oldest = parts.popitem(last=False)
+                        oldest.close()
                 parts.move_to_end(key)
                 parts[key].rows.append(self._row(stored.record))
                 self.rows += 1
@@ -128,12 +129,12 @@ class Dataset:
                     parts[key].flush()
             for part in parts.values():
                 part.close()
-            for path, written in made.items():
+            for path, temporary_file in written.items():
                 path.parent.mkdir(parents=True, exist_ok=True)
-                written.replace(path)
-        self.files = len(made)
+                temporary_file.replace(path)
+        self.files = len(written)
 
-    def _new_file(self, recording: str, day: int, made: Collection[Path]) -> Path:
+    def _new_file(self, recording: str, day: int, others: Collection[Path]) -> Path:
         """Returns the path of a further file of a partition."""
         date = datetime.fromtimestamp(day * _DAY_NS // NS_PER_S, tz=UTC).date()
         folder = self._root / f"recording={quote(recording, safe=' ')}" / f"date={date}"
@@ -142,7 +143,7 @@ class Dataset:
                 f"{folder} has rows already, which would be there twice; export whole days (UTC)"
                 ", name another folder, or delete this one"
             )
-        return folder / f"part-{sum(path.parent == folder for path in made)}.parquet"
+        return folder / f"part-{sum(path.parent == folder for path in others)}.parquet"
 
     def _row(self, record: Record) -> Row:
         """Returns the row of a message."""

@@ -175,11 +175,11 @@ def plot_path(
     bags: Bags,
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     with spinner("looking for the path"):
-        path, found = path_in(asked, topic, frame), asked.recap()
+        path, happened = path_in(asked, topic, frame), asked.recap()
     with _picture(out, f"Path, {asked.title}", path.line, (8.5, 7.0)) as figure:
-        _draw_path(figure.add_subplot(), asked, path, found)
+        _draw_path(figure.add_subplot(), asked, path, happened)
     _finish(out, path.notes, as_json=as_json)
 
 
@@ -200,7 +200,7 @@ def plot_signal(
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
     topic, bags = bags.with_topic(topic, "plot signal")
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):
         total, signals, notes = signals_of(asked, name, field or ())
@@ -220,16 +220,16 @@ def plot_signal(
 @as_command("plot timeline")
 def plot_timeline(*, out: Out, times: Times, as_json: AsJson = False, bags: Bags) -> None:
     """Draw what was recorded when: gaps, silences and events, and one row for each topic."""
-    asked = _asked(out, bags, times)
+    asked = _checked_request(out, bags, times)
     with spinner("looking what was recorded when"):
-        found = asked.recap()
-        rows = [*event_rows(asked, found), *topic_rows(asked)]
+        happened = asked.recap()
+        rows = [*event_rows(asked, happened), *topic_rows(asked)]
     left_out = len(asked.view.timeline.topics()) - _MOST_TOPICS
     subtitle = f"without the {counted(left_out, 'rarest topic')}" if left_out > 0 else ""
     size = (11.0, 1.3 + 0.27 * len(rows))
     with _picture(out, f"Recorded, {asked.title}", subtitle, size) as figure:
         _draw_rows(figure.add_subplot(), rows, asked.span)
-    _finish(out, found.notes, as_json=as_json)
+    _finish(out, happened.notes, as_json=as_json)
 
 
 @plot.command("recap", epilog=epilog("plot"))
@@ -247,16 +247,16 @@ def plot_recap(
     """Draw a day in one picture: where the robot drove, what happened, what was recorded."""
     if day is not None and times != Times():
         raise InvalidArgumentsError("give --day, or --start, --end and --last, not both")
-    asked = _asked(out, bags, times if times != Times() else day)
+    asked = _checked_request(out, bags, times if times != Times() else day)
     with spinner("recalling the day"):
-        found = asked.recap()
-        rows = event_rows(asked, found)
+        happened = asked.recap()
+        rows = event_rows(asked, happened)
         path, why = None, ""
         try:
             path = path_in(asked, None, None)
         except (InvalidArgumentsError, NoDataError) as error:
             why = f"the path is unknown: {error}"
-    with _picture(out, f"Recap, {asked.title}", _totals(found), (12.0, 8.0)) as figure:
+    with _picture(out, f"Recap, {asked.title}", _totals(happened), (12.0, 8.0)) as figure:
         height = 0.35 + 0.3 * len(rows)
         grid = figure.add_gridspec(
             2, 2, height_ratios=[max(7.0 - height, 3.0), height], width_ratios=[1.25, 1.0]
@@ -265,10 +265,10 @@ def plot_recap(
         if path is None:
             _write_lines(plane, [why])
         else:
-            _draw_path(plane, asked, path, found)
-        _write_lines(figure.add_subplot(grid[0, 1]), _event_lines(found))
+            _draw_path(plane, asked, path, happened)
+        _write_lines(figure.add_subplot(grid[0, 1]), _event_lines(happened))
         _draw_rows(figure.add_subplot(grid[1, :]), rows, asked.span)
-    _finish(out, found.notes, as_json=as_json)
+    _finish(out, happened.notes, as_json=as_json)
 
 
 @contextmanager
@@ -306,7 +306,7 @@ def _font_folder() -> str:
     return mkdtemp(prefix="ros2-memory-")
 
 
-def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, found: Recap) -> None:
+def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> None:
     """Draws a path, coloured by time, with named places and standstills of the same frame."""
     from matplotlib.collections import LineCollection  # noqa: PLC0415 - as above
 
@@ -333,7 +333,7 @@ def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, found: Recap) -> Non
     axes.add_collection(LineCollection([*pieces[jumps]], colors=_GREY, linestyles="dotted"))
     axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
     axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
-    if stops := stops_on(path, found):
+    if stops := stops_on(path, happened):
         xs, ys, lengths = np.array(stops).T
         sizes = 30 + np.minimum(lengths, 3600) / 12
         axes.scatter(xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, label="stood")
@@ -363,7 +363,7 @@ def _draw_rows(axes: "Axes", rows: Sequence[Row], span: Seconds) -> None:
 def _write_lines(axes: "Axes", lines: Iterable[str]) -> None:
     """Writes lines of text in place of a drawing."""
     axes.set_axis_off()
-    wrapped = (textwrap.fill(each, 62, subsequent_indent=" " * 12) for each in lines)
+    wrapped = (textwrap.fill(line, 62, subsequent_indent=" " * 12) for line in lines)
     axes.text(0, 1, "\n".join(wrapped), ha="left", va="top", fontsize=8.5, linespacing=1.5)
 
 
@@ -377,7 +377,7 @@ def _label_times(axis: "Axis", start: float, end: float) -> None:
     axis.set_major_formatter(DateFormatter(form, tz=zone))
 
 
-def _asked(out: Path, bags: Bags, when: Times | str | None) -> Asked:
+def _checked_request(out: Path, bags: Bags, when: Times | str | None) -> Asked:
     """Returns what is asked for, in a window or on a day; checks that it can be drawn.
 
     Raises:
@@ -443,7 +443,7 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
     frames = [asked.memory.limits.map_frame, None] if frame is None else [frame]
     for wanted in frames:
         try:
-            found = trajectory_summary(
+            summary = trajectory_summary(
                 asked.memory,
                 Call(),
                 TimeRange.over(asked.window),
@@ -460,33 +460,33 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         except InvalidArgumentsError:
             if wanted == frames[-1]:
                 raise
-    fastest = found.trajectory.max_speed
+    fastest = summary.trajectory.max_speed
     line = (
-        f"{found.trajectory.totals.distance_m:.1f} m in {_lasted(found.start, found.end)}"
-        f"{'' if fastest is None else f', at most {fastest:.2f} m/s'}; by {found.topic}"
+        f"{summary.trajectory.totals.distance_m:.1f} m in {_lasted(summary.start, summary.end)}"
+        f"{'' if fastest is None else f', at most {fastest:.2f} m/s'}; by {summary.topic}"
     )
-    vertices = found.trajectory.waypoints
+    vertices = summary.trajectory.waypoints
     times = np.array([vertex.time for vertex in vertices])
     xs, ys = (np.array([vertex.position[axis] for vertex in vertices]) for axis in (0, 1))
     jumps = times[[vertex.jump for vertex in vertices]]
-    if found.trajectory.poses <= _MOST_WAYPOINTS and not found.skipped:
+    if summary.trajectory.poses <= _MOST_WAYPOINTS and not summary.skipped:
         # Waypoints leave out what is within 5 cm of a line: a curve would have corners.
-        limits = replace(asked.memory.limits, pose_topic=found.topic)
+        limits = replace(asked.memory.limits, pose_topic=summary.topic)
         view = View(replace(asked.memory, limits=limits), Call())
-        poses = RobotTracks(view, found.frame_id).poses(asked.window)
+        poses = RobotTracks(view, summary.frame_id).poses(asked.window)
         placed = np.isfinite(poses.x) & np.isfinite(poses.y)
         times, xs, ys = poses.times[placed], poses.x[placed], poses.y[placed]
     if not len(times):
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {found.topic} has a place")
+        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {summary.topic} has a place")
     jumped = np.isin(times, jumps)
-    return DrawnPath(found.frame_id, times / NS_PER_S, xs, ys, jumped, line, found.notes)
+    return DrawnPath(summary.frame_id, times / NS_PER_S, xs, ys, jumped, line, summary.notes)
 
 
-def stops_on(path: DrawnPath, found: Recap) -> list[tuple[float, float, float]]:
+def stops_on(path: DrawnPath, happened: Recap) -> list[tuple[float, float, float]]:
     """Returns where the robot stood (x, y in m), by the path at that time; and how long (s)."""
     stops = [
         _unix((event.start, event.end))
-        for event in found.events
+        for event in happened.events
         if event.kind == "stop" and event.end is not None
     ]
     middles = [(start + end) / 2 for start, end in stops]
@@ -542,8 +542,10 @@ def signals_of(
     times = np.array([stored.time for stored, _ in readable])
     signals: dict[str, tuple[Floats, Floats]] = {}
     for name in fields:
-        found = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
-        values = [float(one) if isinstance(one, bool | int | float) else math.nan for one in found]
+        samples = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
+        values = [
+            float(value) if isinstance(value, bool | int | float) else math.nan for value in samples
+        ]
         if all(map(math.isnan, values)):
             raise InvalidArgumentsError(f"{name} of {topic} holds no number")
         signals[name] = _with_breaks(times, values)
@@ -570,14 +572,14 @@ def _with_breaks(times: NDArray[np.int64], values: Sequence[float]) -> tuple[Flo
     return shown, np.insert(np.array(values), broken, math.nan)
 
 
-def event_rows(asked: Asked, found: Recap) -> list[Row]:
+def event_rows(asked: Asked, happened: Recap) -> list[Row]:
     """Returns a row of what was recorded, and one for each kind of event that occurs."""
     span = asked.window.start, asked.window.stop - 1
     recorded = without([span], [*recording_gaps(asked.view, asked.window)])
     rows: list[Row] = [("recorded", [*map(_unix, recorded)], _RECORDED)]
     for kind, (name, color) in _ROWS.items():
         stretches = [
-            _unix((event.start, _until(event))) for event in found.events if event.kind == kind
+            _unix((event.start, _until(event))) for event in happened.events if event.kind == kind
         ]
         if stretches:
             rows.append((name, stretches, color))
@@ -610,21 +612,21 @@ def topic_rows(asked: Asked) -> Iterator[Row]:
         yield topic, [*map(_unix, united(extents, joined))], _TOPIC
 
 
-def _totals(found: Recap) -> str:
+def _totals(happened: Recap) -> str:
     """Returns distance, speed and time of standing in a line, as far as they are known."""
     parts: list[str] = []
-    if found.distance_m is not None and found.max_speed is not None:
-        parts = [f"{found.distance_m:.1f} m driven", f"at most {found.max_speed:.2f} m/s"]
-    if found.stood is not None:
-        parts.append(f"stood {_lasted(0, found.stood)}")
-    return ", ".join([*parts, *(f"{count} {name}" for name, count in found.counts)])
+    if happened.distance_m is not None and happened.max_speed is not None:
+        parts = [f"{happened.distance_m:.1f} m driven", f"at most {happened.max_speed:.2f} m/s"]
+    if happened.stood is not None:
+        parts.append(f"stood {_lasted(0, happened.stood)}")
+    return ", ".join([*parts, *(f"{count} {name}" for name, count in happened.counts)])
 
 
-def _event_lines(found: Recap) -> Iterator[str]:
+def _event_lines(happened: Recap) -> Iterator[str]:
     """Yields each event in a line, with the time of day, and how long it took."""
-    if not found.events:
+    if not happened.events:
         yield "no events"
-    for event in found.events:
+    for event in happened.events:
         at = datetime.fromtimestamp(unix_from_ns(event.start)).astimezone()
         until = _until(event)
         took = f" ({_lasted(event.start, until)})" if until - event.start >= NS_PER_S else ""

@@ -86,11 +86,11 @@ class Disk:
     def bytes_per_day(self, topics: Iterable[Offered]) -> float:
         """Estimates the bytes that the messages of these topics take in a day, without files."""
         return sum(
-            self._rate(each)
-            * ((each.payload_bytes + MESSAGE_BYTES) * self.ratio + INDEX_BYTES)
+            self._rate(topic)
+            * ((topic.payload_bytes + MESSAGE_BYTES) * self.ratio + INDEX_BYTES)
             * DAY_S
             * (1 + self.columns_share)
-            for each in topics
+            for topic in topics
         )
 
     @property
@@ -103,9 +103,9 @@ class Disk:
         """Estimates the days of recording that the budget holds."""
         return self.budget_bytes / (self.bytes_per_day(topics) + self.files_per_day)
 
-    def _rate(self, each: Offered) -> float:
+    def _rate(self, topic: Offered) -> float:
         # Of a latched topic each recording has the newest message.
-        return 1 / self.session_s if each.latched and each.messages == 1 else each.hz
+        return 1 / self.session_s if topic.latched and topic.messages == 1 else topic.hz
 
 
 Proposal: TypeAlias = "dict[Offered, Verdict]"
@@ -114,7 +114,7 @@ Proposal: TypeAlias = "dict[Offered, Verdict]"
 
 def chosen(proposal: Proposal, choice: Choice) -> list[Offered]:
     """Returns the topics of which this is proposed."""
-    return [each for each, verdict in proposal.items() if verdict.choice is choice]
+    return [topic for topic, verdict in proposal.items() if verdict.choice is choice]
 
 
 _RULES: Final = tuple(
@@ -152,17 +152,17 @@ _GRID: Final = "nav_msgs/msg/OccupancyGrid"
 
 def judge(topics: Collection[Offered]) -> Proposal:
     """Returns what is proposed of each topic, whatever the budget is."""
-    names = {each.topic for each in topics}
-    return {each: _judged(each, names) for each in topics}
+    names = {topic.topic for topic in topics}
+    return {topic: _verdict_on(topic, names) for topic in topics}
 
 
-def _judged(each: Offered, names: Collection[str]) -> Verdict:
+def _verdict_on(topic: Offered, names: Collection[str]) -> Verdict:
     for pattern, verdict in _RULES:
-        if pattern.search(f"{each.type} {each.topic}"):
+        if pattern.search(f"{topic.type} {topic.topic}"):
             return verdict
-    if f"{each.topic}_meta" in names:
-        return Verdict(Choice.LEAVE, f"masks: {each.topic}_meta has the same without")
-    if each.type == _GRID and (each.messages > 1 or not each.latched):
+    if f"{topic.topic}_meta" in names:
+        return Verdict(Choice.LEAVE, f"masks: {topic.topic}_meta has the same without")
+    if topic.type == _GRID and (topic.messages > 1 or not topic.latched):
         return Verdict(Choice.LEAVE, "a grid that comes again and again")
     return Verdict(Choice.RECORD)
 
@@ -176,11 +176,11 @@ def propose(topics: Collection[Offered], disk: Disk) -> Proposal:
     proposal = judge(topics)
     recorded = chosen(proposal, Choice.RECORD)
     days, in_all = disk.days(recorded), disk.bytes_per_day(recorded)
-    for each in recorded if days < disk.keep_days else ():
-        share = disk.bytes_per_day([each]) / (in_all or 1)
-        if _RAW.match(each.type) and share > SCAN_SHARE:
+    for topic in recorded if days < disk.keep_days else ():
+        share = disk.bytes_per_day([topic]) / (in_all or 1)
+        if _RAW.match(topic.type) and share > SCAN_SHARE:
             why = f"{share:.0%} of a list of which the budget would hold {days:.1f} days"
-            proposal[each] = Verdict(Choice.LEAVE, why)
+            proposal[topic] = Verdict(Choice.LEAVE, why)
     return proposal
 
 
@@ -188,7 +188,7 @@ def topics_yaml(proposal: Proposal, head: str) -> str:
     """Returns a `topics.yaml` with a comment on top; what a person has to tick is a comment."""
     lines = [f"# Proposed by `ros2-memory up`, and yours to change: {head}", "topics:"]
     for choice, tick in ((Choice.RECORD, "- "), (Choice.ASK, "# - ")):
-        for each in chosen(proposal, choice):
-            why = proposal[each].reason
-            lines.append(f"  {tick}{each.topic}  # {each.type}{f': {why}' if why else ''}")
+        for topic in chosen(proposal, choice):
+            why = proposal[topic].reason
+            lines.append(f"  {tick}{topic.topic}  # {topic.type}{f': {why}' if why else ''}")
     return "\n".join((*lines, ""))

@@ -85,11 +85,11 @@ def prove(
             undefined: list[str] = []
             count = _write(path, view, spans, parts, undefined)
             settings, _ = load_to_look(None, [str(path), *looking, *others])
-            found = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
-            tried.append(_Proof(path, count, undefined, *_differing(expected, found)))
+            repeated = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
+            tried.append(_Proof(path, count, undefined, *_differing(expected, repeated)))
             if not tried[-1].differing and (nth or not tried[-1].beside):
                 break
-        same = [one for one in tried if not one.differing]
+        same = [proof for proof in tried if not proof.differing]
         proof = min(same, key=lambda one: len(one.beside), default=tried[-1])
         proof.path.replace(output)
     beside, differing = proof.beside, proof.differing
@@ -98,12 +98,12 @@ def prove(
     print_line(written if as_json else f"{counted(proof.messages, 'message')} in {output}")
     if beside:
         print_notes([f"only the bags themselves give the same {listed(beside)}"])
-    said = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
+    verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
     if differing:
-        said = f"over {output} the answer differs in {listed(differing)}"
+        verdict = f"over {output} the answer differs in {listed(differing)}"
         if len(parts) > 1 and output.suffix == ".mcap":
-            said += f"; -o {output.with_suffix('')} keeps recordings apart"
-    print(said, file=sys.stderr)
+            verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
+    print(verdict, file=sys.stderr)
     lacking = describe_undefined(proof.undefined)
     print_notes([lacking] if lacking else [])
     rests_on = {name for topic in read for name in view.timeline.types_of(topic)}
@@ -146,23 +146,23 @@ class _Reads:
             topic: united(call[topic] for call in self._calls if topic in call) for topic in topics
         }
 
-    def _noting(self, read: _Read, *given: object, **more: object) -> object:
+    def _noting(self, read: _Read, *given: object, **options: object) -> object:
         """Returns what the reader returns, a message or several, noted when it is their turn."""
         call: dict[str, tuple[Ns, Ns]] = {}
         self._calls.append(call)
 
-        def noted(found: Record | Batch) -> Record | Batch:
-            times = [found.log_time] if isinstance(found, Record) else found.log_times.tolist()
+        def noted(part: Record | Batch) -> Record | Batch:
+            times = [part.log_time] if isinstance(part, Record) else part.log_times.tolist()
             if times:
-                start, stop = call.get(found.channel.topic, (MAX_NS, MIN_NS))
-                call[found.channel.topic] = min(start, *times), max(stop, max(times) + 1)
-            return found
+                start, stop = call.get(part.channel.topic, (MAX_NS, MIN_NS))
+                call[part.channel.topic] = min(start, *times), max(stop, max(times) + 1)
+            return part
 
-        found = read(*given, **more)
-        if found is None or isinstance(found, Record):
-            return found and noted(found)
+        messages = read(*given, **options)
+        if messages is None or isinstance(messages, Record):
+            return messages and noted(messages)
         # Mapped: it goes on behind what cannot be read.
-        return map(noted, found)
+        return map(noted, messages)
 
 
 def _parts(view: View) -> list[tuple[Path, TimeWindow]]:
@@ -188,13 +188,13 @@ def _more_and_more(
     first and the last message of all say when "now" is, those of each part what was recorded.
     """
     times = sorted(at for _, window in parts for at in (window.start, window.stop - 1))
-    whole, ends = ([(at, at + 1) for at in some] for some in ((times[0], times[-1]), times))
-    every = view.timeline.topics()
-    yield {topic: united([*read.get(topic, ()), *whole]) for topic in every}
+    whole, ends = ([(at, at + 1) for at in moments] for moments in ((times[0], times[-1]), times))
+    topics = view.timeline.topics()
+    yield {topic: united([*read.get(topic, ()), *whole]) for topic in topics}
     between = {topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()}
     ever = [(MIN_NS, MAX_NS)]
-    for found in (read, between, dict.fromkeys(read, ever), dict.fromkeys(every, ever)):
-        yield {topic: united([*found.get(topic, ()), *ends]) for topic in every}
+    for spans_of in (read, between, dict.fromkeys(read, ever), dict.fromkeys(topics, ever)):
+        yield {topic: united([*spans_of.get(topic, ()), *ends]) for topic in topics}
 
 
 def _write(
@@ -216,13 +216,13 @@ def _write(
             folder = path / recording.relative_to(view.bag_dir)
             folder.mkdir(parents=True, exist_ok=True)
             file = folder / f"{recording.name}_{nth}.mcap"
-        found = (
+        stored_messages = (
             stored
             for stored in _messages(view, spans, window)
             if recording in (None, stored.bag.recording)
         )
         with suppress(NoDataError):  # all that it has, another recording has too
-            defined = with_definitions(found, view.memory.reader, undefined)
+            defined = with_definitions(stored_messages, view.memory.reader, undefined)
             count += write_mcap(file, defined, profile)
     return count
 
@@ -230,17 +230,17 @@ def _write(
 def _messages(
     view: View, spans: Mapping[str, Spans], within: TimeWindow
 ) -> Iterator[StoredMessage]:
-    for first, last in united(span for some in spans.values() for span in some):
+    for first, last in united(span for topic_spans in spans.values() for span in topic_spans):
         window = within.intersect(TimeWindow(first, last))
         topics = [
             topic
-            for topic, some in spans.items()
-            if any(start < window.stop and window.start < stop for start, stop in some)
+            for topic, topic_spans in spans.items()
+            if any(start < window.stop and window.start < stop for start, stop in topic_spans)
         ]
         for stored in view.stream.messages(topics, window) if topics else ():
-            some = spans[stored.topic]
-            nth = bisect_right(some, (stored.time, MAX_NS)) - 1
-            if nth >= 0 and stored.time < some[nth][1]:
+            topic_spans = spans[stored.topic]
+            nth = bisect_right(topic_spans, (stored.time, MAX_NS)) - 1
+            if nth >= 0 and stored.time < topic_spans[nth][1]:
                 yield stored
 
 
@@ -256,7 +256,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     memory = replace(memory, columns=Scanner(None, memory.index.bag_dir))
     dispatcher = build_dispatcher(settings, memory)
     tool, *given = words
-    tools = {each.name: each for each in dispatcher.tools}
+    tools = {tool.name: tool for tool in dispatcher.tools}
     if tool not in tools:
         raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
     (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools[tool], given)})

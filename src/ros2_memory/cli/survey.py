@@ -73,20 +73,22 @@ def survey(ros: Installation, reader: BagReader, chunk_bytes: int, seconds: floa
         (folder / "qos.yaml").write_text(qos_overrides({}, QueuePlan({}), latched=["/tf_static"]))
         (folder / "storage.yaml").write_text(storage_config(chunk_bytes))
         unknown, empty = _record(
-            ros, folder / "look", _EVERYTHING, QUIET_S, more=("--start-paused",)
+            ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",)
         )
         offered = {
-            each.topic: Offered(each.topic, re.sub(r"[^\w/]", "?", each.type), each.latched)
-            for each in reader.channels(empty)
-            if not _OWN.match(each.topic)
+            channel.topic: Offered(
+                channel.topic, re.sub(r"[^\w/]", "?", channel.type), channel.latched
+            )
+            for channel in reader.channels(empty)
+            if not _OWN.match(channel.topic)
         }
         # Neither pixels nor what people say is recorded even now.
-        light = tuple(each.topic for each in chosen(judge(offered.values()), Choice.RECORD))
+        light = tuple(topic.topic for topic in chosen(judge(offered.values()), Choice.RECORD))
         fixed, ratio = empty.stat().st_size, 1.0
         if light:
             _, bag = _record(ros, folder / "measure", TopicSelection(light), seconds, light)
             ratio = _measure(reader, bag, offered, fixed)
-    topics = [each for _, each in sorted(offered.items())]
+    topics = [topic for _, topic in sorted(offered.items())]
     return Survey(topics, sorted(unknown), ratio, fixed)
 
 
@@ -97,15 +99,15 @@ def _measure(reader: BagReader, bag: Path, offered: dict[str, Offered], fixed: i
     for batch in reader.batches(bag, offered, TimeWindow.everything()):
         sizes.setdefault(batch.channel.topic, []).extend(batch.sizes.tolist())
         times.setdefault(batch.channel.topic, []).extend(batch.log_times.tolist())
-    ends = [max(each) for each in times.values()]
-    for topic, each in sizes.items():
+    ends = [max(times_ns) for times_ns in times.values()]
+    for topic, payloads in sizes.items():
         # A topic is heard from its first message on: others may have been subscribed to before.
         span_s = unix_from_ns(max(ends) - min(times[topic]))
-        count = len(each)
+        count = len(payloads)
         hz = (count - 1) / span_s if count > 1 and span_s else 1 / max(span_s, 1.0)
-        mean = sum(each) / count
+        mean = sum(payloads) / count
         offered[topic] = replace(offered[topic], messages=count, hz=hz, payload_bytes=mean)
-    payload = sum(sum(each) + len(each) * MESSAGE_BYTES for each in sizes.values())
+    payload = sum(sum(payloads) + len(payloads) * MESSAGE_BYTES for payloads in sizes.values())
     stored = bag.stat().st_size - fixed - INDEX_BYTES * sum(map(len, sizes.values()))
     return min(max(stored / payload, LEAST_RATIO), 1.0) if payload else 1.0
 
@@ -117,7 +119,7 @@ def _record(
     quiet_s: float,
     expected: Collection[str] = (),
     *,
-    more: Sequence[str] = (),
+    options: Sequence[str] = (),
 ) -> tuple[set[str], Path]:
     """Records until all that is expected (else anything) came, and nothing new for `quiet_s`.
 
@@ -134,20 +136,22 @@ def _record(
         cache_bytes=CACHE_BYTES,
         known_options=ros.options,
     )
-    child = Child.start([*argv, *more], {**ros.env, "ROS_LOG_DIR": str(directory.parent)})
+    child = Child.start([*argv, *options], {**ros.env, "ROS_LOG_DIR": str(directory.parent)})
     heard: dict[LineKind, set[str]] = {LineKind.SUBSCRIBED: set(), LineKind.UNKNOWN_TYPE: set()}
-    said: list[str] = []
+    lines: list[str] = []
     began = changed = time.monotonic()
     try:
         while child.exit_status() is None and time.monotonic() < began + LOOK_S + quiet_s:
             for line in map(parse_line, child.take_lines()):
-                said.append(line.text)
+                lines.append(line.text)
                 if line.topic and line.kind in heard and not _OWN.match(line.topic):
                     heard[line.kind].add(line.topic)
                     changed = time.monotonic()
-            come = heard[LineKind.SUBSCRIBED]
-            is_all = come and come.issuperset(expected) and time.monotonic() > changed + quiet_s
-            if is_all or sum(each.stat().st_size for each in directory.glob("*")) > MAX_BYTES:
+            subscribed = heard[LineKind.SUBSCRIBED]
+            has_all = subscribed and subscribed.issuperset(expected)
+            if has_all and time.monotonic() > changed + quiet_s:
+                break
+            if sum(file.stat().st_size for file in directory.glob("*")) > MAX_BYTES:
                 break
             time.sleep(_POLL_S)
         failed = child.exit_status()
@@ -155,7 +159,7 @@ def _record(
         end_all([child])
     file = next(directory.glob("*.mcap"), None)
     if failed is not None or file is None:
-        words = "; ".join([*said, *child.take_lines()][-3:])
+        words = "; ".join([*lines, *child.take_lines()][-3:])
         raise RecorderError(
             f"ros2 bag record ended by itself (status {failed}): {words}; `ros2-memory doctor` "
             "checks the installation"

@@ -108,10 +108,10 @@ def up(
     robot = _find_robot(settings.recorder.setup_files, bags, list_file, words)
     print_line(f"{robot.ros.ros2}, {robot.where}, bags in {robot.bag_dir}")
     with spinner("looking which topics there are, and measuring them"):
-        found = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes, SECONDS)
+        measured = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes, SECONDS)
     disk = Disk(
-        ratio=found.ratio,
-        fixed_bytes=found.fixed_bytes,
+        ratio=measured.ratio,
+        fixed_bytes=measured.fixed_bytes,
         split_s=settings.recording.split_duration_s,
         session_s=settings.recording.session_duration_s,
         columns_share=settings.store.max_share if settings.store.enabled else 0.0,
@@ -119,12 +119,12 @@ def up(
         keep_days=settings.retention.max_age_h / 24,
     )
     if robot.list_file.exists():
-        _show_list(robot, found, disk)
+        _show_list(robot, measured, disk)
     else:
-        _require_messages(robot, found)
-        _propose(robot, found, disk, yes=yes)
+        _require_messages(robot, measured)
+        _write_proposal(robot, measured, disk, yes=yes)
     is_open = not settings.memory.keep and sources("memory.keep").startswith("in ")
-    if is_open and _remembers(bags, yes=yes):
+    if is_open and _may_keep_memory(bags, yes=yes):
         robot.words.append("memory.keep=true")
         if script is None:  # else the folder would not be that of the service's user
             (bags / MEMORY_FOLDER).mkdir(exist_ok=True)
@@ -151,7 +151,7 @@ def _find_robot(
             f"{bags} cannot be written by this user; name another folder with --bag-dir DIR, or "
             "run as the user who owns it"
         )
-    files = ",".join(quoted(str(each.absolute())) for each in setup_files)
+    files = ",".join(quoted(str(file.absolute())) for file in setup_files)
     more = [
         f"recording.bag_dir={quoted(str(bags))}",
         f"recording.topics_file={quoted(str(list_file))}",
@@ -160,14 +160,14 @@ def _find_robot(
     return _Robot(ros, bags, list_file, [*words, *more])
 
 
-def _require_messages(robot: _Robot, found: Survey) -> None:
+def _require_messages(robot: _Robot, measured: Survey) -> None:
     """Checks that there is something to propose, and that it can be received.
 
     Raises:
         RecorderError: there is not; the sentence says what to do.
     """
-    light = chosen(judge(found.topics), Choice.RECORD)
-    if not found.topics and not found.unknown_types:
+    light = chosen(judge(measured.topics), Choice.RECORD)
+    if not measured.topics and not measured.unknown_types:
         advice = advice_on_rmw(robot.ros.env)
         raise RecorderError(
             f"no topic is offered in {robot.where} (waited {LOOK_S:g} s); start the robot's nodes, "
@@ -176,7 +176,7 @@ def _require_messages(robot: _Robot, found: Survey) -> None:
         )
     owners = ", ".join(map(str, sorted(_owners_of_segments() - {os.getuid()})))
     others = f"nodes of user {owners} run, or ran, here" if owners else ""
-    if light and not any(each.messages for each in light):
+    if light and not any(topic.messages for topic in light):
         raise RecorderError(
             f"{counted(len(light), 'topic is', 'topics are')} offered in {robot.where}, and no "
             f"message came to user {os.getuid()} in {SECONDS:g} s{others and f' ({others})'}; "
@@ -196,15 +196,15 @@ def _owners_of_segments() -> set[int]:
     return owners
 
 
-def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:
+def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
     """Shows the proposal, asks, and writes it.
 
     Raises:
         RecorderError: nothing is proposed, or the list cannot be written.
     """
-    proposal = propose(found.topics, disk)
+    proposal = propose(measured.topics, disk)
     recorded = chosen(proposal, Choice.RECORD)
-    takes = _print_topics(proposal, disk, recorded, found)
+    takes = _print_topics(proposal, disk, recorded, measured)
     if not recorded:
         raise RecorderError(
             "nothing of this is proposed; write a list of topics, and name it with "
@@ -223,7 +223,7 @@ def _propose(robot: _Robot, found: Survey, disk: Disk, *, yes: bool) -> None:
     print_line(f"wrote {robot.list_file}")
 
 
-def _remembers(bags: Path, *, yes: bool) -> bool:
+def _may_keep_memory(bags: Path, *, yes: bool) -> bool:
     """Returns whether something of the bags is to outlive them: only a person says so, once."""
     if (bags / MEMORY_FOLDER).is_dir():
         print_line(f"{bags / MEMORY_FOLDER} goes on: memory.keep=false would delete it")
@@ -236,36 +236,36 @@ def _remembers(bags: Path, *, yes: bool) -> bool:
     return False
 
 
-def _show_list(robot: _Robot, found: Survey, disk: Disk) -> None:
+def _show_list(robot: _Robot, measured: Survey, disk: Disk) -> None:
     """Shows what a list that is there selects, and what it lacks.
 
     Raises:
         ConfigError: it is refused.
     """
     selection = load_topics(robot.list_file)
-    proposal = propose(found.topics, disk)
-    recorded = [each for each in found.topics if selection.matches(each.topic)]
-    _print_topics(proposal, disk, recorded, found)
+    proposal = propose(measured.topics, disk)
+    recorded = [topic for topic in measured.topics if selection.matches(topic.topic)]
+    _print_topics(proposal, disk, recorded, measured)
     print_line(f"{robot.list_file} is used as it is")
-    missing = [each.topic for each in chosen(proposal, Choice.RECORD) if each not in recorded]
+    missing = [topic.topic for topic in chosen(proposal, Choice.RECORD) if topic not in recorded]
     if missing:
         print_line(f"it lacks, of what would be proposed: {', '.join(missing)}")
-    unoffered = [*{*selection.exact}.difference(each.topic for each in found.topics)]
+    unoffered = [*{*selection.exact}.difference(topic.topic for topic in measured.topics)]
     if unoffered:
         print_line(f"it lists, and nobody offers: {', '.join(sorted(unoffered))}")
 
 
-def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], found: Survey) -> str:
+def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measured: Survey) -> str:
     """Prints a line for each topic, and returns the estimate, as a sentence, after printing it."""
-    width = max((len(each.topic) for each in proposal), default=0)
-    for each, (choice, reason) in proposal.items():
-        sign = "record" if each in recorded else choice.replace("record", "-")
-        rate = f"{each.hz:8.3g} Hz {each.payload_bytes:7.0f} B" if each.messages else ""
-        daily = f"{_amount(disk.bytes_per_day([each]))} a day" if each.messages else ""
-        told = f"{each.type}{f': {reason}' if reason and each not in recorded else ''}"
-        print_line(escape(f"  {sign:<7}{each.topic:<{width}}{rate:<21}{daily:>17}  {told}"))
+    width = max((len(topic.topic) for topic in proposal), default=0)
+    for topic, (choice, reason) in proposal.items():
+        sign = "record" if topic in recorded else choice.replace("record", "-")
+        rate = f"{topic.hz:8.3g} Hz {topic.payload_bytes:7.0f} B" if topic.messages else ""
+        daily = f"{_amount(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
+        detail = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
+        print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
     files = disk.files_per_day
-    silent = [each.topic for each in recorded if not each.messages]
+    silent = [topic.topic for topic in recorded if not topic.messages]
     takes = (
         f"about {_amount(disk.bytes_per_day(recorded) + files)} a day"
         f"{f' without {listed(silent)}' if silent else ''}, {_amount(files)} of it for files of "
@@ -274,10 +274,10 @@ def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], found
         "(retention.max_age_h)"
     )
     print_line(takes)
-    if found.unknown_types:
+    if measured.unknown_types:
         print_line(
-            f"ros2 bag record does not know the types of {listed(found.unknown_types)}; name the "
-            "setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
+            f"ros2 bag record does not know the types of {listed(measured.unknown_types)}; name "
+            "the setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
         )
     return takes
 

@@ -60,7 +60,7 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
 
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
     """Returns some rows of a table, which is a dataclass with a column in each field."""
-    names = [each.name for each in fields(table)]
+    names = [column.name for column in fields(table)]
     return replace(table, **{name: getattr(table, name)[which] for name in names})
 
 
@@ -68,9 +68,10 @@ def stacked(tables: Sequence[T]) -> T:
     """Returns the rows of such tables, of which there is one at least, one after the other."""
     if len(tables) == 1:
         return tables[0]
-    names = [each.name for each in fields(tables[0])]
-    columns = {name: np.concatenate([getattr(one, name) for one in tables]) for name in names}
-    return replace(tables[0], **columns)
+    first, *_ = tables
+    names = [column.name for column in fields(first)]
+    columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
+    return replace(first, **columns)
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
@@ -88,17 +89,19 @@ def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:
 
 def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     """Returns the distinct rows of some columns in order, and the number of each row among them."""
-    lows = [int(each.min(initial=0)) for each in columns]
-    sizes = [int(each.max(initial=0)) - low + 1 for each, low in zip(columns, lows, strict=True)]
+    lows = [int(column.min(initial=0)) for column in columns]
+    sizes = [
+        int(column.max(initial=0)) - low + 1 for column, low in zip(columns, lows, strict=True)
+    ]
     if math.prod(sizes) >= _MOST_KEYS:
         rows, number = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
         return rows, number.reshape(-1)
     # One number for each row, in the order of the rows: sorting rows takes ten times as long.
     keys = np.zeros(len(columns[0]), np.int64)
-    for each, low, size in zip(columns, lows, sizes, strict=True):
-        keys = keys * size + (each - low)
+    for column, low, size in zip(columns, lows, sizes, strict=True):
+        keys = keys * size + (column - low)
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
-    return np.stack([each[first] for each in columns], axis=1), number.reshape(-1)
+    return np.stack([column[first] for column in columns], axis=1), number.reshape(-1)
 
 
 class Groups(NamedTuple):

@@ -178,8 +178,10 @@ def shared_schema(
     """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
     headers = tuple(
-        TopicHeader(intern(each.topic), intern(each.type), intern(each.encoding), each.latched)
-        for each in topics
+        TopicHeader(
+            intern(header.topic), intern(header.type), intern(header.encoding), header.latched
+        )
+        for header in topics
     )
     names = tuple(intern(name) for name in silent)
     return SummarySchema(headers, names, complete, notes, set_back, pauses)
@@ -217,29 +219,29 @@ class BagSummary:
         pauses: Pauses = (),
     ) -> None:
         headers = (
-            TopicHeader(each.topic, each.type, each.encoding, each.latched) for each in topics
+            TopicHeader(topic.topic, topic.type, topic.encoding, topic.latched) for topic in topics
         )
         self.schema = shared_schema(
             tuple(headers), silent, complete, notes, set_back=set_back, pauses=pauses
         )
-        numbers = (part for each in topics for part in (each.count, each.first, each.last))
+        numbers = (part for topic in topics for part in (topic.count, topic.first, topic.last))
         self._numbers = self.schema.numbers.pack(*numbers)
 
     @classmethod
     def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
         """Returns the summary of these numbers, packed or not, as many as the schema has."""
-        made = cls.__new__(cls)
-        made.schema = schema
-        made._numbers = numbers
-        return made
+        summary = cls.__new__(cls)
+        summary.schema = schema
+        summary._numbers = numbers
+        return summary
 
     @property
     def numbers(self) -> bytes:
         """Count, first and last of each topic, in the order of the schema."""
         if not self._is_packed:
             return self._numbers
-        every = map(self._numbers_at, range(len(self.schema.topics)))
-        return self.schema.numbers.pack(*chain.from_iterable(every))
+        numbers = map(self._numbers_at, range(len(self.schema.topics)))
+        return self.schema.numbers.pack(*chain.from_iterable(numbers))
 
     @property
     def _is_packed(self) -> bool:
@@ -254,11 +256,10 @@ class BagSummary:
         at = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
         begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
         (base,) = _BASE.unpack_from(packed)
-        return (
-            int.from_bytes(packed[at:begin], "little"),
-            base + int.from_bytes(packed[begin:end], "little"),
-            base + int.from_bytes(packed[end : end + _TIME_BYTES], "little"),
-        )
+        count = int.from_bytes(packed[at:begin], "little")
+        first = base + int.from_bytes(packed[begin:end], "little")
+        last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
+        return count, first, last
 
     def pack(self) -> None:
         """Takes about half of the memory from now on, and some microseconds for each look."""
@@ -301,8 +302,10 @@ class BagSummary:
     def topics(self) -> tuple[TopicSummary, ...]:
         """Each topic under each of its types, computed again."""
         return tuple(
-            _topic_of(*each)
-            for each in zip(self.schema.topics, _NUMBERS.iter_unpack(self.numbers), strict=True)
+            _topic_of(header, numbers)
+            for header, numbers in zip(
+                self.schema.topics, _NUMBERS.iter_unpack(self.numbers), strict=True
+            )
         )
 
     def at(self, position: int) -> TopicSummary:
@@ -315,9 +318,11 @@ class BagSummary:
 
     def span_of(self, topics: Collection[str]) -> tuple[Ns, Ns]:
         """Returns the first and last log time of these topics; it must hold one of them."""
-        known = self.schema.positions
-        every = [self._numbers_at(each) for topic in topics for each in known.get(topic, ())]
-        return min(first for _, first, _ in every), max(last for _, _, last in every)
+        positions = self.schema.positions
+        numbers = [
+            self._numbers_at(position) for topic in topics for position in positions.get(topic, ())
+        ]
+        return min(first for _, first, _ in numbers), max(last for _, _, last in numbers)
 
     @property
     def silent(self) -> tuple[str, ...]:

@@ -124,16 +124,16 @@ def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
         with suppress(OSError):
             with os.scandir(path) as listing:
                 entries = list(listing)
-            waiting.extend(each.path for each in entries if each.is_dir(follow_symlinks=False))
+            waiting.extend(entry.path for entry in entries if entry.is_dir(follow_symlinks=False))
             yield path, entries
 
 
 def files_below(root: Path, suffix: str) -> Iterator[Path]:
     """Yields the files below a directory with a suffix, links to files included, in no order."""
     for path, entries in walk(root):
-        for each in entries:
-            if each.name.endswith(suffix) and each.is_file():
-                yield Path(path, each.name)
+        for entry in entries:
+            if entry.name.endswith(suffix) and entry.is_file():
+                yield Path(path, entry.name)
 
 
 def remove(root: Path) -> None:
@@ -141,10 +141,10 @@ def remove(root: Path) -> None:
     folders = []
     for path, entries in walk(root):
         folders.append(path)
-        for each in entries:
-            if not each.is_dir(follow_symlinks=False):
+        for entry in entries:
+            if not entry.is_dir(follow_symlinks=False):
                 with suppress(OSError):
-                    Path(each.path).unlink()
+                    Path(entry.path).unlink()
     for path in reversed(folders):
         with suppress(OSError):
             Path(path).rmdir()
@@ -191,7 +191,7 @@ def make(root: Path, path: Path) -> None:
 def link_in(path: Path) -> Path | None:
     """Returns the first symbolic link in a path, itself included; None without one."""
     whole = path.absolute()
-    return next((each for each in (*reversed(whole.parents), whole) if each.is_symlink()), None)
+    return next((part for part in (*reversed(whole.parents), whole) if part.is_symlink()), None)
 
 
 def _link_error(error: OSError, name: str, directory: int, path: Path) -> OSError:

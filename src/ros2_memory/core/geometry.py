@@ -174,7 +174,7 @@ def simplified(
     """
     # What is the same everywhere, as z mostly is, is off by nothing.
     columns = points.T[(points != points[0]).any(axis=0)].copy()
-    found, error = [kept], 0.0
+    kept_indices, error = [kept], 0.0
     looked_at: list[_Farthest] = []
     starts, ends = kept[:-1], kept[1:]
     for depth in count():
@@ -189,8 +189,8 @@ def simplified(
         starts, ends, where = starts[splits], ends[splits], where[splits]
         if depth >= _MOST_LOPSIDED:
             where = (starts + ends) // 2
-        found.append(where)
-        if sum(map(len, found)) > at_most:
+        kept_indices.append(where)
+        if sum(map(len, kept_indices)) > at_most:
             return _worst_first(
                 columns,
                 clock,
@@ -203,7 +203,7 @@ def simplified(
         starts, ends = np.append(starts, where), np.append(where, ends)
         order = np.argsort(starts)
         starts, ends = starts[order], ends[order]
-    return np.sort(np.concatenate(found)), math.sqrt(error)
+    return np.sort(np.concatenate(kept_indices)), math.sqrt(error)
 
 
 def _worst_first(
@@ -220,12 +220,12 @@ def _worst_first(
 
     `looked_at` is what is known of some intervals.
     """
-    found = kept.tolist()
+    indices = kept.tolist()
     worst: list[tuple[float, int, int, int]] = []
-    known = {
+    measured = {
         (start, end): (-most, where)
-        for one in looked_at
-        for start, end, most, where in zip(*(each.tolist() for each in one), strict=True)
+        for batch in looked_at
+        for start, end, most, where in zip(*(column.tolist() for column in batch), strict=True)
     }
 
     def farthest(start: int, end: int) -> tuple[float, int]:
@@ -235,20 +235,20 @@ def _worst_first(
     def look(*edges: int) -> None:
         for start, end in pairwise(edges):
             if end - start > 1:
-                off, where = known.get((start, end)) or farthest(start, end)
+                off, where = measured.get((start, end)) or farthest(start, end)
                 heapq.heappush(worst, (off, where, start, end))
 
-    look(*found)
+    look(*indices)
     scans_left = _MOST_LOPSIDED * len(clock)
-    while worst and -worst[0][0] > tolerance_m * tolerance_m and len(found) < at_most:
+    while worst and -worst[0][0] > tolerance_m * tolerance_m and len(indices) < at_most:
         _, split, start, end = heapq.heappop(worst)
         scans_left -= end - start
         if scans_left < 0:
             split = (start + end) // 2
-        found.append(split)
+        indices.append(split)
         look(start, split, end)
     error = math.sqrt(-worst[0][0]) if worst else 0.0
-    return np.sort(np.array(found, np.intp)), error
+    return np.sort(np.array(indices, np.intp)), error
 
 
 def _farthest_of_each(
@@ -279,29 +279,31 @@ def _farthest_of_each(
         high = min(low + _TOGETHER, int(stops[-1]))
         first, end = np.searchsorted(begins, (low + 1, high)) - (1, 0)
         edges = np.append(begins[first:end], high).clip(low)
-        of = np.repeat(np.arange(first, end), np.diff(edges))
-        at = np.arange(low, high) + (starts + 1 - begins)[of]
+        interval = np.repeat(np.arange(first, end), np.diff(edges))
+        at = np.arange(low, high) + (starts + 1 - begins)[interval]
         # `columns[:, at]` would be in the order of `at` in memory, which is slow to add up.
-        chord = chords.take(of, axis=1)
-        here = columns.take(at, axis=1) - columns.take(starts[of], axis=1)
-        along = ((here * chord).sum(axis=0) * scale[of]).clip(0.0, 1.0)
+        chord = chords.take(interval, axis=1)
+        here = columns.take(at, axis=1) - columns.take(starts[interval], axis=1)
+        along = ((here * chord).sum(axis=0) * scale[interval]).clip(0.0, 1.0)
         off = ((here - along * chord) ** 2).sum(axis=0)
         # How far along the points before are, of each interval alone: those of a later interval
         # are greater by 2 than all before.
-        farthest = along + 2.0 * of
+        farthest = along + 2.0 * interval
         if begins[first] < low:
             farthest[0] = max(farthest[0], reached)
         np.maximum.accumulate(farthest, out=farthest)
         reached = farthest[-1]
-        back = farthest - 2.0 * of - along
-        np.maximum(off, back * back * squared[of] * _BACKWARDS_WEIGHT, out=off)
-        on_time = (clock[at] - clock[starts[of]]) * rate[of]
+        back = farthest - 2.0 * interval - along
+        np.maximum(off, back * back * squared[interval] * _BACKWARDS_WEIGHT, out=off)
+        on_time = (clock[at] - clock[starts[interval]]) * rate[interval]
         late = ((here - on_time * chord) ** 2).sum(axis=0) * of_time**2
-        np.maximum(off, np.where(rate[of] > 0, late, 0.0), out=off)
+        np.maximum(off, np.where(rate[interval] > 0, late, 0.0), out=off)
         greatest = np.maximum.reduceat(off, edges[:-1] - low)
         is_greater = greatest > most[first:end]
         most[first:end][is_greater] = greatest[is_greater]
         # The first of several that are as far: written last.
-        found = np.flatnonzero((off == most[of]) & is_greater[of - first])[::-1]
-        where[of[found]] = at[found]
+        farthest_points = np.flatnonzero((off == most[interval]) & is_greater[interval - first])[
+            ::-1
+        ]
+        where[interval[farthest_points]] = at[farthest_points]
     return most, where

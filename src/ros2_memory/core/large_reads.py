@@ -57,7 +57,7 @@ class LargeReads:
             check: raises where the time of who waits is over.
             waited: is called with how long it waited.
         """
-        before = self._block
+        before = self._block_of_thread
         if before is not None:
             yield
             return
@@ -71,7 +71,7 @@ class LargeReads:
     @contextmanager
     def exempt(self) -> Iterator[None]:
         """Within the block this thread never waits: for what is done under a lock."""
-        before, self._own.block = self._block, None
+        before, self._own.block = self._block_of_thread, None
         try:
             yield
         finally:
@@ -79,7 +79,7 @@ class LargeReads:
 
     def acquire(self) -> None:
         """Waits until this thread may hold more than `LARGE_BYTES`. Raises what `check` does."""
-        block = self._block
+        block = self._block_of_thread
         if block is None or block.has_turn:
             return
         begun = time.perf_counter_ns()
@@ -99,12 +99,12 @@ class LargeReads:
 
     def release(self) -> None:
         """Ends the turn of this thread, which holds nothing large at the moment, if it has it."""
-        block = self._block
+        block = self._block_of_thread
         if block is not None:
             self._end(block)
 
     @property
-    def _block(self) -> _Block | None:
+    def _block_of_thread(self) -> _Block | None:
         block: _Block | None = getattr(self._own, "block", None)
         return block
 

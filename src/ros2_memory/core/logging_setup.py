@@ -202,10 +202,10 @@ def withheld_warnings() -> Counter[str]:
     """Returns how often each event was withheld since the last call."""
     counted = Counter[str]()
     for handler in logging.getLogger().handlers:
-        for each in handler.filters:
-            if isinstance(each, _WarningCounter):
-                counted += each.counted
-                each.counted.clear()
+        for log_filter in handler.filters:
+            if isinstance(log_filter, _WarningCounter):
+                counted += log_filter.counted
+                log_filter.counted.clear()
     return counted
 
 

@@ -42,5 +42,6 @@ def noteworthy(pauses: Pauses, counts: Sequence[int], length: Ns) -> Pauses:
     if not pauses:
         return ()
     second = sorted(counts, reverse=True)[:2][-1]
-    longer = [each for each in pauses if each[1] - each[0] > _PERIODS * length / second]
-    return tuple(sorted(sorted(longer, key=lambda each: each[0] - each[1])[:_MOST]))
+    longer = [(start, end) for start, end in pauses if end - start > _PERIODS * length / second]
+    longer.sort(key=lambda pause: pause[0] - pause[1])  # the longest first
+    return tuple(sorted(longer[:_MOST]))

@@ -102,10 +102,10 @@ class Rectangle:
             along = to - at
             moves = along != 0
             size = np.where(moves, along, 1.0)
-            one, other = (low - at) / size, (high - at) / size
+            to_low, to_high = (low - at) / size, (high - at) / size
             still = (at >= low) & (at <= high)
-            start = np.maximum(start, np.where(moves, np.minimum(one, other), ~still * 2.0))
-            stop = np.minimum(stop, np.where(moves, np.maximum(one, other), 1.0))
+            start = np.maximum(start, np.where(moves, np.minimum(to_low, to_high), ~still * 2.0))
+            stop = np.minimum(stop, np.where(moves, np.maximum(to_low, to_high), 1.0))
         return start, stop
 
 
@@ -166,18 +166,18 @@ class AnyOf:
 
     def contains(self, x: float, y: float) -> bool:
         """Returns whether a point is inside one of them."""
-        return any(each.contains(x, y) for each in self.regions)
+        return any(region.contains(x, y) for region in self.regions)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """The least and greatest x, and the least and greatest y."""
-        low_x, high_x, low_y, high_y = zip(*(each.bounds for each in self.regions), strict=True)
+        low_x, high_x, low_y, high_y = zip(*(region.bounds for region in self.regions), strict=True)
         return min(low_x), max(high_x), min(low_y), max(high_y)
 
     def crossings(self, steps: Steps) -> Parts:
         """Returns the parts of steps inside; what lies in two regions is one part."""
-        every = [parts_inside(each, steps) for each in self.regions]
-        step, start, stop = (np.concatenate(some) for some in zip(*every, strict=True))
+        parts = [parts_inside(region, steps) for region in self.regions]
+        step, start, stop = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         if not len(step):
             return Parts(step, start, stop)
         order = np.lexsort((start, step))
@@ -210,11 +210,11 @@ def parts_inside(region: Region, steps: Steps) -> Parts:
         & (np.minimum(steps.y, steps.to_y) <= high_y)
         & (np.maximum(steps.y, steps.to_y) >= low_y)
     )
-    some = Steps(*(each[near] for each in steps))
+    nearby = Steps(*(column[near] for column in steps))
     if isinstance(region, Polygon | AnyOf):
-        found = region.crossings(some)
-        return Parts(near[found.step], found.start, found.stop)
-    start, stop = region.parts(some)
+        parts = region.crossings(nearby)
+        return Parts(near[parts.step], parts.start, parts.stop)
+    start, stop = region.parts(nearby)
     start, stop = np.maximum(start, 0.0), np.minimum(stop, 1.0)
     meets = start <= stop
     return Parts(near[meets], start[meets], stop[meets])
@@ -231,8 +231,10 @@ class Place:
 
 def places_at(places: Sequence[Place], frame_id: str, x: float, y: float) -> tuple[str, ...]:
     """Returns the names of the places of a frame that a point is in, the smallest first."""
-    inside = [each for each in places if each.frame_id == frame_id and each.region.contains(x, y)]
-    return tuple(each.name for each in sorted(inside, key=lambda each: _area(each.region)))
+    inside = [
+        place for place in places if place.frame_id == frame_id and place.region.contains(x, y)
+    ]
+    return tuple(place.name for place in sorted(inside, key=lambda place: _area(place.region)))
 
 
 def _area(region: Region) -> float:

@@ -286,7 +286,7 @@ class Keys:
     Attributes:
         keys: all of them.
         span: the oldest time and the newest, which decide whether it has local times.
-        other: an attribute, and the keys that take the place of these where it is true.
+        other: gets an attribute, and the keys that take the place of these where it is true.
     """
 
     keys: tuple[Key, ...]
@@ -296,7 +296,10 @@ class Keys:
     @property
     def all(self) -> tuple[Key, ...]:
         """These keys, and those that may take their place."""
-        return self.keys if self.other is None else (*self.keys, *self.other[1].keys)
+        if self.other is None:
+            return self.keys
+        _, other_keys = self.other
+        return (*self.keys, *other_keys.keys)
 
     @property
     def short(self) -> Keys:
@@ -305,8 +308,10 @@ class Keys:
 
     def render(self, owner: object, scope: Scope) -> JsonObject:
         """Returns an object with these keys."""
-        if self.other is not None and self.other[0](owner):
-            return self.other[1].render(owner, scope)
+        if self.other is not None:
+            takes_others, other_keys = self.other
+            if takes_others(owner):
+                return other_keys.render(owner, scope)
         if self.span is not None:
             first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
             now = getattr(owner, "now", scope.now)
@@ -344,14 +349,15 @@ def result(
     """
     form = keys(*declared, span=span)
     if where is not None:
-        form = replace(form, other=(_getter(where[0]), where[1]))
+        attribute, other_keys = where
+        form = replace(form, other=(_getter(attribute), other_keys))
 
-    def made(cls: type[T]) -> type[T]:
+    def declare(cls: type[T]) -> type[T]:
         whole = dataclass(frozen=True, slots=True)(cls)
         cast("type[Declared]", whole).reply = form
         return whole
 
-    return made
+    return declare
 
 
 def render(answer: object, bag_dir: Path, form: Keys | None = None) -> JsonObject:
@@ -379,8 +385,8 @@ def itself_if(attribute: str) -> Source:
 
 def unit(convert: Callable[[Never], JsonValue], suffix: str = "") -> Unit:
     """Returns a unit whose values depend on nothing else."""
-    known = cast("Callable[[object], JsonValue]", convert)
-    return Unit(lambda value, _: known(value), suffix)
+    any_convert = cast("Callable[[object], JsonValue]", convert)
+    return Unit(lambda value, _: any_convert(value), suffix)
 
 
 def digits(places: int) -> Unit:
@@ -457,8 +463,8 @@ def _inside(places: Sequence[str]) -> JsonValue:
     return {**reply, "also_in": [*places[1:]]} if places[1:] else reply
 
 
-def _counted(known: tuple[int, bool]) -> JsonValue:
-    number, is_all = known
+def _counted(count: tuple[int, bool]) -> JsonValue:
+    number, is_all = count
     return {"total" if is_all else "at_least": number}
 
 
@@ -483,8 +489,8 @@ def _local(times: Sequence[Ns | None], scope: Scope) -> JsonValue | Absent:
     return scope.local.text(*times) or Absent.ABSENT
 
 
-def _local_of_days(found: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
-    times = (found,) if found is None or isinstance(found, int) else found
+def _local_of_days(at: Sequence[Ns | None] | Ns | None, scope: Scope) -> JsonValue | Absent:
+    times = (at,) if at is None or isinstance(at, int) else at
     texts = (scope.local.text(at) for at in times if at is not None)
     days = {text[:_DAY_CHARS] for text in texts if text is not None}
     if days <= scope.days:

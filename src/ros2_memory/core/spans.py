@@ -22,10 +22,12 @@ def united(spans: Iterable[tuple[Ns, Ns]], apart: Ns = 0) -> Spans:
     """Returns spans, sorted; those that touch, or are no farther apart, are merged."""
     merged: Spans = []
     for start, stop in sorted(spans):
-        if merged and start - merged[-1][1] <= apart:
-            merged[-1] = (merged[-1][0], max(merged[-1][1], stop))
-        else:
-            merged.append((start, stop))
+        if merged:
+            last_start, last_stop = merged[-1]
+            if start - last_stop <= apart:
+                merged[-1] = last_start, max(last_stop, stop)
+                continue
+        merged.append((start, stop))
     return merged
 
 
@@ -67,13 +69,13 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
         held: first and last log times (inclusive) of files or recordings, and their recording.
     """
     spans: list[tuple[Ns, Ns]] = []
-    open_ones: list[tuple[Ns, object]] = []
+    open_spans: list[tuple[Ns, object]] = []
     for first, last, recording in sorted(held, key=lambda span: span[0]):
-        open_ones = [one for one in open_ones if one[0] + COPY_HORIZON_NS >= first]
+        open_spans = [(end, folder) for end, folder in open_spans if end + COPY_HORIZON_NS >= first]
         spans.extend(
-            (first - COPY_HORIZON_NS, min(other, last) + COPY_HORIZON_NS + 1)
-            for other, folder in open_ones
+            (first - COPY_HORIZON_NS, min(end, last) + COPY_HORIZON_NS + 1)
+            for end, folder in open_spans
             if folder != recording
         )
-        open_ones.append((last, recording))
+        open_spans.append((last, recording))
     return united(spans)

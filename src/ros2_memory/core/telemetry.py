@@ -79,13 +79,13 @@ class Telemetry:
 
     def answered(self, call: Answered) -> None:
         """Notifies every observer of a finished call."""
-        for each in self.observers:
-            each.answered(call)
+        for observer in self.observers:
+            observer.answered(call)
 
     def stop(self) -> None:
         """Stops every observer."""
-        for each in self.observers:
-            each.stop()
+        for observer in self.observers:
+            observer.stop()
 
 
 SILENT: Final = Telemetry()

@@ -87,7 +87,9 @@ class Reason:
         [name, detail], *others = sorted(things.items())
         if not others:
             return f"{self.of}{name} {self.what}" + (f": {detail}" if detail else "")
-        named = [f"{each} ({why})" if why else each for each, why in sorted(things.items())]
+        named = [
+            f"{name} ({detail})" if detail else name for name, detail in sorted(things.items())
+        ]
         subject = f"{self.of}{counted(len(things), self.noun, self.plural)}"
         return f"{subject} {self.many or self.what}: {listed(named)}"
 
@@ -178,30 +180,32 @@ def quoted_keys(reply: JsonValue) -> list[str]:
 
     A cell of a table (`fields`, `rows`) is at `rows` and the name of its column.
     """
-    found: dict[str, None] = {}
+    paths: dict[str, None] = {}
     columns = reply.get("fields") if isinstance(reply, dict) else None
     rows = reply.get("rows") if isinstance(reply, dict) else None
     if isinstance(reply, dict) and isinstance(columns, list) and isinstance(rows, list):
         for row in rows:
             for name, cell in zip(columns, row if isinstance(row, list) else (), strict=True):
-                _find(cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", found)
-        reply = {key: each for key, each in reply.items() if key != "rows"}
-    _find(reply, "", found)
-    if len(found) > _MOST_KEYS or sum(map(len, found)) > _MOST_KEYS_CHARS:
-        found = dict.fromkeys(path.partition(".")[0] for path in found)
-    return [*found]
+                _add_quoted_paths(
+                    cell, f"rows.{name}" if not isinstance(name, Quoted) else "rows", paths
+                )
+        reply = {key: value for key, value in reply.items() if key != "rows"}
+    _add_quoted_paths(reply, "", paths)
+    if len(paths) > _MOST_KEYS or sum(map(len, paths)) > _MOST_KEYS_CHARS:
+        paths = dict.fromkeys(path.partition(".")[0] for path in paths)
+    return [*paths]
 
 
-def _find(value: JsonValue, path: str, found: dict[str, None]) -> None:
+def _add_quoted_paths(value: JsonValue, path: str, paths: dict[str, None]) -> None:
     if isinstance(value, Quoted):
-        found[path] = None
+        paths[path] = None
     elif isinstance(value, list):
         for part in value:
-            _find(part, path, found)
+            _add_quoted_paths(part, path, paths)
     elif isinstance(value, dict):
         for name, part in value.items():
             if isinstance(name, Quoted):
-                found[path] = None
-                _find(part, path, found)
+                paths[path] = None
+                _add_quoted_paths(part, path, paths)
             else:
-                _find(part, f"{path}.{name}" if path else name, found)
+                _add_quoted_paths(part, f"{path}.{name}" if path else name, paths)

@@ -157,8 +157,8 @@ def rest_of_text_s(text: str) -> float:
     Its last decimal is all part of it: 14:05:03.74 lasts 9.999 ms longer, to 14:05:03.749999, and
     14:05:03 all of its second. One without seconds is exact, as Unix seconds are.
     """
-    found = _SECONDS.search(text)
-    return max(10.0 ** -len(found[1] or "") - 1e-6, 0.0) if found else 0.0
+    match = _SECONDS.search(text)
+    return max(10.0 ** -len(match[1] or "") - 1e-6, 0.0) if match else 0.0
 
 
 def rest_of_end_s(text: str) -> float:

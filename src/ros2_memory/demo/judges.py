@@ -93,7 +93,10 @@ class CallContext:
     def last_where(self, stream: Stream, holds: Callable[[float], bool]) -> list[Message]:
         """Returns the messages that may be the newest known one for which `holds(t)` is true."""
         newest_first = (self.timeline.newest_first(stream, end) for end in self.known)
-        fits = (next((one for one in some if holds(one.t)), None) for some in newest_first)
+        fits = (
+            next((message for message in messages if holds(message.t)), None)
+            for messages in newest_first
+        )
         return [message for message in fits if message is not None]
 
     def when(self, moment_s: float) -> str:
@@ -165,11 +168,11 @@ def items(value: JsonValue, *path: str | int) -> list[JsonValue]:
 
 
 def _typed(value: JsonValue, path: Sequence[str | int], what: str, *kinds: type[T]) -> T:
-    found = at(value, *path)
-    if isinstance(found, bool) or not isinstance(found, kinds):
+    item = at(value, *path)
+    if isinstance(item, bool) or not isinstance(item, kinds):
         named = ".".join(map(str, path)) or "the top"
-        raise WrongAnswerError(f"expected {what} at {named}, not {_brief(found)}")
-    return found
+        raise WrongAnswerError(f"expected {what} at {named}, not {_brief(item)}")
+    return item
 
 
 def one_of(what: str, moment_s: float, moments: Sequence[Ns]) -> None:
@@ -178,8 +181,8 @@ def one_of(what: str, moment_s: float, moments: Sequence[Ns]) -> None:
     Raises:
         WrongAnswerError: it is not.
     """
-    if not any(abs(unix_rounded_up(one) - moment_s) < _SAME_MOMENT_S for one in moments):
-        right = " or ".join(f"{unix_rounded_up(one):.6f}" for one in moments[:4])
+    if not any(abs(unix_rounded_up(moment) - moment_s) < _SAME_MOMENT_S for moment in moments):
+        right = " or ".join(f"{unix_rounded_up(moment):.6f}" for moment in moments[:4])
         raise WrongAnswerError(f"expected {what} {right or 'no moment'}, not {moment_s:.6f}")
 
 
@@ -190,7 +193,7 @@ def match_time(moment_s: float, candidates: Sequence[Message]) -> Message:
         WrongAnswerError: none of them.
     """
     one_of("the message of", moment_s, [message.log_time for message in candidates])
-    return min(candidates, key=lambda one: abs(unix_rounded_up(one.log_time) - moment_s))
+    return min(candidates, key=lambda message: abs(unix_rounded_up(message.log_time) - moment_s))
 
 
 def near(what: str, got: float, expected: float, tolerance: float) -> None:
@@ -299,7 +302,7 @@ def topics(reply: JsonValue, call: CallContext) -> str:
     return f"{total:,} messages on {len(counts)} topics, {of_odom:,} on /odom."
 
 
-def _ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
+def _judge_ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
     """Judges the message of a topic so long ago; `tell` checks what it holds."""
 
     def judge(reply: JsonValue, call: CallContext) -> str:
@@ -331,9 +334,9 @@ def _charge(reply: JsonValue, message: Message, _when: str) -> str:
     return f"{charge:.1%}."
 
 
-position: Final = partial(_ago, ODOM, _pose)
-velocity: Final = partial(_ago, ODOM, _twist)
-battery: Final = partial(_ago, BATTERY, _charge)
+position: Final = partial(_judge_ago, ODOM, _pose)
+velocity: Final = partial(_judge_ago, ODOM, _twist)
+battery: Final = partial(_judge_ago, BATTERY, _charge)
 
 
 def _last(topic: str, holds: Callable[[float], bool], tell: Tell, then: str | None = None) -> Judge:
@@ -345,18 +348,18 @@ def _last(topic: str, holds: Callable[[float], bool], tell: Tell, then: str | No
 
     def judge(reply: JsonValue, call: CallContext) -> str:
         moment = number(reply, "timestamp")
-        found = match_time(moment, call.last_where(_BY_TOPIC[topic], holds))
+        matched = match_time(moment, call.last_where(_BY_TOPIC[topic], holds))
         if then is not None:
-            newest = call.timeline.newest(_BY_TOPIC[then], found.log_time)
-            found = match_time(number(reply, "value_timestamp"), [newest] if newest else [])
-        return tell(reply, found, f"at {call.when(moment)}")
+            newest = call.timeline.newest(_BY_TOPIC[then], matched.log_time)
+            matched = match_time(number(reply, "value_timestamp"), [newest] if newest else [])
+        return tell(reply, matched, f"at {call.when(moment)}")
 
     return judge
 
 
 def _labels(reply: JsonValue, message: Message) -> str:
     """Checks the objects in view, and returns their names for a sentence."""
-    labels = [text(found, "label") for found in items(reply, "value", "detections")]
+    labels = [text(detection, "label") for detection in items(reply, "value", "detections")]
     same("objects", sorted(labels), sorted(thing.label for thing in robot.seen(message.t)))
     return listed_in_words(labels)
 
@@ -367,7 +370,7 @@ def seen_near(place: Planar) -> Judge:
     def tell(reply: JsonValue, message: Message, when: str) -> str:
         return f"{_labels(reply, message).capitalize()}, {when}."
 
-    return _last(ODOM, _near(place), tell, SCENE_OBJECTS)
+    return _last(ODOM, _is_near(place), tell, SCENE_OBJECTS)
 
 
 def last_near(place: Planar) -> Judge:
@@ -377,7 +380,7 @@ def last_near(place: Planar) -> Judge:
         _at_place(at(reply, "value", "position"), message)
         return f"{when.capitalize()}."
 
-    return _last(ODOM, _near(place), tell)
+    return _last(ODOM, _is_near(place), tell)
 
 
 def _clear(reply: JsonValue, _message: Message, when: str) -> str:
@@ -504,12 +507,12 @@ def nothing_on(topic: str) -> Judge:
     return judge
 
 
-def _near(place: Planar) -> Callable[[float], bool]:
+def _is_near(place: Planar) -> Callable[[float], bool]:
     spot = in_odom(place)
 
     def holds(t: float) -> bool:
-        here = robot.pose(t)
-        return math.hypot(here.x - spot.x, here.y - spot.y) <= NEAR_M
+        pose = robot.pose(t)
+        return math.hypot(pose.x - spot.x, pose.y - spot.y) <= NEAR_M
 
     return holds
 
@@ -524,5 +527,5 @@ def _at_place(point: JsonValue, message: Message) -> str:
     x, y, z = (number(point, axis) for axis in "xyz")
     for axis, got, expected in (("x", x, truth.x), ("y", y, truth.y), ("z", z, 0.0)):
         near(axis, got, expected, METRES)
-    there = robot.MAP_TO_ODOM.then(Planar(x, y, 0.0))
-    return f"In the {room_at(there.x)}, at x {x:.2f} m, y {y:.2f} m in odom"
+    in_map = robot.MAP_TO_ODOM.then(Planar(x, y, 0.0))
+    return f"In the {room_at(in_map.x)}, at x {x:.2f} m, y {y:.2f} m in odom"

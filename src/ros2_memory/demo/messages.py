@@ -47,7 +47,7 @@ Body: TypeAlias = "dict[str, object]"
 def payload(message: Message) -> bytes:
     """Returns the message in CDR, as it is published."""
     name = message.stream.type
-    return bytes(_typestore().serialize_cdr(_made(name, _body(message)), name))
+    return bytes(_typestore().serialize_cdr(_ros_message(name, _body(message)), name))
 
 
 @cache
@@ -77,7 +77,7 @@ def _typestore() -> Typestore:
     return store
 
 
-def _made(type_name: str, body: Mapping[str, object]) -> object:
+def _ros_message(type_name: str, body: Mapping[str, object]) -> object:
     store = _typestore()
     fields = store.fielddefs[type_name][1]
     build = cast("Callable[[*tuple[object, ...]], object]", store.types[type_name])
@@ -86,14 +86,14 @@ def _made(type_name: str, body: Mapping[str, object]) -> object:
 
 def _field(form: FieldDesc, value: object) -> object:
     """Returns a field of a message; zero or empty where there is no value."""
-    kind, of = form
+    kind, detail = form
     if kind is Nodetype.NAME:
-        return _made(str(of), cast("Body", value or {}))
+        return _ros_message(str(detail), cast("Body", value or {}))
     if kind is Nodetype.BASE:
-        return value or ("" if of[0] == "string" else 0)
-    inner, size = cast("tuple[FieldDesc, int]", of)
+        return value or ("" if detail[0] == "string" else 0)
+    inner, size = cast("tuple[FieldDesc, int]", detail)
     if inner[0] is Nodetype.NAME:
-        return [_field(inner, each) for each in cast("list[Body]", value)]
+        return [_field(inner, item) for item in cast("list[Body]", value)]
     return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
 
 
@@ -131,8 +131,8 @@ def _body(message: Message) -> Body:  # noqa: C901 - a case for each topic
             }
         case topics.BATTERY:
             unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
-            known = {"voltage": 25.2, "percentage": robot.battery(t), "present": True}
-            body = {**_headed(message, "base_link"), **dict.fromkeys(unknown, math.nan), **known}
+            measured = {"voltage": 25.2, "percentage": robot.battery(t), "present": True}
+            body = {**_headed(message, "base_link"), **dict.fromkeys(unknown, math.nan), **measured}
         case topics.SCENE_DESCRIPTION:
             body = {**_headed(message, "camera"), "data": description(t)}
         case topics.SCENE_OBJECTS:
@@ -144,7 +144,7 @@ def _body(message: Message) -> Body:  # noqa: C901 - a case for each topic
 
 
 def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> Body:
-    found = [
+    detections = [
         {
             "label": thing.label,
             "score": thing.score,
@@ -153,7 +153,7 @@ def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) 
         }
         for thing in things
     ]
-    return {**_headed(message, "base_link"), "skill": skill, "detections": found}
+    return {**_headed(message, "base_link"), "skill": skill, "detections": detections}
 
 
 def _headed(message: Message, frame_id: str) -> Body:

@@ -51,8 +51,8 @@ def judge_reply(
 
 
 def _spot(place: Planar) -> JsonValue:
-    there = judges.in_odom(place)
-    return {"x": round(there.x, 3), "y": round(there.y, 3)}
+    pose = judges.in_odom(place)
+    return {"x": round(pose.x, 3), "y": round(pose.y, 3)}
 
 
 _CAMERA_TOPIC: Final = "/camera/image_raw"

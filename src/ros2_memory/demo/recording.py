@@ -132,12 +132,12 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
             self.failure = error
 
     def _write(self, message: Message) -> None:
-        split, at = self._split, message.log_time
-        if split is None or at - split.first > self._duration:
-            before, self._split = split, self._opened(at)
-            split = self._split
+        at = message.log_time
+        if self._split is None or at - self._split.first > self._duration:
+            before, self._split = self._split, self._opened(at)
             if before is not None:
                 self._close(before)
+        split = self._split
         channel = split.channels[message.stream.topic]
         split.writer.add_message(channel, at, payload(message), message.publish_time, split.count)
         split.last = at

@@ -232,9 +232,9 @@ def place(t: float) -> str:
 
 def seen(t: float) -> tuple[SimulatedThing, ...]:
     """Returns the objects in the camera's view, nearest first: in range, and behind no wall."""
-    here = pose_in_map(t)
-    camera = here.then(Planar(CAMERA[0], CAMERA[1], 0.0))
-    to_base = here.inverse()
+    base = pose_in_map(t)
+    camera = base.then(Planar(CAMERA[0], CAMERA[1], 0.0))
+    to_base = base.inverse()
     things: list[SimulatedThing] = []
     for label, (x, y, z) in THINGS.items():
         bearing = math.atan2(y - camera.y, x - camera.x)
@@ -243,8 +243,8 @@ def seen(t: float) -> tuple[SimulatedThing, ...]:
             continue
         if wall_distances(camera.x, camera.y, np.array([bearing]))[0] < distance:
             continue
-        there = to_base.then(Planar(x, y, 0.0))
-        things.append(SimulatedThing(label, round(0.97 - 0.1 * distance, 2), (there.x, there.y, z)))
+        point = to_base.then(Planar(x, y, 0.0))
+        things.append(SimulatedThing(label, round(0.97 - 0.1 * distance, 2), (point.x, point.y, z)))
     return tuple(sorted(things, key=lambda thing: -thing.score))
 
 

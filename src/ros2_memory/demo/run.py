@@ -336,7 +336,9 @@ def run_demo(
             f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
         )
         show = exchange_as_json if as_json else format_exchange
-        wrong = _count_wrong(f"{url}/sse", recorder, lambda *each: say(show(*each)), questions)
+        wrong = _count_wrong(
+            f"{url}/sse", recorder, lambda *exchange: say(show(*exchange)), questions
+        )
         total = len(questions)
         tell(f"{total - wrong} of {total} answers are right.")
         if not once:

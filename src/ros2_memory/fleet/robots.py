@@ -79,7 +79,7 @@ class FromLake(NamedTuple):
         return cls(latest, None if call.older == MAX_NS else call.older)
 
     def since(self, begin: Ns) -> FromLake:
-        """Returns that of an answer from a log time on."""
+        """Returns the report for an answer that needs nothing before a log time."""
         is_whole = self.older is None or begin > self.older
         return self._replace(older=None) if is_whole else self
 
@@ -142,7 +142,7 @@ class Robot:
             return ask(self.memory(), call), None
 
         def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
-            return _of_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
+            return _ask_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
 
         is_mounted = self.is_mounted()
         own = self.memory().index.snapshot() if is_mounted else None
@@ -184,33 +184,33 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
     Raises:
         EpisodicError: the lake cannot be read, and these bags do not reach back so far.
     """
-    there = own.index.snapshot()
-    begin = since(own.now(own.clock.now(), there.latest))
+    on_robot = own.index.snapshot()
+    begin = since(own.now(own.clock.now(), on_robot.latest))
     if begin is None:
         return False
     try:
-        known = lake.index.snapshot()
+        in_lake = lake.index.snapshot()
     except (RefusedError, LakeError):
-        if there.earliest is None or begin < there.earliest:
+        if on_robot.earliest is None or begin < on_robot.earliest:
             raise
         return False
-    if known.older is not None and begin <= known.older:
+    if in_lake.older is not None and begin <= in_lake.older:
         return True
-    window = TimeWindow(begin, MIN_NS if known.latest is None else known.latest + 1)
+    window = TimeWindow(begin, MIN_NS if in_lake.latest is None else in_lake.latest + 1)
     # By their beginnings: bags that were never shipped do not stand for those that are gone.
-    here = dict(sorted((bag.start, bag.size) for bag in there.timeline.overlapping(window)))
-    return any(bag.size > here.get(bag.start, 0) for bag in known.timeline.overlapping(window))
+    sizes = dict(sorted((bag.start, bag.size) for bag in on_robot.timeline.overlapping(window)))
+    return any(bag.size > sizes.get(bag.start, 0) for bag in in_lake.timeline.overlapping(window))
 
 
-def _of_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
+def _ask_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
     """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
     call.older = MAX_NS
     try:
-        found = ask(lake, call)
+        answer = ask(lake, call)
     except NoDataError as error:
         detail = "; ".join((error.detail, *FromLake.of(lake, call).notes))
         raise NoDataError(error.reason, detail, error.notes) from error
-    return found, FromLake.of(lake, call)
+    return answer, FromLake.of(lake, call)
 
 
 @dataclass(eq=False, repr=False)
@@ -246,10 +246,10 @@ class Fleet:
         if self.join is None:
             return ()
         with self._lock:
-            found = [*self.join(self.robots)]
+            joining = [*self.join(self.robots)]
             # A new dict: other threads iterate over the old one.
-            self.robots = {**self.robots, **{robot.name: robot for robot in found}}
-        return found
+            self.robots = {**self.robots, **{robot.name: robot for robot in joining}}
+        return joining
 
     def allowed(self, call: Call) -> list[Robot]:
         """Returns the robots that a call may ask about, in the order of the configuration."""
@@ -257,7 +257,7 @@ class Fleet:
         return [robot for name, robot in self.robots.items() if robots is None or name in robots]
 
     def named(self, name: object, call: Call) -> Robot:
-        """Returns the robot of a name.
+        """Returns the robot with a name.
 
         Raises:
             InvalidArgumentsError: there is none, or the call may not ask about it, which the
@@ -267,10 +267,12 @@ class Fleet:
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)
-        if found := next((robot for robot in allowed if robot.name == name), None):
-            return found
-        there = names_of(allowed)
-        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; there {there}")
+        for robot in allowed:
+            if robot.name == name:
+                return robot
+        raise InvalidArgumentsError(
+            f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
+        )
 
 
 def names_of(robots: Iterable[Robot]) -> str:
@@ -317,7 +319,7 @@ class FanOut:
                 own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
                 own.used_active = own.used_thinned = False
                 until_s = now_s + own_s + left_s * _GRACE
-                running[robot.name] = _asked(robot, work, own), own, own_s, until_s
+                running[robot.name] = _start_asking(robot, work, own), own, own_s, until_s
             # Without a deadline there is nothing to wake up for but an answer.
             first_s = min((until_s for *_, until_s in running.values()), default=now_s)
             futures = [future for future, *_ in running.values()]
@@ -351,7 +353,9 @@ class FanOut:
         return None
 
 
-def _asked(robot: Robot, work: Callable[[Robot, Call], T], call: Call) -> Future[T | EpisodicError]:
+def _start_asking(
+    robot: Robot, work: Callable[[Robot, Call], T], call: Call
+) -> Future[T | EpisodicError]:
     """Returns what a robot will answer, in a thread of its own."""
     answer: Future[T | EpisodicError] = Future()
 

@@ -207,15 +207,15 @@ class _FleetQuestion:
         """
 
         def ask(_: Robot, own: Call) -> OfRobot:
-            answer, found = robot.asked(partial(_answer, self.question), own, self._since)
-            lake = self._reported(answer, found)
+            answer, from_lake = robot.asked(partial(_answer, self.question), own, self._since)
+            lake = self._reported(answer, from_lake)
             notes = () if lake is None else (*shipped_to({robot.name: lake.latest}), *lake.notes)
             return OfRobot(robot.name, robot.bag_dir, answer, notes, own.now)
 
-        found = self.fan_out.ask([robot], ask, call)[robot.name]
-        if isinstance(found, EpisodicError):
-            raise found
-        return found
+        answer_or_error = self.fan_out.ask([robot], ask, call)[robot.name]
+        if isinstance(answer_or_error, EpisodicError):
+            raise answer_or_error
+        return answer_or_error
 
     def _of_all(self, robots: list[Robot], call: Call) -> OfFleet:
         given = self.given
@@ -232,9 +232,11 @@ class _FleetQuestion:
         wanted = default if given.get("limit") is None else given["limit"]
         limit = int(wanted) if isinstance(wanted, int | float) else None
         page = Page(limit, oldest_first=given.get("oldest_first") is True)
-        found = self.fan_out.ask(robots, partial(self._reply, now, page), call)
-        replies = [reply for reply in found.values() if isinstance(reply, RobotReply)]
-        failed = {name: error for name, error in found.items() if isinstance(error, EpisodicError)}
+        answers = self.fan_out.ask(robots, partial(self._reply, now, page), call)
+        replies = [reply for reply in answers.values() if isinstance(reply, RobotReply)]
+        failed = {
+            name: error for name, error in answers.items() if isinstance(error, EpisodicError)
+        }
         if not replies:
             raise _shared_error(failed)
         return OfFleet(merged(self.tool.name, replies, failed, page, self.max_chars))
@@ -389,36 +391,39 @@ def merged(
     failed: JsonObject = {FAILED: codes} if codes else {}
     notes = _notes_on(order, failures)
     if any("columns" in reply.body for reply in order):
-        found = _one_table(order)
+        reply_body = _one_table(order)
     elif tool == "list_recorded_topics":
-        found = {TOPICS: _by_topic(order)}
+        reply_body = {TOPICS: _by_topic(order)}
     elif tool in MERGED_ROWS:
-        found = _rows(MERGED_ROWS[tool], order, page)
+        reply_body = _rows(MERGED_ROWS[tool], order, page)
     else:
         whole: list[JsonObject] = [{ROBOT_NAME: reply.name, **reply.body} for reply in order]
-        found = with_notes({"robots": [*whole], **failed}, notes)
-        if len(to_json_text(found)) <= max_chars:
-            return found
+        reply_body = with_notes({"robots": [*whole], **failed}, notes)
+        if len(to_json_text(reply_body)) <= max_chars:
+            return reply_body
         keys = dict.fromkeys((ROBOT_NAME, "now", *SHORT_KEYS[tool]))
         short = [{key: row[key] for key in keys if key in row} for row in whole]
         do = "each robot shortly; pass robot for all of it"
         return with_notes({"robots": [*short], **failed}, [do, *notes])
-    own = by_reason(
+    notes_of_robots = by_reason(
         (reply.name, note)
         for reply in order
         # `str(note)` would lose that it is quoted.
         for note in _items(reply.body, "notes")
         if isinstance(note, str)
     )
-    return with_notes({**found, **failed}, [*map(_of_robots, own.values(), own), *notes])
+    return with_notes(
+        {**reply_body, **failed},
+        [*map(_of_robots, notes_of_robots.values(), notes_of_robots), *notes],
+    )
 
 
 def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
     """Returns the rows of all in order, those of robots whose clock is ahead last; and the rest."""
     values = {reply.name: _as_rows(reply) for reply in replies}
     times = {key.name: key.row_time for key in declared if key.row_time}
-    there = {name for value in values.values() for name in value}
-    key = next((name for name in times if name in there), next(iter(times)))
+    present = {name for value in values.values() for name in value}
+    key = next((name for name in times if name in present), next(iter(times)))
     merging = {key.name: key.merging for key in declared if key.merging}
     names = {name for name, how in merging.items() if how == "inherited"}
     order: list[tuple[bool, float, JsonObject]] = []
@@ -432,15 +437,18 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
             named = {ROBOT_NAME: reply.name, **same, **row}
             order.append((reply.is_ahead, at if page.oldest_first else -at, named))
     order.sort(key=itemgetter(0, 1))
-    found: list[JsonValue] = [row for *_, row in order]
-    rows: JsonObject = {key: found[: page.limit]}
+    ordered: list[JsonValue] = [row for *_, row in order]
+    rows: JsonObject = {key: ordered[: page.limit]}
     if key == MATCHES:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
     rest = {name: _without(value, {key, *names}) for name, value in values.items()}
-    is_cut = found[: page.limit] != found or any(value.get("more") for value in values.values())
+    is_cut = ordered[: page.limit] != ordered or any(value.get("more") for value in values.values())
     marks_more = is_cut and any(key.name == "more" for key in declared)
-    return {**rows, **_rest(merging, replies, rest), **({"more": True} if marks_more else {})}
+    reply_body = {**rows, **_combined(merging, replies, rest)}
+    if marks_more:
+        reply_body["more"] = True
+    return reply_body
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -453,43 +461,49 @@ def _as_rows(reply: RobotReply) -> JsonObject:
     return reply.body
 
 
-def _rest(
+def _combined(
     merging: Mapping[str, Merging], replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
 ) -> JsonObject:
     """Returns what the replies have besides rows, and what of it is not the same for all.
 
     What is added up is also listed by robot.
     """
-    found: JsonObject = {}
+    combined: JsonObject = {}
     by_robot: dict[str, JsonObject] = {}
     # Times of robots whose clock is ahead are compared only where there are no others.
     dated = [reply.name for reply in replies if not reply.is_ahead] or [*values]
     for key in dict.fromkeys(key for value in values.values() for key in value):
         if key in _LEFT_OUT:
             continue
-        own = {name: value[key] for name, value in values.items() if key in value}
+        of_robots = {name: value[key] for name, value in values.items() if key in value}
         match merging.get(key, "added" if key == AT_LEAST else ""):
             case "who":
-                found[key] = [name for name, is_so in own.items() if is_so]
+                combined[key] = [name for name, is_so in of_robots.items() if is_so]
             case "counted":
                 sums: Counter[str] = Counter()
-                for counts in own.values():
+                for counts in of_robots.values():
                     sums.update(counts if isinstance(counts, dict) else {})
-                found[key] = dict(sums.most_common())
+                combined[key] = dict(sums.most_common())
             case ("earliest" | "newest") as how:
-                numbers = [_number(own[name]) for name in dated if own.get(name) is not None]
-                found[key] = (min if how == "earliest" else max)(numbers, default=None)
-            case "" if len(own) == len(values) and len({*map(to_json_text, own.values())}) == 1:
-                found[key] = next(iter(own.values()))
+                numbers = [
+                    _number(of_robots[name]) for name in dated if of_robots.get(name) is not None
+                ]
+                combined[key] = (min if how == "earliest" else max)(numbers, default=None)
+            case "" if (
+                len(of_robots) == len(values) and len({*map(to_json_text, of_robots.values())}) == 1
+            ):
+                combined[key] = next(iter(of_robots.values()))
             case how:
                 # Where a robot has not counted all, there is no total, but at least so many.
                 totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
-                is_counted = key != _TOTAL or not any(AT_LEAST in one for one in values.values())
+                is_counted = key != _TOTAL or not any(
+                    AT_LEAST in value for value in values.values()
+                )
                 if how == "added" and is_counted:
-                    found[key] = round(sum(map(_number, (*own.values(), *totals))), 2)
-                for name, value in own.items():
+                    combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
+                for name, value in of_robots.items():
                     by_robot.setdefault(name, {})[key] = value
-    return {**found, "by_robot": {**by_robot}} if by_robot else found
+    return {**combined, "by_robot": {**by_robot}} if by_robot else combined
 
 
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
@@ -499,12 +513,12 @@ def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
     for reply in replies:  # those whose clock ran ahead come last
         for row in _list(reply.value):
             key = str(row["topic"]), str(row["type"])
-            known = topics.setdefault(key, {**row, "count": 0})
+            total = topics.setdefault(key, {**row, "count": 0})
             for time, best in (("first_ts", min), ("last_ts", max)):
                 if not reply.is_ahead:
-                    known[time] = best(_number(known[time]), _number(row[time]))
-            known["count"] = int(_number(known["count"]) + _number(row["count"]))
-            known[f"{ROBOT_NAME}s"] = robots.setdefault(key, [])
+                    total[time] = best(_number(total[time]), _number(row[time]))
+            total["count"] = int(_number(total["count"]) + _number(row["count"]))
+            total[f"{ROBOT_NAME}s"] = robots.setdefault(key, [])
             robots[key].append(reply.name)
     return [*sorted(topics.values(), key=lambda row: (-_number(row["last_ts"]), str(row["topic"])))]
 
@@ -517,25 +531,25 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
     headers = {reply.name: [*map(str, _items(reply.body, "columns"))] for reply in replies}
     columns = [*dict.fromkeys(name for own in headers.values() for name in own)]
     rows: list[JsonValue] = []
-    every: JsonObject = {}
+    totals: JsonObject = {}
     for reply in replies:
-        name, own = reply.name, headers[reply.name]
+        name, header = reply.name, headers[reply.name]
         for row in _items(reply.body, "rows"):
-            cells = dict(zip(own, row if isinstance(row, list) else (), strict=True))
+            cells = dict(zip(header, row if isinstance(row, list) else (), strict=True))
             rows.append([name, *map(cells.get, columns)])
         if total := _items(reply.body, "all"):
-            every[name] = [*map(dict(zip(own[1:], total, strict=True)).get, columns[1:])]
+            totals[name] = [*map(dict(zip(header[1:], total, strict=True)).get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
-    table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": every}
-    return table | _rest({}, replies, rest)
+    table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": totals}
+    return table | _combined({}, replies, rest)
 
 
-def by_reason(said: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def by_reason(reasons: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
     """Returns the names of robots by reason, from pairs of a name and a reason."""
-    found: dict[str, list[str]] = {}
-    for name, reason in said:
-        found.setdefault(reason, []).append(name)
-    return found
+    names_by_reason: dict[str, list[str]] = {}
+    for name, reason in reasons:
+        names_by_reason.setdefault(reason, []).append(name)
+    return names_by_reason
 
 
 def reason_of(error: EpisodicError) -> str:
@@ -574,7 +588,7 @@ def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicErro
 
 def shipped_to(latest: Mapping[str, Ns | None]) -> list[str]:
     """Returns the note on answers from a lake: up to when each robot's bags were shipped."""
-    order = sorted(latest.items(), key=lambda of: of[1] or 0)
+    order = sorted(latest.items(), key=lambda shipped: shipped[1] or 0)
     times = [(name, "no time" if at is None else iso_local(at) or str(at)) for name, at in order]
     parts = [f"{name} up to {time}" for name, time in times[:_MOST_NAMED]]
     if more := len(order) - len(parts):
@@ -587,8 +601,8 @@ def _without(value: JsonObject, keys: set[str]) -> JsonObject:
 
 
 def _items(reply: JsonObject, key: str) -> list[JsonValue]:
-    found = reply.get(key)
-    return found if isinstance(found, list) else []
+    values = reply.get(key)
+    return values if isinstance(values, list) else []
 
 
 def _list(value: JsonValue) -> list[JsonObject]:

@@ -146,7 +146,7 @@ class Lake:
             if time.monotonic() - self._looked_at >= within_s:
                 # Other tables are looked up later, and have the rows of these bags by then.
                 self._tables = {}
-                self._table("bags")
+                self._loaded_table("bags")
                 self._looked_at = time.monotonic()
 
     def days(self, name: str) -> Mapping[str, Days]:
@@ -155,7 +155,7 @@ class Lake:
         In those of a robot no row of another one is.
         """
         with self._looking():
-            table = self._table(name)
+            table = self._loaded_table(name)
             return {} if table is None else self._partitions[name].look(table)
 
     def select(
@@ -163,18 +163,18 @@ class Lake:
     ) -> pa.Table:
         """Returns the rows of a select (see `LakeEngine`) over some files of a table."""
         with self._looking():
-            table = self._table(name)
+            table = self._loaded_table(name)
         store = {} if table is None else dict(table.io.properties)
         locations = tuple(file.location for file in files)
-        found = DataFiles(TABLES[name].arrow_schema, locations, store)
-        return self.engine.select(sql, name, found, parameters or {})
+        data_files = DataFiles(TABLES[name].arrow_schema, locations, store)
+        return self.engine.select(sql, name, data_files, parameters or {})
 
     @contextmanager
     def _looking(self) -> Iterator[None]:
         with self._lock, self.translated("looking into the lake"):
             yield
 
-    def _table(self, name: str) -> IcebergTable | None:
+    def _loaded_table(self, name: str) -> IcebergTable | None:
         if name not in self._tables:
             try:
                 self._tables[name] = self.catalog.load_table(f"{NAMESPACE}.{name}")

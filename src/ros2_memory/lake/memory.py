@@ -121,8 +121,8 @@ def newest(days: Days, until: date, rows: int, fewest: int) -> tuple[Days, date 
         if total > rows and day <= order[end - 1] - timedelta(days=fewest):
             break
         begin -= 1
-    found = {day: days[day] for day in order[begin:end]}
-    return found, order[begin - 1] if begin else None
+    chosen = {day: days[day] for day in order[begin:end]}
+    return chosen, order[begin - 1] if begin else None
 
 
 @dataclass(eq=False, repr=False)
@@ -172,15 +172,15 @@ class LakeIndex:
         Raises:
             RefusedError: the lake cannot be read.
         """
-        known = self._snapshot
-        if known is None or self.clock.now() - known.scanned_at > self.refresh_s * 1e9:
-            known = self.refresh()
-        if reach is None or known.older is None or reach > known.older:
-            return known
+        newest = self._snapshot
+        if newest is None or self.clock.now() - newest.scanned_at > self.refresh_s * 1e9:
+            newest = self.refresh()
+        if reach is None or newest.older is None or reach > newest.older:
+            return newest
         with self._lock:
             # With the next day, in which what lies across midnight goes on.
             window = self._window(day_of(reach) + timedelta(days=1), _FEWEST_DAYS)
-        return replace(known, timeline=window.timeline, older=window.older)
+        return replace(newest, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:
         """Looks into the lake now; what was just seen there for another robot is not old."""
@@ -201,8 +201,8 @@ class LakeIndex:
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
         """Returns what the robot's handovers were when the bags were shipped."""
-        found = (window.joined.get(recording) for window in self._windows.values())
-        return next(filter(None, found), ())
+        joined = (window.joined.get(recording) for window in self._windows.values())
+        return next(filter(None, joined), ())
 
     def bag(self, path: Path) -> LakeBag:
         """Returns the bag of a snapshot that has a path there.
@@ -211,27 +211,29 @@ class LakeIndex:
             BagVanishedError: it is not in the lake any more.
         """
         for window in self._windows.values():
-            if found := window.bags.get(str(path)):
-                return found
+            if bag := window.bags.get(str(path)):
+                return bag
         raise BagVanishedError(str(path), _GONE)
 
     def _window(self, until: date, fewest: int) -> _Window:
         """Returns the newest days up to one; only those are read of which a file is new."""
-        known = self._windows.get(until, _Window())
+        before = self._windows.get(until, _Window())
         of_robot = self.lake.days("bags").get(self.robot, {})
         made_of, day_before = newest(of_robot, until, self.most_bags, fewest)
-        window = replace(known, older=None if day_before is None else end_of(day_before))
-        if made_of != known.made_of:
-            new = {day: files for day, files in made_of.items() if known.made_of.get(day) != files}
+        window = replace(before, older=None if day_before is None else end_of(day_before))
+        if made_of != before.made_of:
+            new = {day: files for day, files in made_of.items() if before.made_of.get(day) != files}
             same = made_of.keys() - new.keys()
-            bags = {path: bag for path, bag in known.bags.items() if bag.day in same}
-            bags |= self._read(new, known.bags)
-            gone, come = _missing(known.bags, bags), _missing(bags, known.bags)
-            timeline = known.timeline.changed(gone, come)
+            bags = {path: bag for path, bag in before.bags.items() if bag.day in same}
+            bags |= self._read(new, before.bags)
+            gone, come = _missing(before.bags, bags), _missing(bags, before.bags)
+            timeline = before.timeline.changed(gone, come)
             joined = {bag.file.recording: bag.joined for bag in bags.values() if bag.joined}
             window = _Window(window.older, made_of, timeline, bags, joined)
         # A new dict: other threads look for the bags of their answers in the old one.
-        windows = {day: one for day, one in self._windows.items() if day != until} | {until: window}
+        windows = {**self._windows}
+        windows.pop(until, None)  # the one that was asked for last comes last
+        windows[until] = window
         dated = [day for day in windows if day != date.max]
         self._windows = {day: windows[day] for day in (date.max, *dated[-_MOST_WINDOWS:])}
         return window
@@ -243,7 +245,7 @@ class LakeIndex:
         schemas: dict[str, SummarySchema] = {}
         of_day = Counter[date]()
         groups: dict[tuple[date, int], dict[str, int]] = {}
-        found: dict[str, LakeBag] = {}
+        bags: dict[str, LakeBag] = {}
         for row in rows.to_pylist():
             schema, counts, joined = map(row.pop, ("summary", "counts", "joined"))
             bag = ShippedBag(**row)
@@ -265,8 +267,8 @@ class LakeIndex:
             together[bag.bag_id] = state
             of_day[bag.day] += 1
             names = tuple(joined.split("/")) if joined else ()
-            found[path] = LakeBag(bag.bag_id, bag.day, file, names, together)
-        return found
+            bags[path] = LakeBag(bag.bag_id, bag.day, file, names, together)
+        return bags
 
 
 def _missing(bags: Mapping[str, LakeBag], others: Mapping[str, LakeBag]) -> list[BagFile]:
@@ -327,8 +329,8 @@ class LakeReader(BagReader):
         """
         step = -1 if newest_first else 1
         batches = [*self.batches(path, topics, window)][::step]
-        found = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
-        yield from heapq.merge(*found, key=attrgetter("log_time"), reverse=newest_first)
+        records = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
+        yield from heapq.merge(*records, key=attrgetter("log_time"), reverse=newest_first)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
@@ -338,8 +340,8 @@ class LakeReader(BagReader):
         Raises:
             NotInLakeError: the lake has the times of a topic alone, and it is not `bare`.
         """
-        here = self.index.bag(path)
-        wanted = [head for head in self._heads_of(here) if head.channel.topic in topics]
+        lake_bag = self.index.bag(path)
+        wanted = [head for head in self._heads_of(lake_bag) if head.channel.topic in topics]
         names = sorted({head.channel.topic for head in wanted})
         for head in wanted:
             topic = head.channel.topic
@@ -347,7 +349,7 @@ class LakeReader(BagReader):
                 do = "name it in lake.messages of ros2-memory ship, ask about other topics"
                 why = f"the lake has only the times of {topic}, whose messages are large"
                 raise NotInLakeError(f"{why}: {do}, or ask the robot's own memory")
-            data = self._packed_of(here, head.number, names)
+            data = self._packed_of(lake_bag, head.number, names)
             if data is None:
                 raise BagError(str(path), f"the lake has no messages of {topic} any more")
             if is_large(data):
@@ -382,22 +384,33 @@ class LakeReader(BagReader):
         return self.decoder.definition(channel)
 
     def _heads_of(self, bag: LakeBag) -> Sequence[_Head]:
+        """Returns the channels of a bag; those of the bags beside it are read with it, and cached.
+
+        Raises:
+            BagVanishedError: it is not in the lake any more.
+        """
         heads = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
         if heads is None:
-            found: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
-            for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
-                schema = Schema(row["type"], row["schema_encoding"], row["schema"])
-                more = tuple((key, value) for key, value in json.loads(row["metadata"]))
-                channel = Channel(row["topic"], row["encoding"], schema, row["latched"], more)
-                head = _Head(row["channel"], shared(channel), row["has_payloads"])
-                found[row["bag_id"]].append(head)
-            for bag_id, own in found.items():
-                self._heads.put((bag_id, bag.together[bag_id]), own, _HEAD_BYTES * (1 + len(own)))
-            heads = found[bag.bag_id]
+            heads_by_bag = self._read_heads(bag)
+            for bag_id, read in heads_by_bag.items():
+                size_bytes = _HEAD_BYTES * (1 + len(read))
+                self._heads.put((bag_id, bag.together[bag_id]), read, size_bytes)
+            heads = heads_by_bag[bag.bag_id]
         if not heads and bag.file.summary.count:
             # Deleted, or replaced under another id, since the index of this robot was read.
             raise BagVanishedError(bag.file.file, _GONE)
         return heads
+
+    def _read_heads(self, bag: LakeBag) -> dict[str, list[_Head]]:
+        """Returns the channels of a bag and of those that are read with it, by the ids of bags."""
+        heads_by_bag: dict[str, list[_Head]] = {bag_id: [] for bag_id in bag.together}
+        for row in self._select(_HEADS, bag, [*bag.together]).to_pylist():
+            schema = Schema(row["type"], row["schema_encoding"], row["schema"])
+            metadata = tuple((key, value) for key, value in json.loads(row["metadata"]))
+            channel = Channel(row["topic"], row["encoding"], schema, row["latched"], metadata)
+            head = _Head(row["channel"], shared(channel), row["has_payloads"])
+            heads_by_bag[row["bag_id"]].append(head)
+        return heads_by_bag
 
     def _packed_of(self, bag: LakeBag, number: int, topics: Sequence[str]) -> bytes | None:
         """Returns the packed messages of a channel; None where they are gone.
@@ -406,8 +419,8 @@ class LakeReader(BagReader):
         and goes on, reads those beside it, too, as many as may be in memory.
         """
         messages = self.index.lake.messages
-        known = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
-        if known is None:
+        packed = messages.get((bag.bag_id, bag.file.sidecar_ns, number))
+        if packed is None:
             beside = (messages.get((*state, number)) for state in bag.together.items())
             largest = max(map(len, filter(None, beside)), default=_NEAR_BYTES + 1)
             near, ids = _NEAR_BYTES // (largest * len(topics)), [*bag.together]
@@ -417,8 +430,8 @@ class LakeReader(BagReader):
                 key = (row["bag_id"], bag.together[row["bag_id"]], row["channel"])
                 messages.put(key, row["packed"], len(row["packed"]))
                 if key == (bag.bag_id, bag.file.sidecar_ns, number):
-                    known = row["packed"]
-        return known
+                    packed = row["packed"]
+        return packed
 
     def _select(self, sql: str, bag: LakeBag, bags: list[str], **more: Sequence[str]) -> pa.Table:
         """Returns the rows of a select over the channels of some bags of a day."""
@@ -438,10 +451,10 @@ def lake_memory(
     decoder: BagReader,
     large: LargeReads,
     store: ColumnStore | None = None,
-    settings: str = "",
+    reading: str = "",
     caches: Caches | None = None,
 ) -> Memory:
-    """Returns what a bag directory's memory is, but for the index and what reads bags.
+    """Returns the memory of one robot whose bags and messages are read from a lake.
 
     Args:
         index: the robot's bags in the lake.
@@ -450,7 +463,7 @@ def lake_memory(
         decoder: decodes messages.
         large: the turn to hold much of a bag.
         store: of the columns of its bags, which are made again from the lake; None for none.
-        settings: what follows from bags depends on, as a text.
+        reading: the hash of the settings that decide what is read from bags.
         caches: those of the columns of all robots.
     """
     return Memory(
@@ -460,6 +473,6 @@ def lake_memory(
         index.clock,
         # Nothing is recorded here, and nothing deleted.
         replace(limits, kept=None, recording="", screened=False),
-        Scanner(store, index.bag_dir, settings, large, caches),
+        Scanner(store, index.bag_dir, reading, large, caches),
         large=large,
     )

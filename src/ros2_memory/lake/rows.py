@@ -95,19 +95,19 @@ def sha256_of(path: Path) -> str:
 
 
 def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
-    """Returns what the rows of a bag depend on besides its bytes.
+    """Returns a digest of what the rows of a bag depend on besides its bytes.
 
     That is which of its messages count, the handovers of its recording, the static transforms in
     force, what the robot is placed by, the spellings of labels, the settings (`config`) and the
     topics whose `messages` are shipped.
     """
     counted = [
-        (known.topic, known.type, known.count, known.first, known.last)
-        for known in bag.summary.topics
+        (topic.topic, topic.type, topic.count, topic.first, topic.last)
+        for topic in bag.summary.topics
     ]
     view = View(memory, Call())
-    among = sessions_of(view).lending_to(bag.recording, bag.end)
-    statics = repr(static_at(static_transforms(view, among), bag.end))
+    recordings = sessions_of(view).lending_to(bag.recording, bag.end)
+    statics = repr(static_at(static_transforms(view, recordings), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
     return _digest(
         [
@@ -126,8 +126,8 @@ def rows_of(
         BagError: the bag, or a part of it, cannot be read.
     """
     keys = {"robot": shipped.robot, "bag_id": shipped.bag_id, "day": shipped.day}
-    found = _BagRows(memory, bag, messages).rows(shipped)
-    return {name: [{**keys, **row} for row in rows] for name, rows in found.items()}
+    rows_by_table = _BagRows(memory, bag, messages).rows(shipped)
+    return {name: [{**keys, **row} for row in rows] for name, rows in rows_by_table.items()}
 
 
 class _BagRows:
@@ -142,8 +142,8 @@ class _BagRows:
         self._poses = poses_of_bag(view, bag, self._pose_topic)
         self._thing = Labels(memory.limits.labels).key
         self._types = defaultdict[str, list[str]](list)
-        for known in bag.summary.topics:
-            self._types[known.topic].append(known.type)
+        for topic in bag.summary.topics:
+            self._types[topic.topic].append(topic.type)
         self._undecodable = 0
         self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
@@ -153,16 +153,17 @@ class _BagRows:
         for frame, track in tracks:
             same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
             columns = (track.times, track.x, track.y, track.heading, track.begins)
-            for vertex in zip(*(one.tolist() for one in columns), strict=True):
-                of = dict(zip(("time_ns", "x", "y", "heading", "begins"), vertex, strict=True))
-                known = None if math.isnan(of["heading"]) else of["heading"]
-                self._rows["poses"].append({**same, **of, "heading": known})
+            for vertex in zip(*(column.tolist() for column in columns), strict=True):
+                row = dict(zip(("time_ns", "x", "y", "heading", "begins"), vertex, strict=True))
+                if math.isnan(row["heading"]):
+                    row["heading"] = None
+                self._rows["poses"].append({**same, **row})
         self._rows["things"] += self._things()
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
         # Of each topic that can have some.
         events = {
-            topic: found.limited(MAX_PER_BAG, MAX_PER_BAG)
-            for topic, found in events_of_bag(self._view, self._bag, topics).items()
+            topic: bag_events.limited(MAX_PER_BAG, MAX_PER_BAG)
+            for topic, bag_events in events_of_bag(self._view, self._bag, topics).items()
         }
         for topic, found in events.items():
             self._rows["events"] += self._events_of(topic, found)
@@ -210,8 +211,8 @@ class _BagRows:
         return [(frame, track) for frame, track in tracks if len(track.times)]
 
     def _things(self) -> Iterator[Row]:
-        for one in Watching(self._view).in_bag(self._bag):
-            for sights in one.sights:
+        for in_view in Watching(self._view).in_bag(self._bag):
+            for sights in in_view.sights:
                 for spot in sights.spots.tolist():
                     best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
                     yield {
@@ -221,7 +222,7 @@ class _BagRows:
                         "count": spot[Spot.N],
                         "first_ns": spot[Spot.FIRST],
                         "last_ns": spot[Spot.LAST],
-                        "frame_id": one.frame_id,
+                        "frame_id": in_view.frame_id,
                         "x": spot[Spot.X] / _MM,
                         "y": spot[Spot.Y] / _MM,
                         "z": spot[Spot.Z] / _MM,
@@ -257,21 +258,20 @@ class _BagRows:
     def _channels(self) -> Iterator[Row]:
         """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
         # By identity, since hashing a channel hashes its definition.
-        found: dict[int, _Messages] = {}
-        every, window = tuple(self._types), TimeWindow.everything()
-        for batch in self._memory.reader.batches(self._bag.path, every, window):
+        by_channel: dict[int, _Messages] = {}
+        topics, window = tuple(self._types), TimeWindow.everything()
+        for batch in self._memory.reader.batches(self._bag.path, topics, window):
             channel = batch.channel
-            if id(channel) not in found:
+            if id(channel) not in by_channel:
                 is_whole = channel.topic in self._whole
                 has_payloads = is_whole or channel.type not in BULKY_TYPES
-                found[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
-            found[id(channel)].add(batch)
-            droppable = [one for one in found.values() if not one.is_whole]
-            while droppable and sum(one.size for one in found.values()) > _MOST_BYTES:
-                largest = max(droppable, key=attrgetter("size"))
-                largest.payloads, largest.size = None, 0
-                droppable.remove(largest)
-        order = sorted(found.values(), key=lambda one: (one.channel.topic, one.channel.type))
+                by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
+            by_channel[id(channel)].add(batch)
+            _drop_payloads(by_channel.values())
+        order = sorted(
+            by_channel.values(),
+            key=lambda messages: (messages.channel.topic, messages.channel.type),
+        )
         for number, messages in enumerate(order):
             yield messages.row(number)
 
@@ -282,7 +282,7 @@ class _BagRows:
         reader, extractor = self._memory.reader, self._memory.extractor
         for record in reader.records(self._bag.path, topics, window):
             topic, kind = record.channel.topic, record.channel.type
-            found: Sequence[Detection] = ()
+            detections: Sequence[Detection] = ()
             row = {"topic": topic, "type": kind, "time_ns": record.log_time}
             row["message"] = numbers[topic]
             numbers[topic] += 1
@@ -294,28 +294,38 @@ class _BagRows:
                 value: Row = {"undecodable": error.reason}
             else:
                 value = taken_apart(shown) if topic in self._whole else {}
-                found = detections_of(shown, extractor.frame(message)) if topic in seen else ()
+                detections = detections_of(shown, extractor.frame(message)) if topic in seen else ()
             if topic in self._whole:
                 published = {"publish_ns": record.publish_time}
                 self._rows["messages"].append({**row, **published, **value})
-            at = place_at(track, record.log_time) if found else None
+            at = place_at(track, record.log_time) if detections else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
-            for detection in found:
+            for detection in detections:
                 label, place = detection.label, detection.place or ()
                 named = {"label": label, "thing": self._thing(label), "score": detection.score}
                 where = {"frame_id": detection.frame_id, **dict(zip("xyz", place, strict=False))}
                 self._rows["sightings"].append({**row, **named, **where})
 
-    def _events_of(self, topic: str, found: TopicEvents) -> Iterator[Row]:
-        for seen in found.visible.intervals():
-            of = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
-            yield _event(topic, "thing", seen.first, seen.label, **of)
-        for flip in found.of_kind(FLAG)[1]:
+    def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
+        for seen in events.visible.intervals():
+            columns = {"thing": self._thing(seen.label), "value": seen.best, "last_ns": seen.last}
+            yield _event(topic, "thing", seen.first, seen.label, **columns)
+        _, flips = events.of_kind(FLAG)
+        for flip in flips:
             yield _event(topic, "flip", flip.time, toggled(topic, flip), value=float(flip.value))
-        for error in found.errors:
+        for error in events.errors:
             reports = {"last_ns": error.last, "count": error.reports}
             yield _event(topic, "error", error.first, error.text, **reports)
+
+
+def _drop_payloads(channels: Collection[_Messages]) -> None:
+    """Drops payloads of the largest channels until `_MOST_BYTES` hold all; those whole stay."""
+    droppable = [messages for messages in channels if not messages.is_whole]
+    while droppable and sum(messages.size for messages in channels) > _MOST_BYTES:
+        largest = max(droppable, key=attrgetter("size"))
+        largest.payloads, largest.size = None, 0
+        droppable.remove(largest)
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
@@ -328,23 +338,23 @@ def taken_apart(value: JsonValue) -> Row:
     In the JSON every scalar that a map has is null. So it is one text for all messages of a type
     without lists, which Parquet stores once. Lists stay whole, and what has a dot in its name.
     """
-    found: dict[str, list[tuple[str, object]]] = {name: [] for name in _MAP_OF.values()}
+    scalars: dict[str, list[tuple[str, object]]] = {name: [] for name in _MAP_OF.values()}
 
     def rest(inner: JsonValue, path: str) -> JsonValue:
         if isinstance(inner, dict):
             return {
-                name: one if "." in name or not name else rest(one, f"{path}.{name}".lstrip("."))
-                for name, one in inner.items()
+                name: part if "." in name or not name else rest(part, f"{path}.{name}".lstrip("."))
+                for name, part in inner.items()
             }
         kind = _MAP_OF.get(type(inner))
         is_large = type(inner) is int and not -_LARGEST <= inner < _LARGEST
         if kind is None or not path or is_large:
             return inner
-        found[kind].append((path, inner))
+        scalars[kind].append((path, inner))
         return None
 
     text = json.dumps(rest(value, ""), ensure_ascii=False, separators=(",", ":"))
-    return {**found, "value": text}
+    return {**scalars, "value": text}
 
 
 @dataclass(slots=True, eq=False)

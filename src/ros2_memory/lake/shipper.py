@@ -72,8 +72,8 @@ class Shipped:
     problems: list[str] = field(default_factory=list)
 
 
-class _Seen(NamedTuple):
-    """A bag as it was: its file, and the sidecars that decide which of its messages count.
+class _KnownState(NamedTuple):
+    """What was found out of a bag while it had a size, an mtime and sidecars.
 
     `is_forgotten`: whether it has messages that were forgotten.
     """
@@ -83,10 +83,10 @@ class _Seen(NamedTuple):
     is_forgotten: bool
 
 
-class _Ready(NamedTuple):
+class _PreparedBag(NamedTuple):
     """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
 
-    of: RobotBags
+    robot: RobotBags
     bag: ShippedBag
     rows: Mapping[str, pa.Table]
     replaced: Sequence[ShippedBag]
@@ -135,10 +135,10 @@ class Shipper:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
         done = Shipped()
-        batch: list[_Ready] = []
+        batch: list[_PreparedBag] = []
         size = 0
-        known = [robot for robot in self.robots if self._forget(robot, done)]
-        for ready in chain.from_iterable(robot.ready(self, done) for robot in known):
+        robots = [robot for robot in self.robots if self._forget(robot, done)]
+        for ready in chain.from_iterable(robot.ready(self, done) for robot in robots):
             batch.append(ready)
             size += sum(rows.nbytes for rows in ready.rows.values())
             if len(batch) >= self.most_bags or size >= MOST_BYTES:
@@ -171,7 +171,10 @@ class Shipper:
             )
             return False
         try:
-            wanted = [Tombstone.of(robot.name, one) for one in read_forgettings(robot.bag_dir)]
+            wanted = [
+                Tombstone.of(robot.name, forgetting)
+                for forgetting in read_forgettings(robot.bag_dir)
+            ]
         except (OSError, ValueError) as error:
             why = "until it is repaired, since what was forgotten could come back"
             file = f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}"
@@ -191,7 +194,7 @@ class Shipper:
             self.look_again()
         return True
 
-    def _commit(self, batch: Sequence[_Ready], done: Shipped, *, is_full: bool) -> None:
+    def _commit(self, batch: Sequence[_PreparedBag], done: Shipped, *, is_full: bool) -> None:
         """Commits a batch.
 
         Raises:
@@ -214,17 +217,17 @@ class Shipper:
         done.rows += rows
         log.info("bags_shipped", bags=len(batch), rows=rows)
         for robot in self.robots:
-            own = [ready for ready in batch if ready.of is robot]
-            for bag in (bag for ready in own for bag in ready.replaced):
+            of_robot = [ready for ready in batch if ready.robot is robot]
+            for bag in (bag for ready in of_robot for bag in ready.replaced):
                 robot.known.pop(bag.bag_id, None)
-            robot.confirm([ready.bag for ready in own], self, done)
+            robot.confirm([ready.bag for ready in of_robot], self, done)
 
 
 @dataclass(eq=False, repr=False)
 class RobotBags:
     """One robot whose bags are shipped, and what is known of those that it has.
 
-    `_seen` has the newest state of each by its file, `known` what the lake has of them by their
+    `_states` has the newest state of each by its file, `known` what the lake has of them by their
     ids; neither those that it had: a hub runs for years.
 
     Attributes:
@@ -263,18 +266,18 @@ class RobotBags:
 
     def look_again(self) -> None:
         """Has everything looked at again."""
-        self._seen: dict[str, _Seen] = {}
+        self._states: dict[str, _KnownState] = {}
         self.known: dict[str, ShippedBag] = {}
         self._receipts: dict[str, Receipt] | None = None
 
-    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_Ready]:
+    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBag]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
             done.problems.append(f"{self.name}: {snapshot.problem}")
             return
         bags = self._settled(snapshot, done)
-        self._look_up(bags, shipper.lake)
+        self._load_known(bags, shipper.lake)
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         ids, confirmed = set[str](), list[ShippedBag]()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
@@ -282,43 +285,45 @@ class RobotBags:
         for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
             shipper.alive()
             try:
-                seen = self._look(bag, shipper.tombstones)
-                before = self.known.get(seen.bag_id)
-                if seen.bag_id in ids or (before is not None and bag.file in copies):
+                bag_id, is_forgotten = self._identified(bag, shipper.tombstones)
+                before = self.known.get(bag_id)
+                if bag_id in ids or (before is not None and bag.file in copies):
                     continue
-                if seen.is_forgotten:
+                if is_forgotten:
                     do = "it is not shipped: delete it, or the messages, with ros2-memory forget"
                     why = f"{bag.file} has messages that were forgotten in the lake; {do}"
                     done.problems.append(f"{self.name}: {why}")
                     continue
-                ids.add(seen.bag_id)
-                shipped = self._described(bag, seen.bag_id, before, shipper.messages)
+                ids.add(bag_id)
+                shipped = self._row_of(bag, bag_id, before, shipper.messages)
                 if before is not None and _is_same(before, shipped):
                     confirmed.append(shipped)
                     continue
-                of_file = by_file.get(shipped.file)
-                if of_file is not None and self._is_cut(of_file, bag):
+                same_file = by_file.get(shipped.file)
+                if same_file is not None and self._is_cut(same_file, bag):
                     continue
-                found = rows_of(self.memory, bag, shipped, shipper.messages)
+                by_table = rows_of(self.memory, bag, shipped, shipper.messages)
                 # As Python has them, they take many times as much.
-                rows = {name: table.filled(found[name]) for name, table in TABLES.items()}
+                rows = {name: table.filled(by_table[name]) for name, table in TABLES.items()}
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
                 continue
             replaced = {before} if before is not None else set()
             # As where its first messages were deleted by request: what is left lies within it.
-            start, end = shipped.start_ns, shipped.end_ns
-            if of_file is not None and of_file.start_ns <= start and end <= of_file.end_ns:
-                replaced.add(of_file)
-            yield _Ready(self, shipped, rows, [*replaced])
+            if same_file is not None and _covers(same_file, shipped):
+                replaced.add(same_file)
+            yield _PreparedBag(self, shipped, rows, [*replaced])
         self.confirm(confirmed, shipper, done)
         self._drop_gone(bags)
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
         """Returns the bags that change no more; reports the others."""
         now = self.memory.clock.now()
-        every = [bag for bag in snapshot.bags if bag.state is BagState.CLOSED]
-        closed = [bag for bag in every if not (is_carried(bag.path) or is_thinned(bag.path))]
+        closed = [
+            bag
+            for bag in snapshot.bags
+            if bag.state is BagState.CLOSED and not (is_carried(bag.path) or is_thinned(bag.path))
+        ]
         bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         done.waiting += len(closed) - len(bags) + len(open_bags)
@@ -329,13 +334,13 @@ class RobotBags:
         done.problems += [f"{self.name}: {file.path}: {file.reason}" for file in snapshot.damaged]
         return bags
 
-    def _look_up(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
+    def _load_known(self, bags: Sequence[BagFile], lake: LakeTables) -> None:
         """Asks the lake what it has of the time of new bags.
 
         Raises:
             LakeError: the lake cannot be read.
         """
-        new = [bag for bag in bags if bag.file not in self._seen]
+        new = [bag for bag in bags if bag.file not in self._states]
         if new:
             begin = max(min(bag.start for bag in new) - _BESIDE_NS, MIN_NS)
             stop = min(max(bag.end for bag in new) + _BESIDE_NS, MAX_NS)
@@ -346,36 +351,43 @@ class RobotBags:
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer."""
         names = {bag.file: self.name_of(bag) for bag in bags}
-        self._seen = {file: seen for file, seen in self._seen.items() if file in names}
-        ids, own = {seen.bag_id for seen in self._seen.values()}, {*names.values()}
-        known, receipts = self.known.items(), (self._receipts or {}).items()
-        self.known = {key: one for key, one in known if key in ids or one.file in own}
+        self._states = {file: known for file, known in self._states.items() if file in names}
+        ids, present = {known.bag_id for known in self._states.values()}, {*names.values()}
+        self.known = {
+            bag_id: shipped
+            for bag_id, shipped in self.known.items()
+            if bag_id in ids or shipped.file in present
+        }
         if self._receipts is not None:
-            self._receipts = {name: receipt for name, receipt in receipts if name in own}
+            receipts = self._receipts.items()
+            self._receipts = {name: receipt for name, receipt in receipts if name in present}
 
-    def _look(self, bag: BagFile, tombstones: Collection[Tombstone]) -> _Seen:
-        """Returns a state of a bag, which is read once."""
+    def _identified(self, bag: BagFile, tombstones: Collection[Tombstone]) -> tuple[str, bool]:
+        """Returns a bag's id, and whether it has forgotten messages; reads each state once."""
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
-        seen = self._seen.get(bag.file)
-        if seen is None or seen.state != state:
+        known = self._states.get(bag.file)
+        if known is None or known.state != state:
             summary = self.reader.summarize(bag.path)
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
             bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
-            own = [tombstone for tombstone in tombstones if tombstone.robot == self.name]
-            forgotten = any(one.forbids(self.memory.reader, bag, bag_id) for one in own)
-            seen = self._seen[bag.file] = _Seen(state, bag_id, forgotten)
-        return seen
+            of_robot = [tombstone for tombstone in tombstones if tombstone.robot == self.name]
+            forgotten = any(
+                tombstone.forbids(self.memory.reader, bag, bag_id) for tombstone in of_robot
+            )
+            known = self._states[bag.file] = _KnownState(state, bag_id, forgotten)
+        return known.bag_id, known.is_forgotten
 
-    def _described(
+    def _row_of(
         self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
     ) -> ShippedBag:
-        """Returns what a bag would be known as."""
+        """Returns the row that a bag would have in `bags`; its file is hashed where it is new."""
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and is_read else sha256_of(bag.path)
-        of_file = self.name_of(bag), bag.size, sha256, bag.mtime_ns
+        file_columns = self.name_of(bag), bag.size, sha256, bag.mtime_ns
         made = made_of(self.memory, bag, self.config, messages)
-        return ShippedBag(self.name, bag_id, day_of(bag.start), *of_file, made, bag.start, bag.end)
+        day = day_of(bag.start)
+        return ShippedBag(self.name, bag_id, day, *file_columns, made, bag.start, bag.end)
 
     def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
         """Returns whether only retention took messages out of a bag after it was shipped.
@@ -396,15 +408,17 @@ class RobotBags:
         try:
             if self._receipts is None:
                 self._receipts = read_receipts(self.bag_dir)
-            known = self._receipts
+            receipts = self._receipts
             missing = [
                 Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, shipper.clock.now())
                 for bag in bags
-                if not (is_shipped(known, bag.file, bag.size) and known[bag.file].lake == lake)
+                if not (
+                    is_shipped(receipts, bag.file, bag.size) and receipts[bag.file].lake == lake
+                )
             ]
             if missing:
                 append_receipts(self.bag_dir, missing)
-                known.update((receipt.bag, receipt) for receipt in missing)
+                receipts.update((receipt.bag, receipt) for receipt in missing)
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
             done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")
@@ -414,6 +428,11 @@ def _list_one(folder: Path) -> None:
     """Lists one entry of a folder, which takes as long as its disk does; errors are no matter."""
     with suppress(OSError), os.scandir(folder) as entries:
         next(entries, None)
+
+
+def _covers(before: ShippedBag, now: ShippedBag) -> bool:
+    """Returns whether all of a bag lies within the time of an earlier one."""
+    return before.start_ns <= now.start_ns and now.end_ns <= before.end_ns
 
 
 def _is_same(before: ShippedBag, now: ShippedBag) -> bool:

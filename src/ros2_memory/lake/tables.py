@@ -91,8 +91,8 @@ class LakeTable:
             ids = {"key-id": _INNER_IDS + 2 * number, "value-id": _INNER_IDS + 2 * number + 1}
             of_map = {"key": "string", "value": kind.removeprefix("map "), "value-required": False}
             form = {"type": "map", **ids, **of_map} if kind.startswith("map ") else kind
-            known = {"id": number, "name": name, "type": form, "doc": meaning}
-            fields.append({**known, "required": name in KEYS})
+            field = {"id": number, "name": name, "type": form, "doc": meaning}
+            fields.append({**field, "required": name in KEYS})
         return IcebergSchema.model_validate({"type": "struct", "fields": fields})
 
     @cached_property
@@ -124,15 +124,15 @@ class LakeTable:
         whole: list[Row] = []
         for row in rows:
             # `time` repeats the first time, in microseconds.
-            more = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
+            time = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
             key = str(row.get("topic", "")).strip("/").replace("/", ".")
-            whole.append({"topic_key": key, **more, **row})
+            whole.append({"topic_key": key, **time, **row})
         try:
-            found = pa.Table.from_pylist(whole, self.arrow_schema)
+            table = pa.Table.from_pylist(whole, self.arrow_schema)
         except UnicodeEncodeError:
             # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
-            found = pa.Table.from_pylist([*map(_encodable, whole)], self.arrow_schema)
-        return self.sorted(found)
+            table = pa.Table.from_pylist([*map(_encodable, whole)], self.arrow_schema)
+        return self.sorted(table)
 
 
 _DECLARED: Final = yaml.safe_load(files(__package__).joinpath("tables.yaml").read_text("utf-8"))
@@ -227,10 +227,10 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    found: ex.BooleanExpression = ex.AlwaysFalse()
-    for (robot, day), some in ids.items():
-        found = ex.Or(found, ex.And(of_robots([robot], day), of_ids(robot, some)))
-    return found
+    condition: ex.BooleanExpression = ex.AlwaysFalse()
+    for (robot, day), bag_ids in ids.items():
+        condition = ex.Or(condition, ex.And(of_robots([robot], day), of_ids(robot, bag_ids)))
+    return condition
 
 
 def overlapping(
@@ -251,7 +251,7 @@ def overlapping(
 def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
     """Returns tables by name; makes those that are missing, and adds columns that are new."""
     catalog.create_namespace_if_not_exists(NAMESPACE)
-    found: dict[str, IcebergTable] = {}
+    tables: dict[str, IcebergTable] = {}
     for name in names:
         table, identifier = TABLES[name], f"{NAMESPACE}.{name}"
         try:
@@ -261,8 +261,8 @@ def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, Iceb
         if not set(opened.schema().column_names).issuperset(table.columns):
             with opened.update_schema() as update:
                 update.union_by_name(table.schema)
-        found[name] = opened
-    return found
+        tables[name] = opened
+    return tables
 
 
 def packed_messages(

@@ -31,7 +31,7 @@ from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, 
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterator, Sequence
     from datetime import date
     from pathlib import Path
 
@@ -110,22 +110,12 @@ def expire(lake: LakeTables, until: Ns) -> int:
     with lake.location.translated("deleting old files of the lake"):
         tables = [lake.current(name) for name in TABLES]
         for table in tables:
-            kept = {ref.snapshot_id for ref in table.metadata.refs.values()}
-            old = [
-                version.snapshot_id
-                for version in table.metadata.snapshots
-                if version.snapshot_id not in kept and version.timestamp_ms * NS_PER_MS <= until
-            ]
-            if old:
-                table.maintenance.expire_snapshots().by_ids(old).commit()
-                table.refresh()
+            _drop_versions(table, until)
         recorded = WRITTEN.rows(state_dir)
-        own = [written.file for written in recorded if written.at < until]
+        outdated = [written.file for written in recorded if written.at < until]
         try:
             for table in tables:
-                below = f"{table.location().rstrip('/')}/"
-                files = {file for file in own if file.startswith(below) and ".." not in file}
-                for file in sorted(files - _referenced(table)) if files else ():
+                for file in _unreferenced(table, outdated):
                     with suppress(FileNotFoundError):  # as after a kill
                         table.io.delete(file)
                     gone.add(file)
@@ -138,15 +128,38 @@ def expire(lake: LakeTables, until: Ns) -> int:
     return len(gone)
 
 
+def _drop_versions(table: IcebergTable, until: Ns) -> None:
+    """Drops the versions of up to a time, but those that a branch or a tag names."""
+    named = {ref.snapshot_id for ref in table.metadata.refs.values()}
+    old = [
+        version.snapshot_id
+        for version in table.metadata.snapshots
+        if version.snapshot_id not in named and version.timestamp_ms * NS_PER_MS <= until
+    ]
+    if old:
+        table.maintenance.expire_snapshots().by_ids(old).commit()
+        table.refresh()
+
+
+def _unreferenced(table: IcebergTable, files: Sequence[str]) -> Sequence[str]:
+    """Returns those of some files that lie below a table's location, and that it does not need."""
+    location = f"{table.location().rstrip('/')}/"
+    below = {file for file in files if file.startswith(location) and ".." not in file}
+    return sorted(below - _referenced(table)) if below else ()
+
+
 def _referenced(table: IcebergTable) -> set[str]:
     """Returns the files that some version, branch or tag of a table refers to."""
     metadata, io = table.metadata, table.io
-    found = {table.metadata_location, *(each.statistics_path for each in metadata.statistics)}
-    manifests = [one for version in metadata.snapshots for one in version.manifests(io)]
-    for manifest in {one.manifest_path: one for one in manifests}.values():
+    referenced = {
+        table.metadata_location,
+        *(statistics.statistics_path for statistics in metadata.statistics),
+    }
+    manifests = [manifest for version in metadata.snapshots for manifest in version.manifests(io)]
+    for manifest in {manifest.manifest_path: manifest for manifest in manifests}.values():
         entries = manifest.fetch_manifest_entry(io, discard_deleted=True)
-        found |= {manifest.manifest_path, *(entry.data_file.file_path for entry in entries)}
-    return found | {version.manifest_list for version in metadata.snapshots}
+        referenced |= {manifest.manifest_path, *(entry.data_file.file_path for entry in entries)}
+    return referenced | {version.manifest_list for version in metadata.snapshots}
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +198,7 @@ class Tombstone:
             return bag_id in self.bags
         if not self.window.overlaps(bag.start, bag.end):
             return False
-        topics = {known.topic for known in bag.summary.topics}
+        topics = {topic.topic for topic in bag.summary.topics}
         wanted = topics.intersection(self.topics) if self.topics else topics
         return any(True for _ in reader.records(bag.path, tuple(wanted), self.window))
 
@@ -206,20 +219,19 @@ def append_tombstone(state_dir: Path, tombstone: Tombstone, *, done: bool) -> No
         raise LakeError(f"{path} cannot be written: {error.strerror}") from error
 
 
-def read_tombstones(state_dir: Path) -> dict[Tombstone, bool]:
-    """Returns the tombstones, and whether each is done.
+def read_tombstones(state_dir: Path) -> list[Tombstone]:
+    """Returns the tombstones, each once; one is done if any line on it says so.
 
     Raises:
         LakeError: they cannot be read, or a line is damaged: nothing may be shipped then.
     """
-    found: dict[Tombstone, bool] = {}
     try:
-        for _, tombstone in TOMBSTONES.all_rows(state_dir):
-            found[tombstone] = tombstone.done or found.get(tombstone, False)
+        tombstones = [tombstone for _, tombstone in TOMBSTONES.all_rows(state_dir)]
     except (OSError, ValueError) as error:
         why = "nothing is shipped until it is repaired, since what was forgotten could come back"
         raise LakeError(f"{state_dir / TOMBSTONES_FILE}: {error}; {why}") from error
-    return found
+    done = {tombstone for tombstone in tombstones if tombstone.done}
+    return [replace(tombstone, done=tombstone in done) for tombstone in dict.fromkeys(tombstones)]
 
 
 class Forgotten(NamedTuple):
@@ -238,36 +250,43 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     """
     # `channels` has a row of each bag of which anything is in the lake: it is the first to be
     # committed, and the last from which is deleted.
-    bags = _bags(lake, "channels", _of(tombstone, "first_ns", "last_ns"))
+    bags = _bags_where(lake, "channels", _rows_of_tombstone(tombstone, "first_ns", "last_ns"))
     # In `bags` alone: of which no message counts, and what a killed process was about to replace.
-    listed = _bags(lake, "bags", _of(replace(tombstone, topics=()), "start_ns", "end_ns"))
+    listed = _bags_where(
+        lake, "bags", _rows_of_tombstone(replace(tombstone, topics=()), "start_ns", "end_ns")
+    )
     if tombstone.topics and listed:
         ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
-        listed -= _bags(lake, "channels", ids)
+        listed -= _bags_where(lake, "channels", ids)
     bags |= listed
     for name in reversed([*TABLES]):
         lake.delete(name, of_bags(bags))
     # The versions before have what was deleted, so they go whatever their age, and the clock says.
     files = expire(lake, MAX_NS)
-    kept_by = tuple(
-        f"{name}: {ref}"
-        for name in TABLES
-        for metadata in [lake.current(name).metadata]
-        for ref, version in metadata.refs.items()
-        if version.snapshot_id != metadata.current_snapshot_id
-    )
+    kept_by = (*_refs_to_old_versions(lake),)
     append_tombstone(lake.location.state_dir, tombstone, done=True)
     log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
     return Forgotten(len(bags), files, kept_by)
 
 
-def _bags(lake: LakeTables, name: str, condition: BooleanExpression) -> set[tuple[str, date, str]]:
+def _refs_to_old_versions(lake: LakeTables) -> Iterator[str]:
+    """Yields the branches and tags that name another version than the newest: `bags: NAME`."""
+    for name in TABLES:
+        metadata = lake.current(name).metadata
+        for ref, version in metadata.refs.items():
+            if version.snapshot_id != metadata.current_snapshot_id:
+                yield f"{name}: {ref}"
+
+
+def _bags_where(
+    lake: LakeTables, name: str, condition: BooleanExpression
+) -> set[tuple[str, date, str]]:
     """Returns robot, day and id of the bags that have some rows."""
     rows = lake.rows(name, condition, ("robot", "day", "bag_id")).to_pylist()
     return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
 
 
-def _of(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
+def _rows_of_tombstone(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
     """Returns the condition on rows of what is forgotten; the columns have their span."""
     if tombstone.bags:
         return of_ids(tombstone.robot, tombstone.bags)

@@ -149,13 +149,13 @@ class LakeLocation:
             if self._is_file:
                 self.state_dir.mkdir(parents=True, exist_ok=True)
             file = self.state_dir.absolute() / CATALOGUE_FILE
-            own = {
+            required = {
                 "py-io-impl": f"{RecordingFileIO.__module__}.{RecordingFileIO.__name__}",
                 RECORD: os.fspath(file.parent),
                 "warehouse": self.warehouse,
                 "uri": f"sqlite:///{file}" if self._is_file else self.uri or "",
             }
-            catalog = kind("lake", **{**self.properties, **self.secrets, **own})
+            catalog = kind("lake", **{**self.properties, **self.secrets, **required})
         with closing(catalog):
             yield catalog
 
@@ -241,12 +241,12 @@ def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
     Raises:
         ValueError: the warehouse is on no file system, and there is no state directory.
     """
-    scheme, found, rest = warehouse.partition("://")
-    if found and scheme != "file":
+    scheme, colon, rest = warehouse.partition("://")
+    if colon and scheme != "file":
         if state_dir is None:
             raise ValueError(f"a warehouse in {scheme} needs lake.state_dir, a local folder")
         return warehouse, state_dir
-    folder = Path(rest if found else warehouse).expanduser().absolute()
+    folder = Path(rest if colon else warehouse).expanduser().absolute()
     return folder.as_uri(), folder / ".ros2-memory" if state_dir is None else state_dir
 
 
@@ -354,24 +354,24 @@ class WarehouseLease:
                 self._write(self._clock.now(), 0)
 
     def _require_mine(self, now: Ns) -> None:
-        known: object = None
+        lease: object = None
         file = self._store.new_input(self._file)
         if file.exists():
             with file.open() as stream, suppress(ValueError):
-                known = json.loads(stream.read(_MAX_TEXT))
-        if not isinstance(known, dict) or known.get("id") == self._id:
+                lease = json.loads(stream.read(_MAX_TEXT))
+        if not isinstance(lease, dict) or lease.get("id") == self._id:
             return
-        until = known.get("until")
+        until = lease.get("until")
         if isinstance(until, int) and until > now:
-            who = f"process {known.get('pid')} on {known.get('host')} writes into this lake"
+            who = f"process {lease.get('pid')} on {lease.get('host')} writes into this lake"
             why = f"another lake.state_dir, until {iso_local(until)}"
             raise LakeError(f"{who}, with {why}: a lake has one writer, and one state_dir")
 
     def _write(self, now: Ns, until: Ns) -> None:
         self._require_mine(now)
-        known = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
+        lease = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
         with closing(self._store.new_output(self._file).create(overwrite=True)) as stream:
-            stream.write(json.dumps(known).encode())
+            stream.write(json.dumps(lease).encode())
 
 
 def _id_in(state_dir: Path) -> str:

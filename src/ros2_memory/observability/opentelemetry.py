@@ -54,15 +54,15 @@ class Traces(Observer):
             span.set_attributes(attributes)
             return
         end = time.time_ns()
-        own = self._tracer.start_span(
+        span = self._tracer.start_span(
             f"tools/call {call.tool}",
             kind=SpanKind.SERVER,
             attributes=attributes,
             start_time=end - ns_from_unix(call.duration_s),
         )
         if call.code not in _SUCCESSFUL:
-            own.set_status(Status(StatusCode.ERROR))
-        own.end(end)
+            span.set_status(Status(StatusCode.ERROR))
+        span.end(end)
 
     def stop(self) -> None:
         """Exports the remaining spans, for at most a second."""

@@ -392,9 +392,9 @@ class Status(AnswerWithNotes):
         yield from self.problems
         topics = {silence.topic for silence in self.silences}
         if len(self.silences) == 1:
-            one = self.silences[0]
-            still = ", and still is" if one.goes_on else ""
-            yield f"{one.topic} was silent for {seconds(one.length):.0f} s{still}"
+            [silence] = self.silences
+            still = ", and still is" if silence.goes_on else ""
+            yield f"{silence.topic} was silent for {seconds(silence.length):.0f} s{still}"
         elif topics:
             named = next(iter(topics)) if len(topics) == 1 else counted(len(topics), "topic")
             yield f"{named} fell silent {len(self.silences)} times (see silences)"

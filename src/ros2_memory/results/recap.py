@@ -117,15 +117,15 @@ class Episode:
         return self.spell.until
 
 
-def _first(answer: Changes) -> Ns | None:
+def _first_change(answer: Changes) -> Ns | None:
     return answer.changes[0].first if answer.changes else None
 
 
-def _until(answer: Changes) -> Ns | None:
+def _last_until(answer: Changes) -> Ns | None:
     return answer.changes[-1].until if answer.changes else None
 
 
-@result("topic", "type", "total", OBJECTS("changes"), span=(_first, _until))
+@result("topic", "type", "total", OBJECTS("changes"), span=(_first_change, _last_until))
 class Changes(AnswerWithNotes):
     """The values that a topic held in a window, in order: the first of `total` of them."""
 

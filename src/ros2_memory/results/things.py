@@ -267,14 +267,14 @@ class Pair(NamedTuple):
     other: float | None
 
 
-def _pair(places: int) -> Unit:
+def _unit_of_pairs(places: int) -> Unit:
     """Returns the unit of pairs whose numbers are rounded to so many places."""
     return an_object(keys(digits(places)("this"), digits(places)("with", "other")))
 
 
 def _named_pairs(places: int) -> Unit:
     """Returns the unit of pairs by name."""
-    return by_name(_pair(places), _LONGEST_NAME)
+    return by_name(_unit_of_pairs(places), _LONGEST_NAME)
 
 
 def _spot(name: str, time: str) -> Unit:
@@ -368,8 +368,14 @@ class ComparedThings:
     @property
     def is_any(self) -> bool:
         """Whether anything differs."""
-        found = (self.moved, self.appeared, self.missed, self.not_looked_at, self.not_comparable)
-        return any((*found, self.movers))
+        differences = (
+            self.moved,
+            self.appeared,
+            self.missed,
+            self.not_looked_at,
+            self.not_comparable,
+        )
+        return any((*differences, self.movers))
 
 
 class StandstillPlace(NamedTuple):
@@ -397,7 +403,7 @@ _STANDSTILLS: Final = objects(
     keys(
         _XY.spread("place"),
         INSIDE("inside"),
-        _pair(0).spread("seconds"),
+        _unit_of_pairs(0).spread("seconds"),
         TIME("this_since", lambda stood: stood.since[0]).if_known,
         TIME("with_since", lambda stood: stood.since[1]).if_known,
         LOCAL_OF_DAYS("local", lambda stood: next(filter(None, stood.since), None)),
@@ -420,8 +426,8 @@ def compared(most: int) -> Keys:
     A part in which nothing differs is left out.
     """
     return keys(
-        _pair(1)("duration_s", "lengths"),
-        _pair(1)("recorded_s", "recorded").in_short,
+        _unit_of_pairs(1)("duration_s", "lengths"),
+        _unit_of_pairs(1)("recorded_s", "recorded").in_short,
         PAIRS.spread("frames"),
         an_object(_differences(most))("things"),
         PLAIN("things_unchanged", "things.same").in_short,
@@ -470,13 +476,13 @@ class Comparison(AnswerWithNotes):
     @property
     def farthest_apart(self) -> list[tuple[str, FarFromOther]]:
         """The farthest points, with the window that they are of."""
-        found = zip(("this", "with"), self.farthest, strict=True)
-        return [(name, point) for name, point in found if point is not None]
+        points = zip(("this", "with"), self.farthest, strict=True)
+        return [(name, point) for name, point in points if point is not None]
 
     @property
     def frames(self) -> dict[str, JsonValue]:
         """The frames that places are in, where there are any; that of the path if it is another."""
         frames: list[str | None] = [self.frame_id or None] * self.things.is_any
         frames += [self.way_frame_id] * bool(self.stood or self.farthest_apart)
-        found = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
-        return {key: frame and named(frame) for key, frame in found}
+        by_key = zip(("frame_id", "way_frame_id"), dict.fromkeys(frames), strict=False)
+        return {key: frame and named(frame) for key, frame in by_key}

@@ -173,7 +173,7 @@ class TopicRange(AnswerWithNotes):
     @property
     def extremes_by_field(self) -> list[tuple[str, Extremes]]:
         """The extremes, with the name of their field."""
-        return [(found.field, found) for found in self.extremes]
+        return [(extremes.field, extremes) for extremes in self.extremes]
 
     def _locals(self) -> list[str | None]:
         """Returns the local time of each sample, where they span so much that it is shown."""
@@ -384,7 +384,7 @@ class Sightings(AnswerWithNotes):
     @property
     def oldest(self) -> Ns | None:
         """The oldest time of the reply."""
-        firsts = [*(one.first for one in self.sightings), *(one.first for one in self.episodes)]
+        firsts = [row.first for rows in (self.sightings, self.episodes) for row in rows]
         return min(firsts, default=self.start)
 
     @property
@@ -427,7 +427,7 @@ class Usual:
 
 @result(
     PLAIN("topic"),
-    PLAIN("columns", "names"),
+    PLAIN("columns", "header"),
     PLAIN("rows", "table"),
     PLAIN("all", "sums"),
     TIME("start"),
@@ -466,8 +466,8 @@ class Bins(AnswerWithNotes):
         return self.about[0] if len(self.about) == 1 else [*self.about]
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """The columns of the table; a time has two, the second in Unix seconds."""
+    def header(self) -> tuple[str, ...]:
+        """The names of the table's columns; a time has two, the second in Unix seconds."""
         unix = (f"{name}_unix" for name, kind in self.columns if kind == "time")
         return (self.by, *(name for name, _ in self.columns), *unix)
 

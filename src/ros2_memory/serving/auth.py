@@ -116,7 +116,8 @@ class TokenGate:
     ) -> None:
         self._app = app
         self._digests: list[tuple[bytes, frozenset[str] | None]] = [
-            (_digest(each.encode("ascii")), robots) for each, robots in (limited or {}).items()
+            (_digest(limited_token.encode("ascii")), robots)
+            for limited_token, robots in (limited or {}).items()
         ]
         if token is not None:
             self._digests.append((_digest(token.encode("ascii")), None))
@@ -257,10 +258,10 @@ def _is_visit(scope: Scope, headers: Headers) -> bool:
 
 def _host_name(host: str) -> str:
     """Returns the name or address in a Host header, in lower case; empty if that is malformed."""
-    found = _HOST.fullmatch(host)
-    if found is None:
+    match = _HOST.fullmatch(host)
+    if match is None:
         return ""
-    name, address = found[1], found[2]
+    name, address = match[1], match[2]
     return name.lower() if name else address.lower() if _is_address(address) else ""
 
 

@@ -81,11 +81,11 @@ class Backfill:
     async def in_thread(self, work: Callable[[], T]) -> T:
         """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
 
-        def done() -> T:
+        def work_in_turn() -> T:
             with self._memory.large.during():
                 return work()
 
-        return await anyio.to_thread.run_sync(done, abandon_on_cancel=True)
+        return await anyio.to_thread.run_sync(work_in_turn, abandon_on_cancel=True)
 
     def progress(self) -> Progress:
         """Returns how much is stored."""
@@ -106,18 +106,24 @@ class Backfill:
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags of which columns are to be stored, the newest first."""
-        found = self._to_fill()
-        return [] if found is None else found[0].waiting(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return []
+        filling, timeline = to_fill
+        return filling.waiting(timeline)
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        found = self._to_fill()
-        return [] if found is None else found[0].batches(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return []
+        filling, timeline = to_fill
+        return filling.batches(timeline)
 
     def store(self, batch: Batch) -> int:
-        """Stores the columns of some bags; as `Filling.fill`."""
-        found = self._to_fill()
-        return 0 if found is None else found[0].fill(batch, found[1])
+        """Stores the columns of a batch of bags; returns how many bags, as `Filling.fill`."""
+        if (to_fill := self._to_fill()) is None:
+            return 0
+        filling, timeline = to_fill
+        return filling.fill(batch, timeline)
 
     def follow(self) -> bool:
         """Makes what follows from whole parts, and keeps the store within what it may take.
@@ -128,10 +134,9 @@ class Backfill:
         Returns:
             Whether there is more of that.
         """
-        found = self._to_fill()
-        if found is None:
+        if (to_fill := self._to_fill()) is None:
             return False
-        filling, timeline = found
+        filling, timeline = to_fill
         columns = self._memory.columns
         coverage = columns.coverage(timeline)
         waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
@@ -151,8 +156,9 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        if (found := self._to_fill()) is not None:
-            found[0].store.look_after(thorough=thorough)
+        if (to_fill := self._to_fill()) is not None:
+            filling, _ = to_fill
+            filling.store.look_after(thorough=thorough)
 
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
@@ -168,9 +174,11 @@ class Backfill:
 
         Does nothing where there are no bags, for the same reason.
         """
-        found = self._to_fill()
-        if found is not None and found[1].bags:
-            found[0].prune(found[1])
+        if (to_fill := self._to_fill()) is None:
+            return
+        filling, timeline = to_fill
+        if timeline.bags:
+            filling.prune(timeline)
             self._memory.store_listings(self._memory.index.snapshot())
 
 
@@ -182,15 +190,7 @@ def make_fragments(
     It is joined by stretches of the clock, but for those in which bags or slices are `waiting`: log
     times (ns) where they begin.
     """
-    around = [window.widened(PART_NS) for window in windows]
-    ends = {(one.start // STRETCH_NS, one.stop // STRETCH_NS) for one in around}
-    touched = {number for first, last in ends for number in range(first, last + 1)}
-    touched -= {start // STRETCH_NS for start in waiting}
-    # What is joined of a stretch needs all parts of it, and those that reach into it.
-    stretches = [
-        TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
-        for number in sorted(touched, reverse=True)
-    ]
+    stretches = _stretches_around(windows, waiting)
     # The newest `STRETCH_NS` of a window, and so on: few fragments wait to be written.
     pieces = [
         TimeWindow(max(window.start, stop - STRETCH_NS), stop)
@@ -200,19 +200,7 @@ def make_fragments(
     unwritten: Ns = 0
     for nth, window in enumerate([*pieces, *stretches]):
         try:
-            view = View(memory, Call(stored=True))
-            make_statics(view, window)
-            made = [
-                drive_made(view, window),
-                make_tracks(view, window),
-                events_made(view, window, topics_with_changes(view)),
-            ]
-            if nth < len(pieces):
-                made.append(Watching(view).made(window))
-            # Each goes back in time as far as the others: what they read is still remembered.
-            deque(merge(*made, reverse=True), maxlen=0)
-            if nth < len(pieces):
-                memory.columns.make_outlines(view.timeline, window)
+            _make_fragments_in(memory, window, is_joined=nth >= len(pieces))
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.
@@ -222,6 +210,42 @@ def make_fragments(
             unwritten = 0
         memory.large.release()
     memory.columns.write_fragments()
+
+
+def _stretches_around(windows: Sequence[TimeWindow], waiting: Sequence[Ns]) -> Sequence[TimeWindow]:
+    """Returns the stretches that windows touch and in which nothing is waiting, the newest first.
+
+    What is joined of a stretch needs all parts of it, and those that reach into it.
+    """
+    around = [window.widened(PART_NS) for window in windows]
+    ends = {(window.start // STRETCH_NS, window.stop // STRETCH_NS) for window in around}
+    touched = {number for first, last in ends for number in range(first, last + 1)}
+    touched -= {start // STRETCH_NS for start in waiting}
+    return [
+        TimeWindow(number * STRETCH_NS, (number + 1) * STRETCH_NS).widened(PART_NS)
+        for number in sorted(touched, reverse=True)
+    ]
+
+
+def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -> None:
+    """Makes the fragments of a window; sights and outlines where these are not joined of others.
+
+    Raises:
+        EpisodicError: they cannot be made.
+    """
+    view = View(memory, Call(stored=True))
+    make_statics(view, window)
+    fragments = [
+        drive_made(view, window),
+        make_tracks(view, window),
+        events_made(view, window, topics_with_changes(view)),
+    ]
+    if not is_joined:
+        fragments.append(Watching(view).made(window))
+    # Each goes back in time as far as the others: what they read is still remembered.
+    deque(merge(*fragments, reverse=True), maxlen=0)
+    if not is_joined:
+        memory.columns.make_outlines(view.timeline, window)
 
 
 async def keep_backfilled(
@@ -276,11 +300,11 @@ class Filler:
     async def fill(self) -> None:
         """Stores the closed bags that there are. Raises nothing but cancellation."""
         try:
-            await self._fill()
+            await self._fill_round()
         except Exception:
             log.exception("filling_failed")
 
-    async def _fill(self) -> None:
+    async def _fill_round(self) -> None:
         backfill = self._backfill
         due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
         in_thread = backfill.in_thread

@@ -124,8 +124,11 @@ class BoundedConnection(H11Protocol):
             self._refuse(503, "Service Unavailable", "Too many connections; close some.\n")
             return
         if len(unknown) > MAX_UNKNOWN:
-            held = Counter(each._address for each in unknown)
-            min(unknown, key=lambda each: (-held[each._address], each._made_s))._abort()
+            of_address = Counter(connection._address for connection in unknown)
+            min(
+                unknown,
+                key=lambda connection: (-of_address[connection._address], connection._made_s),
+            )._abort()
         self._watch()
 
     @property
@@ -134,9 +137,11 @@ class BoundedConnection(H11Protocol):
 
     def _unknown(self) -> list[BoundedConnection]:
         return [
-            each
-            for each in self.connections
-            if isinstance(each, BoundedConnection) and each.is_unknown and not each._is_refused
+            connection
+            for connection in self.connections
+            if isinstance(connection, BoundedConnection)
+            and connection.is_unknown
+            and not connection._is_refused
         ]
 
     def _log_refused(self, reason: str) -> None:

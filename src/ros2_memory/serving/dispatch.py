@@ -146,7 +146,7 @@ class Dispatcher:
         self.questions = QuestionLog(most_questions)
         self.memory = memory
         self._tools = {tool.name: tool for tool in tools}
-        self._readable = self._tools | {each.name: each for each in readable}
+        self._readable = self._tools | {tool.name: tool for tool in readable}
         self.readable = frozenset(self._readable)
         self._replies = replies
         self._call_timeout_s = call_timeout_s
@@ -311,11 +311,11 @@ class Dispatcher:
             def answer() -> Reply:
                 memory = self.memory if part is None else part()
                 try:
-                    found = question(memory, call)
+                    result = question(memory, call)
                 except GoneError:  # the store has changed since, and is looked at anew
-                    found = question(memory, call)
+                    result = question(memory, call)
                 return self._replies.answer(
-                    found,
+                    result,
                     from_active=call.used_active,
                     from_memory=call.used_thinned,
                     now=call.now,
@@ -392,9 +392,9 @@ class Dispatcher:
 def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     if name in tools:
         return tools[name]
-    for each in DECLARATIONS:
-        if name in {variant.name for variant in each.names}:
-            why = _WRITES if each.writes else "server.tools is spec"
+    for declaration in DECLARATIONS:
+        if name in {variant.name for variant in declaration.names}:
+            why = _WRITES if declaration.writes else "server.tools is spec"
             raise InvalidArgumentsError(f"{name} is not offered here: {why}")
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
@@ -440,5 +440,5 @@ def excess_in_arguments(given: Mapping[str, object]) -> str | None:
             if depth >= MAX_DEPTH:
                 return f"{name[:80]} is nested deeper than {MAX_DEPTH} levels"
             inner = value.values() if isinstance(value, dict) else value
-            pending.extend((each, depth + 1) for each in inner)
+            pending.extend((item, depth + 1) for item in inner)
     return None

@@ -49,7 +49,7 @@ class FairQueue:
     @property
     def waiting(self) -> int:
         """Returns how many queries wait for a thread."""
-        return sum(len(each) for each in self._waiting.values())
+        return sum(len(turns) for turns in self._waiting.values())
 
     @property
     def running(self) -> int:
@@ -105,7 +105,7 @@ class FairQueue:
         Raises:
             BusyError: that is the client that asks.
         """
-        most = max(self._waiting, key=lambda each: len(self._waiting[each]))
+        most = max(self._waiting, key=lambda waiting: len(self._waiting[waiting]))
         refusal = BusyError(
             f"{self._most_waiting} questions wait already; ask again when some are answered, and "
             "fewer at once"

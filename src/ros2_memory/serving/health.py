@@ -82,7 +82,7 @@ class Health:
         backfill: Backfill | None = None,
         timeout_s: float = TIMEOUT_S,
     ) -> None:
-        self._report = partial(_health, memory, version, backfill)
+        self._report = partial(_health_report, memory, version, backfill)
         self._version = version
         self._timeout_s = timeout_s
         self._queue = FairQueue("health", 1)
@@ -112,8 +112,8 @@ class FleetHealth:
 
     def stop(self) -> None:
         """Ends the threads when they are done."""
-        for each in self._robots.values():
-            each.stop()
+        for health in self._robots.values():
+            health.stop()
 
     async def __call__(self) -> JsonObject:
         """Returns the report of each robot; `degraded` where one of them is.
@@ -121,12 +121,12 @@ class FleetHealth:
         A robot that does not answer in time delays the report by `TIMEOUT_S`, whatever their
         number.
         """
-        found = await asyncio.gather(*(health() for health in self._robots.values()))
-        reports = dict(zip(self._robots, found, strict=True))
+        states = await asyncio.gather(*(health() for health in self._robots.values()))
+        reports = dict(zip(self._robots, states, strict=True))
         problems = []
         for name, report in reports.items():
             if isinstance(of_robot := report.get("problems"), list):
-                problems += [f"{name}: {each}" for each in of_robot]
+                problems += [f"{name}: {problem}" for problem in of_robot]
         robots: JsonObject = {
             name: {key: value for key, value in report.items() if key not in {"version", "pid"}}
             for name, report in reports.items()
@@ -134,7 +134,7 @@ class FleetHealth:
         return _status(self._version, problems, {"robots": robots})
 
 
-def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
+def _health_report(memory: Memory, version: str, backfill: Backfill | None) -> JsonObject:
     now = memory.clock.now()
     snapshot = memory.index.snapshot()
     heartbeat = memory.heartbeat()
@@ -157,12 +157,12 @@ def _health(memory: Memory, version: str, backfill: Backfill | None) -> JsonObje
     foreign = memory.foreign(snapshot)
     if foreign is not None:
         shown["foreign_bytes"] = foreign.total_bytes
-    problems = [_short(each) for each in problems_of(snapshot, heartbeat, now)]
+    problems = [_short(problem) for problem in problems_of(snapshot, heartbeat, now)]
     for fault, files in faulty.items():
         if files:
             shown[f"{fault.removesuffix('s')}_files"] = [
-                {"file": _short(short_name(each.path)), "reason": _short(each.reason)}
-                for each in files[-NAMED:]
+                {"file": _short(short_name(file.path)), "reason": _short(file.reason)}
+                for file in files[-NAMED:]
             ]
     if backfill is not None:
         shown |= _stored(backfill)
@@ -218,9 +218,11 @@ def _recorder(heartbeat: Heartbeat, now: Ns) -> JsonObject:
         "waiting_for": heartbeat.waiting_for and _short(heartbeat.waiting_for),
         "age_held": heartbeat.age_held and _short(heartbeat.age_held),
         "unshipped": heartbeat.unshipped and _short(heartbeat.unshipped),
-        "failing_rules": [_short(each) for each in heartbeat.failing_rules],
-        "required_missing": [_short(each) for each in heartbeat.required_missing[:_MAX_MISSING]],
-        "degraded": [_short(each) for each in unrecorded(heartbeat)],
+        "failing_rules": [_short(rule) for rule in heartbeat.failing_rules],
+        "required_missing": [
+            _short(missing) for missing in heartbeat.required_missing[:_MAX_MISSING]
+        ],
+        "degraded": [_short(reason) for reason in unrecorded(heartbeat)],
     }
     for kind, topics, most in (
         ("silent", heartbeat.silent, _MAX_TOPICS),

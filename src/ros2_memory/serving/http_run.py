@@ -66,10 +66,10 @@ class _Listener(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         await super().startup(sockets)
-        for each in sockets or []:
+        for listener in sockets or []:
             # More connections may wait than are accepted at once.
-            each.listen(BACKLOG)
-            host, port = each.getsockname()[:2]
+            listener.listen(BACKLOG)
+            host, port = listener.getsockname()[:2]
             shown = f"[{host}]" if ":" in host else host
             site = f"http://{shown}:{port}"
             log.info(

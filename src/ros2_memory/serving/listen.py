@@ -44,10 +44,12 @@ def resolved(host: str, port: int) -> Address:
         CannotListenError: it resolves to none.
     """
     try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        candidates = socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
     except (OSError, UnicodeError) as error:
         raise CannotListenError(_why_not(host, port, error)) from error
-    family, *_, address = min(found, key=lambda each: each[0] is not socket.AF_INET)
+    family, *_, address = min(candidates, key=lambda candidate: candidate[0] is not socket.AF_INET)
     return Address(host, family, str(address[0]), port)
 
 

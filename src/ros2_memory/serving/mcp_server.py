@@ -183,7 +183,9 @@ class EpisodicServer(MCPServer[object]):
         has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
         offered = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
         readable = dispatcher.readable
-        self._resources = [each for each in offered if TOOLS_OF_RESOURCES[each.uri] in readable]
+        self._resources = [
+            resource for resource in offered if TOOLS_OF_RESOURCES[resource.uri] in readable
+        ]
         self._templates = [
             template
             for template, tool, *_ in _TEMPLATES.values()
@@ -258,12 +260,12 @@ class EpisodicServer(MCPServer[object]):
         for prefix, (template, tool, argument, _) in _TEMPLATES.items():
             if template in self._templates and uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
-        offered = [each.uri for each in self._resources]
+        offered = [resource.uri for resource in self._resources]
         if uri in offered:
             return TOOLS_OF_RESOURCES[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-        known = ", ".join([*offered, *(each.uri_template for each in self._templates)])
-        raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {known}")
+        uris = ", ".join([*offered, *(template.uri_template for template in self._templates)])
+        raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {uris}")
 
     async def _complete(
         self,
@@ -272,12 +274,18 @@ class EpisodicServer(MCPServer[object]):
         _context: CompletionContext | None,
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
-        of = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        known = (row for row in _TEMPLATES.values() if row[0] in self._templates)
-        asked = next((row for row in known if row[0].uri_template == of), None)
-        if asked is None:
+        uri = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
+        completed = next(
+            (
+                (key, tool)
+                for template, _, key, tool in _TEMPLATES.values()
+                if template in self._templates and template.uri_template == uri
+            ),
+            None,
+        )
+        if completed is None:
             return None
-        _, _, key, tool = asked
+        key, tool = completed
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
         rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
         typed = argument.value.casefold()
@@ -333,7 +341,7 @@ class Storing:
         return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s left"
 
 
-def _request(context: object) -> Request | None:
+def _http_request(context: object) -> Request | None:
     """Returns the HTTP request of a call; None over stdio."""
     request = context.request_context.request if isinstance(context, Context) else None
     return request if isinstance(request, Request) else None
@@ -345,7 +353,7 @@ def _client(context: object) -> Hashable:
     None over stdio, which has one client. It serves to give out turns fairly, and nothing else: a
     client may claim to be another.
     """
-    request = _request(context)
+    request = _http_request(context)
     if request is None:
         return None
     # The body was parsed. Starlette would keep up to 1 MiB of it for as long as the call waits.
@@ -360,13 +368,13 @@ def _client(context: object) -> Hashable:
 
 def _robots(context: object) -> frozenset[str] | None:
     """Returns the robots that the token of a request is for; None where it is for all."""
-    request = _request(context)
+    request = _http_request(context)
     return None if request is None else robots_of(request.scope)
 
 
 def _is_page(context: object) -> bool:
     """Returns whether the server's own page asks: only browsers name the site of a request."""
-    request = _request(context)
+    request = _http_request(context)
     return request is not None and request.headers.get("sec-fetch-site") == "same-origin"
 
 

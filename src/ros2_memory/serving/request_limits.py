@@ -43,14 +43,14 @@ class RequestLimits:
         # h11 has refused a length that is no number. Uvicorn discards the rest of a body that is
         # too large, since a client may read the refusal only afterwards.
         is_small = int(Headers(scope=scope).get("content-length", "0")) <= MAX_BODY_BYTES
-        body, more = bytearray(), is_small
-        while more:
+        body, has_more = bytearray(), is_small
+        while has_more:
             message = await receive()
             if message["type"] == "http.disconnect":
                 return
             body += message.get("body", b"")
             is_small = len(body) <= MAX_BODY_BYTES
-            more = is_small and message.get("more_body", False)
+            has_more = is_small and message.get("more_body", False)
         if is_small:
             await self._answer(scope, bytes(body), receive, send)
         else:

@@ -62,8 +62,8 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     `recording.exclude_when` cannot be evaluated: nothing is served then of what is recorded, or it
     is served against the rule. Other topics that are offered and not recorded are in `degraded`.
     """
-    found = report.get("recorder")
-    recorder = found if isinstance(found, dict) else {}
+    shown_recorder = report.get("recorder")
+    recorder = shown_recorder if isinstance(shown_recorder, dict) else {}
     failing = recorder.get("failing_rules")
     required = recorder.get("required_missing")
     recording = (
@@ -124,8 +124,8 @@ def web_app(
         return JSONResponse(report)
 
     async def show_recording(request: Request) -> JSONResponse:
-        known = not needs_token or request.scope.get(AUTHENTICATED, False)
-        return _recording(await health(), all_of_it=known)
+        is_known = not needs_token or request.scope.get(AUTHENTICATED, False)
+        return _recording(await health(), all_of_it=is_known)
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:

@@ -157,12 +157,12 @@ def _as_region(value: object) -> object:
 def _as_while(value: object) -> object:
     """Returns the conditions on other topics, which planners also send as JSON text."""
     parsed = _parse_json(_check_text(value, LONGEST_VALUE)) if isinstance(value, str) else value
-    every = parsed if isinstance(parsed, list) else [parsed]
-    if not every:
+    conditions = parsed if isinstance(parsed, list) else [parsed]
+    if not conditions:
         raise ValueError("is an empty list: leave it out, or give a condition")
-    if len(every) > MOST_CONDITIONS:
-        raise ValueError(f"has {len(every)} conditions, more than {MOST_CONDITIONS}")
-    return tuple(map(_while_condition, every))
+    if len(conditions) > MOST_CONDITIONS:
+        raise ValueError(f"has {len(conditions)} conditions, more than {MOST_CONDITIONS}")
+    return tuple(map(_while_condition, conditions))
 
 
 def _while_condition(parsed: object) -> WhileCondition:
@@ -428,8 +428,10 @@ class At(TimeArgument):
 
     def chosen(self) -> AtTime:
         """Returns the moment, or those."""
-        each = [AtTime(at_s, rest_s=rest_s) for at_s, rest_s in self.several]
-        return AtTime(self.one[0], rest_s=self.one[1]) if self.one else AtTime(each=tuple(each))
+        if self.one:
+            at_s, rest_s = self.one
+            return AtTime(at_s, rest_s=rest_s)
+        return AtTime(each=tuple(AtTime(at_s, rest_s=rest_s) for at_s, rest_s in self.several))
 
 
 class Ago(TimeArgument):

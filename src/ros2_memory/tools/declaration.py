@@ -89,7 +89,11 @@ class Signature:
     def example(self) -> JsonObject:
         """Returns a call with the required arguments alone."""
         needed = {*self._required, *self._either[:1]}
-        return {name: _example(each) for name, each in self._properties.items() if name in needed}
+        return {
+            name: _example_value(schema)
+            for name, schema in self._properties.items()
+            if name in needed
+        }
 
     def json_schema(self) -> JsonObject:
         """Returns the schema that `tools/list` shows: flat, without empty defaults.
@@ -143,7 +147,7 @@ class Signature:
 
     def _unknown(self, given: Mapping[str, object]) -> Iterator[str]:
         names = ", ".join(self._properties)
-        known = f"the arguments are: {names}" if names else "the tool takes none"
+        hint_of_all = f"the arguments are: {names}" if names else "the tool takes none"
         unknown = (name for name in given if name not in self._properties)
         lacks_hint = False
         for name in islice(unknown, _MAX_UNKNOWN_NAMED):
@@ -152,7 +156,7 @@ class Signature:
             yield f"unknown argument {abbreviate(name)}{hint}"
             lacks_hint = lacks_hint or not near
         if lacks_hint:
-            yield known
+            yield hint_of_all
         if more := sum(1 for _ in unknown):
             yield f"and {more} more unknown arguments"
 
@@ -187,16 +191,17 @@ class Signature:
 def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
     """Returns the JSON schema of each argument; an optional one has a default and no null."""
     schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
-    return {name: _flat(each) for name, each in schema.items()}
+    return {name: _without_null(described) for name, described in schema.items()}
 
 
-def _flat(schema: JsonObject) -> JsonObject:
+def _without_null(schema: JsonObject) -> JsonObject:
+    """Returns the schema of an argument without its title, and without null as an alternative."""
     kinds = schema.get("anyOf")
     kept = {key: item for key, item in schema.items() if key != "title"}
     if isinstance(kinds, list) and {"type": "null"} in kinds:
         del kept["anyOf"]
-        some = next(kind for kind in kinds if kind != {"type": "null"})
-        return {**(some if isinstance(some, dict) else {}), **kept}
+        kind = next(kind for kind in kinds if kind != {"type": "null"})
+        return {**kind, **kept} if isinstance(kind, dict) else kept
     return kept
 
 
@@ -237,7 +242,7 @@ def _expected(schema: JsonObject) -> str:
     text = f"{what} of {' and '.join(bounds)}" if bounds else what
     if "description" in schema:
         text += f" ({str(schema['description']).rstrip('.')})"
-    return f"{text}, e.g. {to_json_text(_example(schema))}" if "examples" in schema else text
+    return f"{text}, e.g. {to_json_text(_example_value(schema))}" if "examples" in schema else text
 
 
 def _kind(schema: JsonObject) -> str:
@@ -257,7 +262,7 @@ def _kind(schema: JsonObject) -> str:
     return _KINDS[str(kinds)]
 
 
-def _example(schema: JsonObject) -> JsonValue:
+def _example_value(schema: JsonObject) -> JsonValue:
     examples = schema.get("examples")
     return examples[0] if isinstance(examples, list) and examples else schema.get("default")
 
@@ -302,7 +307,7 @@ class Tool:
         """Returns the JSON schema of each argument."""
         properties = self.schema["properties"]
         named = properties.items() if isinstance(properties, dict) else ()
-        return {name: each for name, each in named if isinstance(each, dict)}
+        return {name: schema for name, schema in named if isinstance(schema, dict)}
 
     @cached_property
     def _described(self) -> tuple[str, JsonObject]:
@@ -352,18 +357,18 @@ class ToolDeclaration:
 
         `plain_times`: see `Signature`.
         """
-        for each in self.names:
-            signature = Signature(self.arguments, each.when, plain_times=plain_times)
+        for tool_name in self.names:
+            signature = Signature(self.arguments, tool_name.when, plain_times=plain_times)
             yield Tool(
-                each.name,
-                each.title,
-                partial(self._describe, each, signature, defaults),
+                tool_name.name,
+                tool_name.title,
+                partial(self._compose_description, tool_name, signature, defaults),
                 self.blocking,
                 partial(self._question, signature),
                 self.writes,
             )
 
-    def _describe(
+    def _compose_description(
         self, name: ToolName, signature: Signature, defaults: Mapping[str, object]
     ) -> tuple[str, JsonObject]:
         """Returns what planners read: in full for the first name; the others refer to it."""
@@ -381,9 +386,9 @@ class ToolDeclaration:
         properties = schema["properties"]
         if name is not first and isinstance(properties, dict):
             shared = Signature(self.arguments).json_schema()["properties"]
-            for argument, each in properties.items():
-                if isinstance(each, dict) and isinstance(shared, dict) and argument in shared:
-                    each.pop("description", None)
+            for argument, described in properties.items():
+                if isinstance(described, dict) and isinstance(shared, dict) and argument in shared:
+                    described.pop("description", None)
         return text, schema
 
     def _question(self, signature: Signature, given: Mapping[str, object]) -> Question:

@@ -54,13 +54,13 @@ def instructions(settings: QuerySettings, *, additions: bool = True, several: bo
     tools beyond the specification are offered. `several`: whether it is the memory of several
     robots.
     """
-    found = _HAPPENED if additions else _SEEN
+    middle = _HAPPENED if additions else _SEEN
     if several:
-        found += _SEVERAL
+        middle += _SEVERAL
     elif additions:
-        found += _WHERE
+        middle += _WHERE
     newest = "each robot's newest message" if several else "the newest message"
-    return (_RULES + found + _REST).format(
+    return (_RULES + middle + _REST).format(
         or_text=" or ISO 8601, local without offset" if additions else "",
         timestamps="; timestamps takes several: {results: [...]}" if additions else "",
         newest=_newest(settings),

@@ -84,8 +84,8 @@ class Replies:
         if not isinstance(value, dict):
             return Reply(to_json_text(value))
         if notes:
-            known = value.get("notes")
-            value = {**value, "notes": [*(known if isinstance(known, list) else ()), *notes]}
+            stated = value.get("notes")
+            value = {**value, "notes": [*(stated if isinstance(stated, list) else ()), *notes]}
         if from_active:
             value = {**value, "from_active": True}
         if from_memory:

@@ -84,9 +84,9 @@ def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
         case results.Match(found=found) if found is not None:
             return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
         case results.ValueWhen(matched=matched, value=value) if matched is not None:
-            held = () if value is None else value.notes
+            value_notes = () if value is None else value.notes
             return replace(
-                answer, notes=tuple(dict.fromkeys((*matched.notes, *held, *answer.notes)))
+                answer, notes=tuple(dict.fromkeys((*matched.notes, *value_notes, *answer.notes)))
             )
         case results.TrajectorySummary():
             return replace(answer, notes=(*answer.notes, *_path_notes(answer.trajectory)))
@@ -96,23 +96,26 @@ def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
 
 def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
     """Returns one row for each moment; what all rows share is above them, and is not repeated."""
-    rows = [render(found, bag_dir) for found in answer.answers]
-    found = [row for row in rows if "error" not in row]
+    rows = [render(at_moment, bag_dir) for at_moment in answer.answers]
+    answered = [row for row in rows if "error" not in row]
     shared: JsonObject = {
-        key: found[0][key]
+        key: answered[0][key]
         for key in _OF_ALL
-        if found and key in found[0] and all(row.get(key) == found[0][key] for row in found)
+        if answered
+        and key in answered[0]
+        and all(row.get(key) == answered[0][key] for row in answered)
     }
-    often = Counter(note for one in answer.answers for note in dict.fromkeys(one.notes))
-    common = [note for note, times in often.items() if times > 1]
+    occurrences = Counter(
+        note for at_moment in answer.answers for note in dict.fromkeys(at_moment.notes)
+    )
+    common = [note for note, times in occurrences.items() if times > 1]
     explained: set[JsonValue] = set()
-    for row, one in zip(rows, answer.answers, strict=True):
+    for row, at_moment in zip(rows, answer.answers, strict=True):
         for key in shared.keys() & row.keys():
             del row[key]
-        own = [note for note in one.notes if note not in common]
         row.pop("notes", None)
-        if own:
-            row["notes"] = [*own]
+        if notes := [note for note in at_moment.notes if note not in common]:
+            row["notes"] = [*notes]
         if "error" in row:
             if row["reason"] in explained:
                 del row["detail"]
@@ -122,17 +125,17 @@ def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
 
 def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
     """Returns one row for each window, and what all have together."""
-    replies = [as_json(each.answer, bag_dir) for each in answer.windows]
-    bodies = [each for each in replies if isinstance(each, dict)]
-    known = [body for body in bodies if "error" not in body]
+    replies = [as_json(window.answer, bag_dir) for window in answer.windows]
+    bodies = [reply for reply in replies if isinstance(reply, dict)]
+    answered = [body for body in bodies if "error" not in body]
     shared: JsonObject = {
         key: value
-        for key, value in known[0].items()
+        for key, value in answered[0].items()
         if (isinstance(value, str) or key in _HEADERS)
-        and all(body.get(key) == value for body in known)
+        and all(body.get(key) == value for body in answered)
     }
-    often = Counter(note for body in bodies for note in _notes_in(body))
-    common = [note for note, times in often.items() if times > 1]
+    occurrences = Counter(note for body in bodies for note in _notes_in(body))
+    common = [note for note, times in occurrences.items() if times > 1]
     rows: list[JsonValue] = []
     for window, body in zip(answer.windows, bodies, strict=True):
         row: JsonObject = {
@@ -140,13 +143,14 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
             "start": unix_rounded_up(window.start),
             "end": unix_rounded_up(window.stop),
         }
-        row |= {key: each for key, each in body.items() if key not in {*shared, *_OF_WINDOW}}
+        row |= {key: value for key, value in body.items() if key not in {*shared, *_OF_WINDOW}}
         rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
     whole: JsonObject = {}
-    if any("at_least" in body for body in known):
-        known = [{"at_least": body.get("total"), **body, "total": None} for body in known]
+    if any("at_least" in body for body in answered):
+        answered = [{"at_least": body.get("total"), **body, "total": None} for body in answered]
     for key in _SUMMED:
-        numbers = [each for body in known if isinstance(each := body.get(key), int | float)]
+        values = [body.get(key) for body in answered]
+        numbers = [value for value in values if isinstance(value, int | float)]
         if numbers:
             whole[key] = round(sum(numbers), 3)
     total: JsonObject = {"all": whole} if whole else {}
@@ -186,7 +190,7 @@ def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
     def first(count: int) -> JsonObject:
         things = answer.things[:count]
         # A row of several at once is so many things.
-        listed = sum(one.at_once or 1 for one in things)
+        listed = sum(thing.at_once or 1 for thing in things)
         how_many = "all" if listed == answer.total else f"{listed} of {answer.total}"
         note = f"{how_many} things are listed, {_HOW}"
         few = replace(answer, things=things, notes=(note, *answer.notes))

@@ -17,7 +17,6 @@ from ros2_memory.counts.robot import count_path
 from ros2_memory.insights.at_each import at_each
 from ros2_memory.insights.episodes import topic_changes
 from ros2_memory.places.driven_inside import driven_inside
-from ros2_memory.tools import extra_tools
 from ros2_memory.tools.arguments import (
     Ago,
     At,
@@ -35,43 +34,14 @@ from ros2_memory.tools.arguments import (
     TransformArguments,
     ValueWhenArguments,
 )
-from ros2_memory.tools.declaration import Tool, ToolDeclaration, ToolName
+from ros2_memory.tools.declaration import ToolDeclaration, ToolName
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.core.model import JsonValue
-    from ros2_memory.history.context import Call, Memory, QuerySettings
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.view import TimeRange
-
-
-def readable_tools(settings: QuerySettings) -> tuple[Tool, ...]:
-    """Returns what is read as a resource, and is not a tool."""
-    return tuple(
-        tool
-        for each in extra_tools.READABLE
-        for tool in each.tools({"pose_topic": settings.pose_topic})
-    )
-
-
-def build_tools(
-    settings: QuerySettings, *, additions: bool = True, writing: bool = False
-) -> tuple[Tool, ...]:
-    """Returns the tools, in order. Their descriptions name this deployment's defaults.
-
-    `additions`: also those beyond the specification; `writing`: also those of them that write.
-    """
-    defaults = {
-        "pose_topic": settings.pose_topic,
-        "tolerance": f"{settings.time_tolerance_s:g}",
-        "map_frame": settings.map_frame or "no map",
-    }
-    return tuple(
-        tool
-        for declaration in (*_DECLARATIONS, *(extra_tools.DECLARATIONS if additions else ()))
-        if writing or not declaration.writes
-        for tool in declaration.tools(defaults, plain_times=not additions)
-    )
 
 
 def _list_topics(
@@ -137,7 +107,7 @@ def _at_and_ago(name: str, title: str, at: str = "at") -> tuple[ToolName, ...]:
     )
 
 
-_DECLARATIONS = (
+DECLARATIONS = (
     ToolDeclaration(
         (ToolName("list_recorded_topics", "Recorded topics"),),
         "Lists every recorded topic. Call it first if unsure of a name. "

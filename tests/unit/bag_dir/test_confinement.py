@@ -40,7 +40,7 @@ from ros2_memory.retention.clear import clear_bags, remove_if_empty
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.tools.build import build_tools
 from tests.support.bags import boolean, text, write_db3, write_mcap
 from tests.support.handovers import recover_handovers
 from tests.support.housekeepers import keeper_of

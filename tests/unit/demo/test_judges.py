@@ -17,8 +17,8 @@ from ros2_memory.demo.published_topics import MessageSchedule
 from ros2_memory.demo.questions import QUESTIONS, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
 from tests.support.memories import memory_of
 

@@ -17,8 +17,8 @@ from ros2_memory.core.regions import Circle, Place
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.fleet.tools import ANSWER_FOR_ALL, fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.reply_size import to_json_text
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.clocks import FixedClock
 from tests.support.fleets import (
     CALLS,

@@ -15,8 +15,8 @@ import pytest
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.fleets import CALLS, TOOLS, fleet_over, seeded, write_robot
 
 if TYPE_CHECKING:

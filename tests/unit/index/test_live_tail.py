@@ -29,8 +29,8 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import View
 from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.storage.mcap_reader import McapReader
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.mcap_surgery import spoil_chunk

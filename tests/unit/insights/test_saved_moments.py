@@ -34,8 +34,8 @@ from ros2_memory.insights.saved_moments import (
 )
 from ros2_memory.insights.status import MAX_MOMENTS
 from ros2_memory.retention.policy import RetentionLimits
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import odom, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import keeper_of, recorder_at_work

@@ -12,7 +12,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.spec_tools import build_tools
+from ros2_memory.tools.build import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of
 

@@ -30,7 +30,7 @@ from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import EpisodicServer
-from ros2_memory.tools.spec_tools import build_tools, readable_tools
+from ros2_memory.tools.build import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
 if TYPE_CHECKING:

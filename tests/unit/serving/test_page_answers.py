@@ -49,9 +49,9 @@ from ros2_memory.serving.page.span import (
     thinned,
 )
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
 from ros2_memory.tools.reply_size import to_json_text
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import detections, odom, tf, transform, write_mcap
 from tests.support.memories import memory_of, stored_columns, with_store
 from tests.unit.test_positions import fix

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 
 from ros2_memory.serving.dispatch import Dispatcher
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature
 from ros2_memory.tools.replies import Replies, Reply
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.examples import examples
 from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
 from tests.support.memories import memory_of

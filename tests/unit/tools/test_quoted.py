@@ -10,8 +10,8 @@ import pytest
 from ros2_memory.core.text import Quoted, named, quote, quoted_keys
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import (
     boolean,
     detections,

@@ -22,15 +22,15 @@ from ros2_memory.tools.arguments import (
     LastMatchArguments,
     MotionArguments,
 )
+from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
-from ros2_memory.tools.spec_tools import build_tools
 from tests.support.bags import odom, write_mcap
 from tests.support.memories import memory_of, replied
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 TOOLS = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
-DECLARATIONS = (*spec_tools._DECLARATIONS, *extra_tools.DECLARATIONS, *extra_tools.READABLE)
+DECLARATIONS = (*spec_tools.DECLARATIONS, *extra_tools.DECLARATIONS, *extra_tools.READABLE)
 SIGNATURES = {
     each.name: Signature(declaration.arguments, each.when)
     for declaration in DECLARATIONS

@@ -42,7 +42,7 @@ def adopt(
     root = settings.recording.bag_dir
     own = OwnRecordings(root)
     given = [_below(root, directory) for directory in directories]
-    found = {
+    bags_by_name = {
         name: [*filter(is_regular, bags_in(path))]
         for directory in given
         for path in folders_with_bags(directory)
@@ -54,19 +54,19 @@ def adopt(
             claim(own)
         finally:
             lock.release()
-    new = {name: bags for name, bags in found.items() if not all(map(own.owns_bag, bags))}
+    new = {name: bags for name, bags in bags_by_name.items() if not all(map(own.owns_bag, bags))}
     identities = {name: identity_of(root / name) for name in new}
     for name, identity in identities.items():
         if identity is None:
             raise RecorderError(f"{root / name} is not there any more")
     own.adopt({name: identity for name, identity in identities.items() if identity})
     adopted = [(name, len(bags), sum(map(size_of, bags)) / MB) for name, bags in new.items()]
-    already = len(found) - len(new)
+    already = len(bags_by_name) - len(new)
     if as_json:
         keys = ("directory", "bags", "size_mb")
         rows = [dict(zip(keys, row, strict=True)) for row in adopted]
         print_json({"adopted": rows, "already": already})
-        return not found
+        return not bags_by_name
     for name, files, size_mb in adopted:
         print_line(f"adopted: {name} ({counted(files, 'bag file')}, {size_mb:.1f} MB)")
     if already:
@@ -74,12 +74,12 @@ def adopt(
         print_line(f"{folders} the recorder's own already")
     if not all(map(is_kept_apart, new)):
         print_line("retention deletes them from now on, by its limits, oldest first")
-    if not found:
+    if not bags_by_name:
         print_line("there are no bag files")
         for link in islice(_links(given), _MAX_LINKS_NAMED):
             name = str(link.relative_to(root))
             print_line(f"{name} is a symbolic link, which is not followed: {_INSTEAD}")
-    return not found
+    return not bags_by_name
 
 
 def _below(root: Path, directory: Path) -> Path:

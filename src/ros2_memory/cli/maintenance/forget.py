@@ -507,8 +507,8 @@ class _Forget:
         try:
             FORGOTTEN.append(self._bag_dir, forgettings)
         except OSError as error:
-            first = min(one.start for one in forgettings) // NS_PER_S
-            last = -(-max(one.stop for one in forgettings) // NS_PER_S)
+            first = min(forgetting.start for forgetting in forgettings) // NS_PER_S
+            last = -(-max(forgetting.stop for forgetting in forgettings) // NS_PER_S)
             line = (
                 f"what a lake has of it: {self._bag_dir / FORGOTTEN_FILE} cannot be written "
                 f"({error.strerror or error}); if these bags are shipped, run `ros2-memory ship "

@@ -79,8 +79,8 @@ def index(
         bags, stored, refused = progress.closed, progress.stored, progress.refused
         done[name] = {"bags": bags, "stored": stored, "refused": refused}
         if not as_json:
-            of = f" of {name}" if robots else ""
-            print(f"{describe_progress(progress)}{of}", file=sys.stderr)
+            of_robot = f" of {name}" if robots else ""
+            print(f"{describe_progress(progress)}{of_robot}", file=sys.stderr)
     if as_json:
         print_json(done if robots else done[""])
     if problems:

@@ -59,8 +59,8 @@ def recover(
         if as_json:
             raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
         recover_files(path, print_line, force=force, dry_run=True)
-        made = "was not made by this recorder" if len(others) == 1 else "were not made by it"
-        typer.confirm(f"{listed([*map(str, others)])} {made}. Change this?", abort=True)
+        why = "was not made by this recorder" if len(others) == 1 else "were not made by it"
+        typer.confirm(f"{listed([*map(str, others)])} {why}. Change this?", abort=True)
     lines: list[str] = []
     report = lines.append if as_json else print_line
     outcome = recover_files(path, report, force=force, dry_run=dry_run)
@@ -152,13 +152,13 @@ def foreign_unfinished(path: Path) -> tuple[Path, ...]:
     Raises:
         RecorderError: there is no such file or directory.
     """
-    repairer, found = build_repairer(), set[Path]()
+    repairer, unfinished = build_repairer(), set[Path]()
     for file in _files_below(path, WallClock())[0]:
         with suppress(BagError):
-            if file.parent not in found and not repairer.is_whole(file):
-                found.add(file.parent)
+            if file.parent not in unfinished and not repairer.is_whole(file):
+                unfinished.add(file.parent)
     foreign: list[Path] = []
-    for folder in sorted(found):
+    for folder in sorted(unfinished):
         above = folder.absolute().parents
         listing = next((root for root in above if (root / LIST_FILE).exists()), None)
         if listing is None or not OwnRecordings(listing).owns(folder.absolute()):

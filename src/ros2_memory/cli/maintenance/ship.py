@@ -140,11 +140,12 @@ def _forget(
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:
-        known = {*Partitions().look(lake.current("bags")), *(one.name for one in robots)}
-        if robot not in known:
+        in_lake = Partitions().look(lake.current("bags"))
+        names = {*in_lake, *(configured.name for configured in robots)}
+        if robot not in names:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
-                f"{listed(sorted(known))}"
+                f"{listed(sorted(names))}"
             )
         append_tombstone(location.state_dir, tombstone, done=False)
         gone = forget_in_lake(lake, tombstone)
@@ -199,8 +200,8 @@ class _Shipping:
 
         with self.location.writable() as lake:
             tombstones = read_tombstones(self.location.state_dir)
-            for tombstone, is_done in tombstones.items():
-                if not is_done:
+            for tombstone in tombstones:
+                if not tombstone.done:
                     forget_in_lake(lake, tombstone)
             yield Shipper(
                 lake,
@@ -233,7 +234,7 @@ class _Shipping:
         """
         notify(READY)
         log.info("shipping", robots=len(self.robots), warehouse=self.location.warehouse)
-        known: list[str] = []
+        reported: list[str] = []
         kept_up_s = -math.inf
         while True:
             try:
@@ -248,9 +249,9 @@ class _Shipping:
                             shipper.keep_up(self.grace)
                             kept_up_s = time.monotonic()
                         for problem in problems:
-                            if problem not in known:
+                            if problem not in reported:
                                 log.warning("not_shipped", reason=problem)
-                        known = problems
+                        reported = problems
                         if is_due:
                             new = new_robots(self.robots)
                         if not new:
@@ -267,13 +268,13 @@ def _new_robots(
     """Returns the robots of the settings that were not there before: a pattern may match more."""
     try:
         settings, _ = load_for(None, overrides)
-        known = {robot.name for robot in robots}
-        new = {name: bags for name, bags in settings.fleet.robots.items() if name not in known}
+        names = {robot.name for robot in robots}
+        new = {name: bags for name, bags in settings.fleet.robots.items() if name not in names}
         if not new:
             return []
-        found = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
+        built = build_robots(replace(settings, fleet=replace(settings.fleet, robots=new)), shared)
     except ConfigError as error:
         log.warning("not_shipped", reason=f"robots that are new are not looked for: {error}")
         return []
-    log.info("shipping", robots=len(robots) + len(found), warehouse=settings.lake.warehouse)
-    return found
+    log.info("shipping", robots=len(robots) + len(built), warehouse=settings.lake.warehouse)
+    return built

@@ -35,10 +35,10 @@ class DuckdbEngine(LakeEngine):
     """
 
     def __init__(self, memory_mb: int = 1024, threads: int | None = None) -> None:
-        limits = {"memory_limit": f"{memory_mb}MiB"} | (
-            {"threads": str(threads)} if threads else {}
-        )
-        self._connection = duckdb.connect(config={**_SETTINGS, **limits})
+        settings = {**_SETTINGS, "memory_limit": f"{memory_mb}MiB"}
+        if threads:
+            settings["threads"] = str(threads)
+        self._connection = duckdb.connect(config={**settings})
 
     def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
         """Runs the select in a cursor of its own, which alone knows the table."""

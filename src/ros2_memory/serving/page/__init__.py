@@ -49,7 +49,7 @@ class _File(NamedTuple):
     etag: str
 
 
-def _file(names: tuple[str, ...], media_type: str) -> _File:
+def _joined_file(names: tuple[str, ...], media_type: str) -> _File:
     folder = resources.files(__name__)
     body = b"\n".join(folder.joinpath(name).read_bytes() for name in names)
     return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
@@ -61,9 +61,9 @@ class Page:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._files = {
-            PAGE_PATH: _file(("index.html",), "text/html"),
-            "/page/page.js": _file(SCRIPTS, "text/javascript"),
-            "/page/page.css": _file(STYLES, "text/css"),
+            PAGE_PATH: _joined_file(("index.html",), "text/html"),
+            "/page/page.js": _joined_file(SCRIPTS, "text/javascript"),
+            "/page/page.css": _joined_file(STYLES, "text/css"),
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

@@ -69,8 +69,8 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
     if places is not None:
         tracks = RobotTracks(view, places.map_frame)
         frame, track = places.map_frame, tracks.over(window).track
-    elif (found := local_track(view, view.pose_topic, window)) is not None:
-        frame, track = found
+    elif (local := local_track(view, view.pose_topic, window)) is not None:
+        frame, track = local
     else:
         raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, "no topic places the robot")
     track = cut(track, window)
@@ -107,9 +107,9 @@ def stretches_inside(track: RobotTrack, box: Box) -> Iterator[tuple[int, int]]:
     steps = np.flatnonzero(inside)
     begins = track.times[steps[1:]] - track.times[steps[:-1] + 1] > _TOGETHER_NS
     begins |= np.cumsum(track.begins)[steps[1:]] != np.cumsum(track.begins)[steps[:-1]]
-    for some in np.split(steps, np.flatnonzero(begins) + 1):
-        if len(some):
-            yield int(some[0]), int(some[-1]) + 1
+    for piece in np.split(steps, np.flatnonzero(begins) + 1):
+        if len(piece):
+            yield int(piece[0]), int(piece[-1]) + 1
 
 
 def _bounds(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

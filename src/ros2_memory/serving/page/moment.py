@@ -32,7 +32,7 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    found = before(memory, call, at_s, _CHANGES_S, None)
+    preceding = before(memory, call, at_s, _CHANGES_S, None)
     around = recap(
         memory,
         call,
@@ -40,18 +40,19 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
         most_events=MOST_SEEN,
         with_changes=False,
     )
-    changes = [*found.changes, *found.after]
+    changes = [*preceding.changes, *preceding.after]
     return {
         "t": at_s,
-        "robot": None if found.robot is None else POSE_KEYS.render(found.robot, Scope()),
-        "frame": None if found.robot is None else found.robot.frame_id,
-        "speed": None if found.speed_mps is None else rounded(found.speed_mps, 2),
-        "state": dict(found.state),
+        "robot": None if preceding.robot is None else POSE_KEYS.render(preceding.robot, Scope()),
+        "frame": None if preceding.robot is None else preceding.robot.frame_id,
+        "speed": None if preceding.speed_mps is None else rounded(preceding.speed_mps, 2),
+        "state": dict(preceding.state),
         "changes": [
-            {"text": each.text, "before_s": round(unix_from_ns(each.before), 1)} for each in changes
+            {"text": change.text, "before_s": round(unix_from_ns(change.before), 1)}
+            for change in changes
         ],
         "seen": _seen(around),
-        "notes": [*dict.fromkeys([*found.notes, *around.notes])],
+        "notes": [*dict.fromkeys([*preceding.notes, *around.notes])],
     }
 
 
@@ -62,25 +63,25 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
         NoDataError: nothing is recorded.
         QueryTimeoutError: the call's time is over.
     """
-    found = recap(
+    summary = recap(
         memory, call, TimeRange(start_s, end_s), most_events=MOST_SEEN, with_changes=False
     )
-    others = [event_shown(each) for each in found.events if each.kind != "thing"]
+    others = [event_shown(event) for event in summary.events if event.kind != "thing"]
     return {
         "start": start_s,
         "end": end_s,
-        "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
-        "stood_s": None if found.stood is None else round(unix_from_ns(found.stood), 1),
-        "seen": _seen(found),
+        "distance_m": None if summary.distance_m is None else rounded(summary.distance_m, 1),
+        "stood_s": None if summary.stood is None else round(unix_from_ns(summary.stood), 1),
+        "seen": _seen(summary),
         "events": [*others],
-        "notes": [*found.notes],
+        "notes": [*summary.notes],
     }
 
 
-def _seen(found: Recap) -> list[JsonValue]:
+def _seen(summary: Recap) -> list[JsonValue]:
     """Returns what was in view, each label once: first what was all the time."""
-    rows: dict[str, JsonObject] = {each: {"label": each} for each in found.throughout}
-    for event in found.events:
+    rows: dict[str, JsonObject] = {label: {"label": label} for label in summary.throughout}
+    for event in summary.events:
         label = event.text.removesuffix(_IN_VIEW)
         if event.kind == "thing" and label not in rows:
             rows[label] = {**event_shown(event), "label": label}
@@ -99,14 +100,14 @@ def sightings_shown(
     view, window = open_span(memory, call, TimeRange(start_s, end_s))
     detectors = [
         topic
-        for topic, found in found_events(view, window).items()
-        if found is not None and found.visible.size
+        for topic, events in found_events(view, window).items()
+        if events is not None and events.visible.size
     ]
     rows: list[JsonObject] = []
     notes: list[str] = []
     total: int | None = 0
     for topic in detectors:
-        found = find_matches(
+        sightings = find_matches(
             memory,
             call,
             topic,
@@ -116,11 +117,11 @@ def sightings_shown(
             end_s=end_s,
             limit=MOST_SIGHTINGS,
         )
-        sightings = render(found, memory.index.bag_dir)["sightings"]
-        if isinstance(sightings, list):
-            rows += [{"topic": topic, **row} for row in sightings if isinstance(row, dict)]
-        total = None if total is None or found.total is None else total + found.total
-        notes += found.notes
+        rendered = render(sightings, memory.index.bag_dir)["sightings"]
+        if isinstance(rendered, list):
+            rows += [{"topic": topic, **row} for row in rendered if isinstance(row, dict)]
+        total = None if total is None or sightings.total is None else total + sightings.total
+        notes += sightings.notes
     rows.sort(key=_last_seen, reverse=True)
     return {
         "label": label,

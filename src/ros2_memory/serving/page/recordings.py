@@ -23,6 +23,7 @@ from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
 from ros2_memory.serving.page.span import path_in
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
     from pathlib import Path
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
@@ -83,13 +84,13 @@ class Recordings:
         Raises:
             InvalidArgumentsError: none is named so.
         """
-        found = self._narrowed(name)
-        snapshot = found.index.snapshot()
+        alone = self._narrowed(name)
+        snapshot = alone.index.snapshot()
         if not (snapshot.bags or snapshot.active or snapshot.damaged or snapshot.unread):
-            near = get_close_matches(name, [str(each["name"]) for each in self._list()], n=3)
+            near = get_close_matches(name, [str(row["name"]) for row in self._list()], n=3)
             similar = f"; similar: {', '.join(near)}" if near else ""
             raise InvalidArgumentsError(f"no recording is named {shortened(name)}{similar}")
-        return found
+        return alone
 
     def shown(self, chosen: Memory, call: Call) -> JsonObject:
         """Returns the recordings, newest first, and where robots are mixed in what is chosen."""
@@ -97,7 +98,7 @@ class Recordings:
         return {
             "recordings": [*rows[:MOST_RECORDINGS]],
             "recordings_total": len(rows),
-            "mixed": [each.removesuffix(ADVICE) for each in describe_mixed(chosen, call)],
+            "mixed": [note.removesuffix(ADVICE) for note in describe_mixed(chosen, call)],
         }
 
     def paths(self, chosen: Memory, call: Call, window: TimeWindow) -> JsonObject:
@@ -107,19 +108,19 @@ class Recordings:
         Those that overlap come first, then the newest.
         """
         names = _robots(chosen, call, window)
-        found: list[JsonValue] = []
+        robot_paths: list[JsonValue] = []
         for name in sorted(names[:MOST_PATHS]):
             try:
-                one = self.alone(name)
-                limits = replace(one.limits, pose_topic=chosen.limits.pose_topic)
-                path = path_in(replace(one, limits=limits), call, window)
+                alone = self.alone(name)
+                limits = replace(alone.limits, pose_topic=chosen.limits.pose_topic)
+                path = path_in(replace(alone, limits=limits), call, window)
             except EpisodicError as error:
                 late = {"late": True} if isinstance(error, QueryTimeoutError) else {}
-                found.append({"name": name, "error": str(error), **late})
+                robot_paths.append({"name": name, "error": str(error), **late})
                 continue
             if path is not None:
-                found.append({"name": name, **path})
-        return {"paths": found, "paths_left_out": len(names[MOST_PATHS:])}
+                robot_paths.append({"name": name, **path})
+        return {"paths": robot_paths, "paths_left_out": len(names[MOST_PATHS:])}
 
     def _list(self) -> list[JsonObject]:
         index = self._memory.index
@@ -137,14 +138,14 @@ def _narrowed(memory: Memory, name: str) -> Memory:
 
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
     """Returns recordings, and the folders of the bag directory that hold several of them."""
-    found = {name_of(path, bags, root): bags for path, bags in recordings_of(snapshot).items()}
+    by_name = {name_of(path, bags, root): bags for path, bags in recordings_of(snapshot).items()}
     folders: dict[str, list[list[BagFile]]] = {}
-    for name, bags in found.items():
+    for name, bags in by_name.items():
         if "/" in name and not is_kept_apart(name):
             folders.setdefault(name.partition("/")[0], []).append(bags)
-    rows = [_row(name, bags) for name, bags in found.items()]
+    rows = [_row(name, bags) for name, bags in by_name.items()]
     for folder, inside in folders.items():
-        if len(inside) > 1 and folder not in found:
+        if len(inside) > 1 and folder not in by_name:
             rows.append({**_row(folder, [*chain.from_iterable(inside)]), "holds": len(inside)})
     return sorted(rows, key=lambda row: (-float(str(row["end"])), str(row["name"])))
 
@@ -154,7 +155,7 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
 
     Some of their recordings overlap in time, or have frames of other robots.
     """
-    mixed = [each.pair for each in mixed_recordings(memory, call) if each.topic is not None]
+    mixed = [mix.pair for mix in mixed_recordings(memory, call) if mix.topic is not None]
     root = str(memory.index.bag_dir)
     names: dict[str, str] = {}
     ends: dict[str, Ns] = {}
@@ -162,28 +163,35 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
         if any(window.overlaps(bag.start, bag.end) for bag in bags):
             names[path] = name_of(path, bags, root)
             ends[names[path]] = max(bag.end for bag in bags)
-    here = {*map(_folder, names.values())}
-    unlike = [
-        {_folder(path.removeprefix(f"{root}/")) for path in each.recordings}
-        for each in contradicting_frames(memory, call)
-    ]
-    unlike = [folders for folders in unlike if len(folders) > 1 and folders <= here]
-    if not unlike and not any(window.overlaps(each.start, each.end) for each in mixed):
+    unlike = _folders_with_unlike_frames(memory, call, {*map(_folder, names.values())})
+    if not unlike and not any(window.overlaps(pair.start, pair.end) for pair in mixed):
         return []
     pairs = [
-        tuple(names[path] for path in map(str, (each.first, each.second)) if path in names)
-        for each in mixed
+        tuple(names[path] for path in map(str, (pair.first, pair.second)) if path in names)
+        for pair in mixed
     ]
     folders = [{*map(_folder, pair)} for pair in pairs if len(pair) == 2]
-    split = {each for folder in folders if len(folder) == 1 for each in folder}
+    split = {folder for pair in folders if len(pair) == 1 for folder in pair}
     overlapping = {name for pair in pairs for name in pair}
-    overlapping |= {name for name in ends if any(_folder(name) in each for each in unlike)}
+    overlapping |= {name for name in ends if any(_folder(name) in folders for folders in unlike)}
     robots: dict[str, tuple[bool, Ns]] = {}
     for name, end in ends.items():
         robot = name if _folder(name) in split else _folder(name)
         is_mixed, newest = robots.get(robot, (False, end))
         robots[robot] = (is_mixed or name in overlapping, max(newest, end))
-    return sorted(robots, key=lambda each: (*robots[each], each), reverse=True)
+    return sorted(robots, key=lambda robot: (*robots[robot], robot), reverse=True)
+
+
+def _folders_with_unlike_frames(
+    memory: Memory, call: Call, present: Collection[str]
+) -> list[set[str]]:
+    """Returns the sets of folders whose recordings contradict each other; all are `present`."""
+    root = str(memory.index.bag_dir)
+    contradicting = [
+        {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
+        for contradiction in contradicting_frames(memory, call)
+    ]
+    return [folders for folders in contradicting if len(folders) > 1 and folders.issubset(present)]
 
 
 def _folder(name: str) -> str:

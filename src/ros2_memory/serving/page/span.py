@@ -79,9 +79,9 @@ _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
 
 class Shown(NamedTuple):
-    """A part of an answer, and the reason if it is incomplete."""
+    """Keys of an answer, and the reasons if they are incomplete."""
 
-    part: JsonObject
+    keys: JsonObject
     notes: tuple[str, ...] = ()
 
 
@@ -154,23 +154,12 @@ def span_shown(
         "version": version,
         "now": now,
         "latest": moment(latest),
-        "filling": None
-        # Without the newest of many bags, as while recording, the store is as good as full.
-        if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10)
-        else {"closed": filling.closed, "waiting": filling.waiting},
+        "filling": _filling_shown(filling),
     }
     if questions is not None and questions.is_on:
         shown["questions"] = [*questions.newest(MOST_QUESTIONS)]
     if request.status:
-        ranged = data_time_range(memory, call)
-        days: list[JsonValue] = [
-            [_s(start), _s(stop)] for start, stop in snapshot.timeline.thinned_times
-        ]
-        shown["range"] = {
-            **render(ranged, memory.index.bag_dir),
-            "gaps": _gaps(ranged),
-            **({"thinned": days} if days else {}),
-        }
+        shown["range"] = _range_shown(memory, call, snapshot)
         shown["status"] = render(memory_status(memory, call), memory.index.bag_dir)
     if earliest is None or latest is None:
         return shown
@@ -179,7 +168,6 @@ def span_shown(
     # Rounded away from the span, so that one that is asked again holds all that it did.
     end_s = -((AT_OR_BEFORE_SLACK_NS + 1 - window.stop) // NS_PER_MS) / 1000
     shown |= {"start": _start_s(window), "end": end_s, "since": _start_s(fresh)}
-    notes: list[str] = []
     parts: dict[str, Callable[[Call], Shown]] = {
         "path": lambda call: _path(memory, call, fresh, latest),
         "events": lambda call: _events(memory, call, window if request.things else fresh),
@@ -188,25 +176,53 @@ def span_shown(
     }
     if not request.things:
         del parts["things"]
+    all_parts = _united_parts(parts, call, request)
+    shown |= all_parts.keys
+    if request.signals:
+        shown["signals"] = [
+            signal_in(memory, call, signal, fresh, window) for signal in request.signals
+        ]
+    shown["notes"] = [*all_parts.notes]
+    return shown
+
+
+def _filling_shown(filling: Progress | None) -> JsonObject | None:
+    """Returns how far the store of columns is filled; None where that is as good as full."""
+    # So it is without the newest of many bags, as while recording.
+    if filling is None or filling.waiting <= min(_NEWEST_BAGS, filling.closed // 10):
+        return None
+    return {"closed": filling.closed, "waiting": filling.waiting}
+
+
+def _range_shown(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
+    """Returns the recorded range with its longest gaps, and the days that were thinned, if any."""
+    ranged = data_time_range(memory, call)
+    shown: JsonObject = {**render(ranged, memory.index.bag_dir), "gaps": _gaps(ranged)}
+    if thinned := snapshot.timeline.thinned_times:
+        shown["thinned"] = [[_unix_s(start), _unix_s(stop)] for start, stop in thinned]
+    return shown
+
+
+def _united_parts(
+    parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
+) -> Shown:
+    """Returns all parts as one, with how long (ms) those of the whole span took."""
+    shown: JsonObject = {}
+    notes: list[str] = []
     whole_s = 0.0
-    for name, (found, took_s) in _in_time(parts, call, request):
-        shown |= found.part
-        notes += found.notes
+    for name, part, took_s in _in_time(parts, call, request):
+        shown |= part.keys
+        notes += part.notes
         whole_s += took_s if name in _OF_WHOLE else 0.0
     if request.things:
         shown["whole_ms"] = round(whole_s * 1000)
-    if request.signals:
-        shown["signals"] = [
-            signal_in(memory, call, each, fresh, window) for each in request.signals
-        ]
-    shown["notes"] = [*dict.fromkeys(notes)]
-    return shown
+    return Shown(shown, tuple(dict.fromkeys(notes)))
 
 
 def _in_time(
     parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
-) -> Iterator[tuple[str, tuple[Shown, float]]]:
-    """Yields each part, or why it is not known yet, with the processor time (s) that it took."""
+) -> Iterator[tuple[str, Shown, float]]:
+    """Yields each part by name, or why it is not known yet, and the processor time (s) it took."""
     budget_s = _PART_S if request.patient else _QUICK_S
     whole = call.deadline.within(budget_s)
     for name, part in parts.items():
@@ -214,10 +230,10 @@ def _in_time(
         if request.first:
             budget_s = max(whole.left_s(), 0.0) / 2
         try:
-            found = part(replace(call, deadline=call.deadline.within(budget_s)))
+            shown = part(replace(call, deadline=call.deadline.within(budget_s)))
         except QueryTimeoutError as error:
-            found = Shown({}, (f"the {name} are not known yet: {error}",))
-        yield name, (found, time.thread_time() - begun)
+            shown = Shown({}, (f"the {name} are not known yet: {error}",))
+        yield name, shown, time.thread_time() - begun
 
 
 def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:
@@ -229,7 +245,7 @@ def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> Tim
         return window
     since = min(max(ns_from_unix(since_s), window.start), window.stop - 1)
     bags = snapshot.timeline.overlapping(TimeWindow(since, since + 1))
-    begins = min((each.start for each in bags), default=since)
+    begins = min((bag.start for bag in bags), default=since)
     return TimeWindow(max(begins, window.start), window.stop)
 
 
@@ -246,7 +262,7 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
     return "-".join(map(str, counts))
 
 
-def _s(at: Ns) -> float:
+def _unix_s(at: Ns) -> float:
     """Returns Unix seconds to the millisecond: a pixel of the page is more."""
     return round(unix_from_ns(at), 3)
 
@@ -258,8 +274,10 @@ def _start_s(window: TimeWindow) -> float:
 
 def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
     """Returns the longest gaps in order, as pairs of times."""
-    longest = sorted(ranged.gaps, key=lambda each: each.start - each.end)[:MOST_GAPS]
-    return [[_s(each.start), _s(each.end)] for each in sorted(longest, key=lambda each: each.start)]
+    longest = sorted(ranged.gaps, key=lambda gap: gap.start - gap.end)[:MOST_GAPS]
+    return [
+        [_unix_s(gap.start), _unix_s(gap.end)] for gap in sorted(longest, key=lambda gap: gap.start)
+    ]
 
 
 def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
@@ -270,34 +288,38 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
         return _path_by_fixes(view, window, latest)
     tracks = RobotTracks(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
-    found = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
-    track = cut(found.track, window)
+    tracked = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
+    track = cut(tracked.track, window)
     newest = track
     if window.stop <= latest or not len(track.times):
         newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
-    path = _drawn(track, places.map_frame, is_whole=found.since is None)
+    path = _drawn(track, places.map_frame, is_whole=tracked.since is None)
     named: list[JsonValue] = [
-        _place(at) for at in memory.limits.places if at.frame_id == places.map_frame
+        _place_outline(place)
+        for place in memory.limits.places
+        if place.frame_id == places.map_frame
     ]
-    shown: JsonObject = {"path": path, "robot": _last(newest), "places": named}
+    shown: JsonObject = {"path": path, "robot": _newest_pose(newest), "places": named}
     notes = [*view.notes.sentences()]
-    if found.since is not None:
+    if tracked.since is not None:
         notes.append("the path is not complete yet: older bags are still being read")
     return Shown(shown, tuple(notes))
 
 
 def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
     """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
-    found = local_track(view, view.pose_topic, window)
-    if found is None:
+    local = local_track(view, view.pose_topic, window)
+    if local is None:
         try:
             why = f"{resolve_pose_topic(view)} has no poses"
         except NoDataError as error:  # names the setting or tool that gives a path
             why = error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
-    frame, track = found
-    newest = local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1))
-    robot = None if newest is None else _last(newest[1])
+    frame, track = local
+    robot = None
+    if newest := local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1)):
+        _, newest_track = newest
+        robot = _newest_pose(newest_track)
     shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
     return Shown(shown, view.notes.sentences())
 
@@ -312,8 +334,8 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
     places = robot_places(view, window)
     if places is None:
         return None
-    found = RobotTracks(view, places.map_frame).over(window)
-    return _drawn(cut(found.track, window), places.map_frame, is_whole=found.since is None)
+    tracked = RobotTracks(view, places.map_frame).over(window)
+    return _drawn(cut(tracked.track, window), places.map_frame, is_whole=tracked.since is None)
 
 
 def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
@@ -325,7 +347,7 @@ def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
         "x": np.round(track.x[kept], 2).tolist(),
         "y": np.round(track.y[kept], 2).tolist(),
-        "yaw": [degrees(each) for each in track.heading[kept].tolist()],
+        "yaw": [degrees(heading) for heading in track.heading[kept].tolist()],
         "begins": _begins(track, kept),
         "continues": bool(len(kept)) and not bool(track.begins[0]),
         "whole": is_whole,
@@ -382,7 +404,7 @@ def driven_cells(track: RobotTrack) -> JsonObject:
         "size": size,
         "x": (numbers // height + low[0]).tolist(),
         "y": (numbers % height + low[1]).tolist(),
-        "until": _s(int(track.times[-1])),
+        "until": _unix_s(int(track.times[-1])),
     }
 
 
@@ -394,18 +416,18 @@ def _begins(track: RobotTrack, kept: NDArray[np.intp]) -> list[JsonValue]:
     return [0, *(np.flatnonzero(np.diff(pieces)) + 1).tolist()]
 
 
-def _last(track: RobotTrack) -> JsonObject | None:
+def _newest_pose(track: RobotTrack) -> JsonObject | None:
     if not len(track.times):
         return None
     return {
-        "t": _s(int(track.times[-1])),
+        "t": _unix_s(int(track.times[-1])),
         "x": rounded(float(track.x[-1]), 3),
         "y": rounded(float(track.y[-1]), 3),
         "yaw": degrees(math.remainder(float(track.heading[-1]), math.tau)),
     }
 
 
-def _place(place: Place) -> JsonObject:
+def _place_outline(place: Place) -> JsonObject:
     """Returns a named place as a circle or as corners."""
     match place.region:
         case Circle(x, y, radius_m):
@@ -419,28 +441,30 @@ def _place(place: Place) -> JsonObject:
 
 
 def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
-    found = recap(memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False)
+    summary = recap(
+        memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
+    )
     shown: JsonObject = {
-        "events": [event_shown(each) for each in found.events],
+        "events": [event_shown(event) for event in summary.events],
         "events_since": _start_s(window),
-        "throughout": [*found.throughout],
-        "distance_m": None if found.distance_m is None else rounded(found.distance_m, 1),
-        "max_speed": None if found.max_speed is None else rounded(found.max_speed, 2),
-        "stood_s": None if found.stood is None else round(unix_from_ns(found.stood), 1),
-        "counts": dict(found.counts),
+        "throughout": [*summary.throughout],
+        "distance_m": None if summary.distance_m is None else rounded(summary.distance_m, 1),
+        "max_speed": None if summary.max_speed is None else rounded(summary.max_speed, 2),
+        "stood_s": None if summary.stood is None else round(unix_from_ns(summary.stood), 1),
+        "counts": dict(summary.counts),
     }
-    return Shown(shown, found.notes)
+    return Shown(shown, summary.notes)
 
 
 def event_shown(event: Event) -> JsonObject:
     """Returns an event as the page takes it."""
-    shown: JsonObject = {"kind": event.kind, "t": _s(event.start), "text": event.text}
+    shown: JsonObject = {"kind": event.kind, "t": _unix_s(event.start), "text": event.text}
     if event.end is not None:
-        shown["end"] = _s(event.end)
+        shown["end"] = _unix_s(event.end)
     if event.goes_on:
         shown["goes_on"] = True
     if event.point is not None:
-        shown["x"], shown["y"] = (rounded(each, 2) for each in event.point)
+        shown["x"], shown["y"] = (rounded(coordinate, 2) for coordinate in event.point)
     if event.places:
         shown["in"] = event.places[0]
     return shown
@@ -451,12 +475,16 @@ def _moments(memory: Memory, call: Call) -> Shown:
         stored = list_moments(memory, call).moments
     except EpisodicError as error:
         return Shown({"moments": []}, (str(error),))
-    requests = [each.moment.request for each in stored]
+    requests = [saved.moment.request for saved in stored]
     return Shown(
         {
             "moments": [
-                {"start": _s(each.start), "end": _s(each.end), "label": each.label}
-                for each in requests
+                {
+                    "start": _unix_s(request.start),
+                    "end": _unix_s(request.end),
+                    "label": request.label,
+                }
+                for request in requests
             ]
         }
     )
@@ -465,7 +493,7 @@ def _moments(memory: Memory, call: Call) -> Shown:
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
     """Returns the things that were seen in a window."""
     try:
-        found = find_things(
+        answer = find_things(
             memory,
             call,
             start_s=unix_from_ns(window.start),
@@ -476,21 +504,21 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         return Shown({"things": []}, (str(error),))
     return Shown(
         {
-            "things": [_thing(each) for each in found.things],
-            "things_total": found.total,
+            "things": [_thing_row(thing) for thing in answer.things],
+            "things_total": answer.total,
         },
-        found.notes,
+        answer.notes,
     )
 
 
-def _thing(thing: Thing) -> JsonObject:
+def _thing_row(thing: Thing) -> JsonObject:
     shown: JsonObject = {
         "label": thing.label,
         "x": rounded(thing.place[0], 2),
         "y": rounded(thing.place[1], 2),
         "frame": thing.frame_id,
-        "first": _s(thing.first),
-        "last": _s(thing.last),
+        "first": _unix_s(thing.first),
+        "last": _unix_s(thing.last),
         "times": thing.count,
     }
     if thing.inside:

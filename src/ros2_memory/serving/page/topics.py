@@ -56,9 +56,16 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     """
     view = View(memory, replace(call, deadline=call.deadline.within(_PATIENT_S)), window.stop)
     least = memory.limits.min_score
-    found = [each.visible for each in found_events(view, window).values() if each is not None]
-    seen = united([each.scoring(least) if least else each for each in found])
-    rows = [_label(label, *spans, window) for label, spans in seen.spans().items() if len(spans[0])]
+    in_view = [
+        events.visible for events in found_events(view, window).values() if events is not None
+    ]
+    if least:
+        in_view = [visible.scoring(least) for visible in in_view]
+    rows = [
+        _label(label, first, last, window)
+        for label, (first, last) in united(in_view).spans().items()
+        if len(first)
+    ]
     rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))
     shown: list[JsonValue] = [*rows[:MOST_LABELS]]
     return {
@@ -80,7 +87,7 @@ def _label(
         "label": label,
         "sightings": len(first),
         "seconds": rounded(unix_from_ns(int((stop - start).sum())), 1),
-        "bars": [[round(unix_from_ns(each), 3) for each in pair] for pair in pairs],
+        "bars": [[round(unix_from_ns(bound), 3) for bound in pair] for pair in pairs],
     }
 
 
@@ -139,9 +146,9 @@ def signal_in(
 def _signal_parts(
     view: View, topic: str, field: str, window: TimeWindow, width: Ns
 ) -> tuple[list[Part], Ns | None, Sequence[UndecodableError]]:
-    """Returns the numbers of a field, of times that no edge of a bin cuts, in order.
+    """Returns the parts of a field's numbers in order; no edge of a bin cuts one.
 
-    And since when they are known, if not all were read, and failures.
+    Besides from which log time on they are known (None where all were read), and failures.
     """
     inside = [
         (max(first, window.start), min(last, window.stop - 1))
@@ -161,13 +168,13 @@ def _signal_parts(
 
 def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]:
     """Returns for each bin with numbers its middle, and the least, mean and greatest number."""
-    middles = np.array([(each.first + each.last) // 2 for each in parts], np.int64)
+    middles = np.array([(part.first + part.last) // 2 for part in parts], np.int64)
     bins = middles // width
     starts = np.flatnonzero(np.diff(bins, prepend=bins[0] - 1))
-    sizes = np.array([each.size for each in parts], np.float64)
-    totals = np.array([each.total for each in parts])
-    lows = np.minimum.reduceat(np.array([each.least.middle for each in parts]), starts)
-    highs = np.maximum.reduceat(np.array([-each.greatest.middle for each in parts]), starts)
+    sizes = np.array([part.size for part in parts], np.float64)
+    totals = np.array([part.total for part in parts])
+    lows = np.minimum.reduceat(np.array([part.least.middle for part in parts]), starts)
+    highs = np.maximum.reduceat(np.array([-part.greatest.middle for part in parts]), starts)
     # One of them may be exact, and the other rounded to beyond it.
     lows, highs = np.minimum(lows, highs), np.maximum(lows, highs)
     means = np.add.reduceat(totals, starts) / np.add.reduceat(sizes, starts) / SUM_SCALE
@@ -176,8 +183,8 @@ def _in_bins(parts: Sequence[Part], width: Ns) -> list[tuple[float | None, ...]]
     times = np.add.reduceat(middles / NS_PER_S * sizes, starts) / np.add.reduceat(sizes, starts)
     columns = (lows, means, highs)
     return [
-        (round(at, 3), *(rounded(each, 6) for each in row))
-        for at, *row in zip(times.tolist(), *(each.tolist() for each in columns), strict=True)
+        (round(at, 3), *(rounded(value, 6) for value in row))
+        for at, *row in zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
     ]
 
 
@@ -204,23 +211,24 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     """
     view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
     topics = view.timeline.topics()
-    rows: list[JsonValue] = [
-        {
-            "topic": topic,
-            "type": type_name,
-            "count": census.count,
-            "rate_hz": _rate(view, topic),
-            "spoke": _spoke(view, topic, window).tolist(),
-            "numbers": [*_numbers(view, topic)],
-        }
-        for topic in topics[:MOST_TOPICS]
-        # The type under which it was recorded last.
-        for type_name, census in [max(view.census(topic).items(), key=lambda of: of[1].last)]
-    ]
     return {
-        "topics": rows,
+        "topics": [_topic_row(view, topic, window) for topic in topics[:MOST_TOPICS]],
         "topics_total": len(topics),
         "places_robot": _places_robot(view),
+    }
+
+
+def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
+    """Returns a topic's row, with the type under which it was recorded last."""
+    by_type = view.census(topic)
+    newest_type = max(by_type, key=lambda type_name: by_type[type_name].last)
+    return {
+        "topic": topic,
+        "type": newest_type,
+        "count": by_type[newest_type].count,
+        "rate_hz": _rate(view, topic),
+        "spoke": _spoke(view, topic, window).tolist(),
+        "numbers": [*_numbers(view, topic)],
     }
 
 
@@ -238,10 +246,10 @@ def _rate(view: View, topic: str) -> float | None:
 def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:
     """Returns how many messages each bin of a window has."""
     extents = [*view.timeline.extents(topic, window)]
-    held = sum(known.count for each in extents for known in each.bag.summary.of(topic))
+    messages = sum(summary.count for extent in extents for summary in extent.bag.summary.of(topic))
     width = max((window.stop - window.start) // BINS, 1)
-    longest = max((each.last - each.first for each in extents), default=0)
-    if longest > width and held <= _MOST_TIMES:
+    longest = max((extent.last - extent.first for extent in extents), default=0)
+    if longest > width and messages <= _MOST_TIMES:
         try:
             parts = [rows.times for rows in scan(view, topic, window, columns=False)]
         except QueryTimeoutError:
@@ -249,9 +257,9 @@ def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:
         else:
             return _binned(np.concatenate([np.zeros(0, np.int64), *parts]), window)
     spread = [
-        np.linspace(each.first, each.last, min(known.count, BINS), dtype=np.int64)
-        for each in extents
-        for known in each.bag.summary.of(topic)
+        np.linspace(extent.first, extent.last, min(summary.count, BINS), dtype=np.int64)
+        for extent in extents
+        for summary in extent.bag.summary.of(topic)
     ]
     return _binned(np.concatenate([np.zeros(0, np.int64), *spread]), window)
 
@@ -264,23 +272,23 @@ def _binned(times: NDArray[np.int64], window: TimeWindow) -> NDArray[np.int64]:
 
 def _numbers(view: View, topic: str) -> list[str]:
     """Returns the fields of a topic's newest message that are numbers, as dot-paths."""
-    found = view.stream.newest(topic, TimeWindow.everything())
-    if found is None or len(found.record.payload) > _LARGEST_BYTES:
+    newest = view.stream.newest(topic, TimeWindow.everything())
+    if newest is None or len(newest.record.payload) > _LARGEST_BYTES:
         return []
-    message = view.bags.decode(found)
+    message = view.bags.decode(newest)
     if message is None:
         return []
-    value = view.extractor.exact(message, found.type)
+    value = view.extractor.exact(message, newest.type)
     numbers = [path or "data" for path, kind in fields_of(value) if kind in _PLOTTED]
     return numbers[:MOST_NUMBERS]
 
 
 def _places_robot(view: View) -> list[JsonValue]:
     """Returns the topics that can place the robot; those that are its own come first."""
-    posed = [each.partition(" ")[0] for each in topics_with(view, "position")]
-    posed = posed or [each.partition(" ")[0] for each in topics_that_show_poses(view)]
-    own = {*topics_of_robot(view, "position")}
-    posed.sort(key=lambda each: (each not in own, each))
-    fixes = [each.partition(" ")[0] for each in topics_with(view, "geodetic")]
+    posed = [described.partition(" ")[0] for described in topics_with(view, "position")]
+    posed = posed or [described.partition(" ")[0] for described in topics_that_show_poses(view)]
+    of_robot = {*topics_of_robot(view, "position")}
+    posed.sort(key=lambda topic: (topic not in of_robot, topic))
+    fixes = [described.partition(" ")[0] for described in topics_with(view, "geodetic")]
     kinds = {**dict.fromkeys(fixes, "fixes"), **dict.fromkeys(posed, "poses")}
-    return [{"topic": each, "kind": kinds[each]} for each in dict.fromkeys([*posed, *fixes])]
+    return [{"topic": topic, "kind": kinds[topic]} for topic in dict.fromkeys([*posed, *fixes])]
