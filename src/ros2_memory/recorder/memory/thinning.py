@@ -6,7 +6,7 @@ A message that stays is as it was recorded. Those go that say again what others 
   and where poses are farther apart none was recorded.
 - Of a boolean, a status or a name every message stays that changes it, and the last one before.
 - Of the detections of a second, and of the transforms of a slot, as few messages stay as show all
-  labels and frames, and the most of a label at once.
+  labels and frames, each label with its highest score (`_STEPS`), and the most of one at once.
 - Of numbers one of each slot stays, and their least and greatest of five minutes.
 
 No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from math import ceil, log2
+from math import ceil, isnan, log2, nan
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeGuard
 
@@ -48,6 +48,7 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Definition, IntArray
 
     Name = tuple[str, int]
+    Scored = tuple[float, float]  # the step of a score, and the score
     _Value = tuple[float, Ns]  # and its log time
     Points = NDArray[np.float64]
 
@@ -104,6 +105,12 @@ _MOVED: Final = 0.05
 _FEW: Final = 8
 """Integers of more values in a bag are measurements or counters."""
 _STATE_BYTES: Final = 4
+_STEPS: Final = 20
+"""Of a unit of scores: one of 0.52 may stay for one of 0.54. Above 0.5 both are found."""
+_HIGHEST: Final = 1e6
+_SINGLE: Final = 1e-6
+"""What a number of 32 bits may be less than what was meant."""
+_UNSCORED: Final = (0.0, 0.0)
 _LONG: Final = 64
 """Messages with longer arrays are samples: scans, maps, sound, features of faces."""
 _DEGREE_M: Final = 111_320.0
@@ -191,7 +198,7 @@ class TopicThinning:
     _last: Ns | None = None
     _stays: list[IntArray] = field(default_factory=list)
     _slot: int = -1
-    _named: set[Name] = field(default_factory=set)
+    _named: dict[Name, Scored] = field(default_factory=dict)
     _values: dict[str, tuple[object, Ns]] = field(default_factory=dict)
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
     _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
@@ -223,7 +230,7 @@ class TopicThinning:
         for start, stop in zip(starts, [*starts[1:], times.size], strict=True):
             self._add_slot(int(slots[start]), times[start:stop], named[start:stop])
 
-    def _add_slot(self, slot: int, times: IntArray, named: Sequence[set[Name]]) -> None:
+    def _add_slot(self, slot: int, times: IntArray, named: Sequence[Mapping[Name, Scored]]) -> None:
         """Adds few messages of a slot that show all labels and frames in it; at least one."""
         is_new = slot != self._slot
         if is_new:
@@ -240,22 +247,31 @@ class TopicThinning:
         self._stays += [around[after], around[after + 1]]
         self._last = int(times[-1])
 
-    def _labels(self, table: Table) -> list[set[Name]]:
+    def _labels(self, table: Table) -> list[dict[Name, Scored]]:
         """Returns the labels of the detections in each message, also in JSON, with their number."""
         found = self.detections.of(table)
-        labels: list[list[str]] = [[] for _ in range(len(table))]
+        labels: list[tuple[int, str, float]] = []
         if found is not None:
             seen = found.detections
-            for row, label in zip(seen.rows.tolist(), seen.labels.values(), strict=True):
-                labels[row].append(label)
+            rows, scores = seen.rows.tolist(), seen.scores.tolist()
+            labels += zip(rows, seen.labels.values(), scores, strict=True)
         for column in table.columns.values():
             if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
                 for row, text in enumerate(column.values()):
-                    labels[row] += [each.label for each in detections_of(text)]
-        return [
-            {(label, nth) for label, count in Counter(those).items() for nth in range(count)}
-            for those in labels
-        ]
+                    labels += [
+                        (row, one.label, nan if one.score is None else one.score)
+                        for one in detections_of(text)
+                    ]
+        named: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
+        counts = Counter[tuple[int, str]]()
+        for row, label, score in labels:
+            first = named[row].get((label, 0))
+            scored = _stepped(score)
+            named[row][label, 0] = scored if first is None else max(first, scored)
+            if nth := counts[row, label]:
+                named[row][label, nth] = _UNSCORED
+            counts[row, label] += 1
+        return named
 
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
@@ -307,13 +323,15 @@ class TopicThinning:
         codes = {value: nth for nth, value in enumerate(dict.fromkeys(rows))}
         self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
 
-    def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
+    def _add_frames(
+        self, inner: Elements, times: IntArray, named: Sequence[dict[Name, Scored]]
+    ) -> None:
         """Adds the moves of the frames of transforms, and to `named` the frames in each message."""
         column = inner.columns.get(_FRAME)
         if not isinstance(column, Texts):
             return
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
-            named[row].add((frame, 0))
+            named[row][frame, 0] = _UNSCORED
         for code, frame in enumerate(column.words):
             own = np.flatnonzero(column.codes == code)
             poses = {key: rows[own] for key, rows in _poses(inner.columns).items()}
@@ -332,15 +350,39 @@ def is_sampled(table: Table) -> bool:
     )
 
 
-def _covering(named: Sequence[set[Name]], seen: set[Name]) -> list[int]:
-    """Returns few rows in which all names occur that were not `seen`, and adds these to them."""
-    missing: set[Name] = set().union(*named) - seen
+def _stepped(score: float) -> tuple[float, float]:
+    """Returns a score with its step; one that a detector does not give is the lowest."""
+    score = -_HIGHEST if isnan(score) else max(-_HIGHEST, min(score, _HIGHEST))
+    return (score + _SINGLE) * _STEPS // 1, score
+
+
+def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) -> list[int]:
+    """Returns few rows with all names that were not `seen`, or not so high, and adds these to them.
+
+    Each name is in one of them with its highest score, to a step.
+    """
+    missing: dict[Name, Scored] = {}
+    for names in named:
+        for name, score in names.items():
+            if name not in seen or seen[name][0] < score[0]:
+                missing[name] = max(score, missing.get(name, score))
     seen |= missing
+    shown = [
+        {
+            name: score[1]
+            for name, score in names.items()
+            if name in missing and missing[name][0] == score[0]
+        }
+        for names in named
+    ]
     rows: list[int] = []
     while missing:
-        best = max(range(len(named)), key=lambda row: len(named[row] & missing))
+        best = max(range(len(shown)), key=lambda row: (len(shown[row]), sum(shown[row].values())))
         rows.append(best)
-        missing -= named[best]
+        for name in [*shown[best]]:
+            del missing[name]
+            for names in shown:
+                names.pop(name, None)
     return rows
 
 

@@ -130,6 +130,18 @@ def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path)
     assert len(stays) < 250
 
 
+def test_a_label_stays_with_the_highest_score_of_each_second(tmp_path: Path) -> None:
+    chance = np.random.default_rng(7)
+    scores = np.round(chance.random(300), 2).tolist()
+    messages = [detections(T0 + n * S // 5, ["cup"], score=one) for n, one in enumerate(scores)]
+    stays = {5 * t // S for t in times_that_stay(tmp_path, cut(messages, [130, 133]))}
+    for second in range(60):
+        inside = range(5 * second, 5 * second + 5)
+        best, left = (max(scores[n] for n in some) for some in (inside, stays & {*inside}))
+        assert best == left
+    assert len(stays) < 80
+
+
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 6.28))
 def test_a_rounded_pose_is_within_the_steps_of_columns(x: float, yaw: float) -> None:
     message = odom(T0, x, -x / 3, yaw=yaw).body
