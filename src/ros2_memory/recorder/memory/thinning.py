@@ -4,7 +4,8 @@ A message that stays is as it was recorded. Those go that say again what others 
 
 - What moves has a pose a second (`STEP_NS`), and one in two while it stands: standstills are found,
   and where poses are farther apart none was recorded.
-- Of a boolean, a status or a name every message stays that changes it, and the last one before.
+- Of a boolean, a status or a name every message stays that changes it, and the last one before. An
+  integer is a status in five minutes in which it has few values, or does not change often.
 - Of the detections of a second, and of the transforms of a slot, as few messages stay as show all
   labels and frames, each label with its highest score (`_STEPS`), and the most of one at once.
 - Of numbers one of each slot stays, and their least and greatest of five minutes.
@@ -29,6 +30,7 @@ from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS, STAMPS_BESIDE_NS
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.bag_dir.state_files import Thinned
+from ros2_memory.columns.plan import fields_at, is_time
 from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.model import BagState
@@ -36,6 +38,7 @@ from ros2_memory.core.text import NAMES_IN_MESSAGES
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.messages.detections import detections_of
+from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,7 +48,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.detections import DetectionColumns
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.storage.base import Definition, IntArray
+    from ros2_memory.storage.base import IntArray
 
     Name = tuple[str, int]
     Scored = tuple[float, float]  # the step of a score, and the score
@@ -103,8 +106,8 @@ EXTREMES_NS: Final[Ns] = 300 * NS_PER_S
 _MOVED: Final = 0.05
 """In metres; also of each component of a unit quaternion, which is then a turn by 6 degrees."""
 _FEW: Final = 8
-"""Integers of more values in a bag are measurements or counters."""
-_STATE_BYTES: Final = 4
+_OFTEN: Final = 7
+"""Integers of more than `_FEW` values that change more often in a slot are measurements."""
 _STEPS: Final = 20
 """Of a unit of scores: one of 0.52 may stay for one of 0.54. Above 0.5 both are found."""
 _HIGHEST: Final = 1e6
@@ -186,6 +189,30 @@ class _Mover:
 
 
 @dataclass(slots=True)
+class _Changes:
+    """The changes of an integer in some minutes: the log times before each, and of each.
+
+    Attributes:
+        values: that it had, up to one more than are few.
+    """
+
+    values: set[int] = field(default_factory=set)
+    count: int = 0
+    _times: list[IntArray] = field(default_factory=list)
+
+    def add(self, numbers: Numbers, before: IntArray, after: IntArray) -> None:
+        """Adds those among some numbers."""
+        if len(self.values) <= _FEW:
+            self.values.update(np.unique(numbers)[: _FEW + 1].tolist())
+        self.count += after.size
+        self._times += [before, after]
+
+    def times(self, most: int) -> Sequence[IntArray]:
+        """Returns the log times, if the values are few or no more than `most` changes."""
+        return self._times if len(self.values) <= _FEW or self.count <= most else ()
+
+
+@dataclass(slots=True)
 class TopicThinning:
     """Chooses the messages of a topic that stay; its tables are added in order of time.
 
@@ -203,6 +230,8 @@ class TopicThinning:
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
     _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
     """The least and the greatest value of a column in some minutes."""
+    _changes: dict[tuple[str, int], _Changes] = field(default_factory=dict)
+    """Of integers, likewise."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
@@ -212,11 +241,11 @@ class TopicThinning:
             if isinstance(column, Texts):
                 # A text with detections differs in each message, and is none that holds.
                 if not has_labels:
-                    self._add_changes(path, column.codes, column.values(), times)
-            elif _is_discrete(column):
-                self._add_changes(path, column, column.tolist(), times)
-            elif _is_measured(column) or column.dtype.itemsize <= _STATE_BYTES:
-                self._add_extremes(path, np.asarray(column, np.float64), times)
+                    self._stays += self._changed(path, column.codes, column.values(), times)
+            elif _is_measured(column) or not _is_time(table, path):
+                if not _is_measured(column):
+                    self._add_integers(path, column, times)
+                self._add_extremes(path, column, times)
         self._add_moves("", times, _poses(table.columns))
         for path, inner in table.elements.items():
             self._add_frames(inner, times, named)
@@ -276,25 +305,39 @@ class TopicThinning:
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
         extremes = [one[1] for both in self._extremes.values() for one in both]
-        return np.unique(np.concatenate([*self._stays, np.array(extremes, np.int64)]))
+        most = EXTREMES_NS // self.numbers_ns * _OFTEN
+        changes = (time for one in self._changes.values() for time in one.times(most))
+        return np.unique(np.concatenate([*self._stays, *changes, np.array(extremes, np.int64)]))
 
-    def _add_changes(
+    def _changed(
         self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
-    ) -> None:
-        """Adds the messages between which a value changes; `codes` differ where `values` do."""
-        last, at = self._values.get(path, (values[0], int(times[0])))
-        later = np.flatnonzero(codes[1:] != codes[:-1])
-        self._stays += [times[later], times[later + 1]]
-        if last != values[0]:
-            self._stays.append(np.array([at, times[0]], np.int64))
-        self._values[path] = values[-1], int(times[-1])
+    ) -> tuple[IntArray, IntArray]:
+        """Returns the log times before each change of a value, and of each change.
 
-    def _add_extremes(self, path: str, numbers: Points, times: IntArray) -> None:
+        `codes` differ where `values` do.
+        """
+        last, at = self._values.get(path, (values[0], int(times[0])))
+        self._values[path] = values[-1], int(times[-1])
+        later = np.flatnonzero(codes[1:] != codes[:-1])
+        before, after = times[later], times[later + 1]
+        if last != values[0]:
+            return np.append(before, at), np.append(after, times[0])
+        return before, after
+
+    def _add_integers(self, path: str, column: Numbers, times: IntArray) -> None:
+        before, after = self._changed(path, column, column.tolist(), times)
+        parts, parts_after = times // EXTREMES_NS, after // EXTREMES_NS
+        for part in np.unique(parts).tolist():
+            inside = parts_after == part
+            changes = self._changes.setdefault((path, part), _Changes())
+            changes.add(column[parts == part], before[inside], after[inside])
+
+    def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         for part in np.unique(times // EXTREMES_NS).tolist():
             inside = np.flatnonzero((times // EXTREMES_NS == part) & np.isfinite(numbers))
             if not inside.size:
                 continue
-            found = [(float(numbers[nth]), int(times[nth])) for nth in inside.tolist()]
+            found = [*zip(numbers[inside].tolist(), times[inside].tolist(), strict=True)]
             least, greatest = min(found), max(found, key=itemgetter(0))
             before = self._extremes.get((path, part), (least, greatest))
             # Of equal ones the earliest.
@@ -311,7 +354,8 @@ class TopicThinning:
         states = [
             column
             for column in inner.columns.values()
-            if not isinstance(column, Texts) and column.dtype.itemsize == 1 and _is_discrete(column)
+            if not isinstance(column, Texts)
+            if column.dtype.itemsize == 1 and np.unique(column).size <= _FEW
         ]
         if not states:
             return
@@ -321,7 +365,7 @@ class TopicThinning:
         ):
             rows[owner] = (*rows[owner], *values)
         codes = {value: nth for nth, value in enumerate(dict.fromkeys(rows))}
-        self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
+        self._stays += self._changed(path, np.array([codes[value] for value in rows]), rows, times)
 
     def _add_frames(
         self, inner: Elements, times: IntArray, named: Sequence[dict[Name, Scored]]
@@ -381,19 +425,16 @@ def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) 
         rows.append(best)
         for name in [*shown[best]]:
             del missing[name]
-            for names in shown:
-                names.pop(name, None)
+            for left in shown:
+                left.pop(name, None)
     return rows
 
 
-def _is_discrete(column: Column) -> TypeGuard[Numbers]:
-    """Returns whether a column of numbers has states: booleans, and integers of few values."""
-    if isinstance(column, Texts):
-        return False
-    # Those of 64 bits are times.
-    if column.dtype.kind not in "biu" or column.dtype.itemsize > _STATE_BYTES:
-        return False
-    return np.unique(column).size <= _FEW
+def _is_time(table: Table, path: str) -> bool:
+    names = path.split(".")
+    along = fields_at(table.definition, names)
+    kind = along[-1].kind if len(along) == len(names) else ""
+    return isinstance(kind, Definition) and is_time(kind)
 
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
