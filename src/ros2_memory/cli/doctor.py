@@ -40,7 +40,7 @@ from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
-from ros2_memory.core.text import MAX_NAMED, counted, listed
+from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
@@ -479,6 +479,11 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     if live is not None and (other := _other_list(robot, selection, live)):
         yield other
         return
+    for glob in robot.settings.retention.topics:
+        names = (*selection.entries, *robot.snapshot.timeline.topics())
+        if not (selection.matches(glob) or match_topics(names, glob)):
+            do = "compare with `ros2-memory topics`"
+            yield warning(f"{glob} in retention.topics is no topic that is recorded", do)
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(robot, selection, heard)
     unoffered = live.missing if live else ()

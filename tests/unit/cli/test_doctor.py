@@ -458,3 +458,11 @@ def test_the_list_that_up_wrote_beside_the_bags_is_that_of_its_recorder(
     assert any("another list" in each["seen"] for each in examined(1)["topics"])
     (robot / "topics.yaml").write_text("topics: [/odom]\n")
     assert "topics" not in examined(0)
+
+
+def test_a_shorter_life_of_a_topic_that_nobody_records_is_reported(
+    robot: Path, examined: Examined
+) -> None:
+    lives = "retention.topics={/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, /mic: {max_age_h: 1}}"
+    [finding] = examined(1, lives)["topics"]
+    assert finding["seen"] == "/mic in retention.topics is no topic that is recorded"
