@@ -267,11 +267,10 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
         repaired = f"ros2-memory recover {settings.recording.bag_dir}{rest}"
         yield warning(seen, _NOT_REPAIRED if others == len(broken) else repaired)
-    if covered.unread:
-        names = listed([bag.path.name for bag in covered.unread])
-        files = counted(len(covered.unread), "file is", "files are")
-        do = "storage=rosbag2 reads sqlite and compressed bags, too"
-        yield warning(f"{files} not read: {names}", do)
+    for reason in dict.fromkeys(bag.reason for bag in covered.unread):
+        unread = [bag.path.name for bag in covered.unread if bag.reason == reason]
+        files = counted(len(unread), "file is", "files are")
+        yield warning(f"{files} not read: {listed(unread)}", reason)
     odd = bags_with_remarks(snapshot)
     for forms, some, do in (
         (
@@ -479,11 +478,7 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     if live is not None and (other := _other_list(robot, selection, live)):
         yield other
         return
-    for glob in robot.settings.retention.topics:
-        names = (*selection.entries, *robot.snapshot.timeline.topics())
-        if not (selection.matches(glob) or match_topics(names, glob)):
-            do = "compare with `ros2-memory topics`"
-            yield warning(f"{glob} in retention.topics is no topic that is recorded", do)
+    yield from _lives_of_others(robot, selection)
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(robot, selection, heard)
     unoffered = live.missing if live else ()
@@ -510,6 +505,15 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
             yield warning(f"{entry} is in {file}; {unseen}", do)
+
+
+def _lives_of_others(robot: Examined, selection: TopicSelection) -> Iterator[Finding]:
+    """Yields a finding on each key of `retention.topics` that no topic has."""
+    names = (*selection.entries, *robot.snapshot.timeline.topics())
+    for glob in robot.settings.retention.topics:
+        if not (selection.matches(glob) or match_topics(names, glob)):
+            do = "compare with `ros2-memory topics`"
+            yield warning(f"{glob} in retention.topics is no topic that is recorded", do)
 
 
 def _list_file(settings: Settings) -> Path:

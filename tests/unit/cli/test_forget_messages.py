@@ -358,6 +358,19 @@ def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Captur
     assert path.read_bytes() == data
 
 
+@pytest.mark.parametrize(
+    ("name", "do"), [("rec_a_3.MCAP", "rename it"), ("rec_a_3.db3", "choose storage=rosbag2")]
+)
+def test_what_is_not_read_is_named_with_its_reason(
+    bag_dir: Path, capsys: Capture, name: str, do: str
+) -> None:
+    (bag_dir / "rec_a" / name).write_bytes(b"any")
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    kept = f"stays: rec_a/{name}: "
+    [line] = [each for each in capsys.readouterr().out.splitlines() if each.startswith(kept)]
+    assert do in line
+
+
 def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
     path = left(write_db3(bag_dir / "rec_s" / "rec_s_0.db3", messages(0)))
     own_all(bag_dir)
