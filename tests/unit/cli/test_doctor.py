@@ -471,8 +471,8 @@ def test_a_shorter_life_of_a_topic_that_nobody_records_is_reported(
 def test_what_is_not_read_is_reported_with_its_reason(robot: Path, examined: Examined) -> None:
     for name in ("a_0.db3", "b_0.db3", "c_0.MCAP"):
         (robot / "rec" / name).write_bytes(b"any")
-    findings = [each for each in examined(1)["bags"] if "not read" in each["seen"]]
-    assert [(each["seen"], each["do"].partition(":")[2]) for each in findings] == [
+    findings = [finding for finding in examined(1)["bags"] if "not read" in finding["seen"]]
+    assert [(finding["seen"], finding["do"].partition(":")[2]) for finding in findings] == [
         ("2 files are not read: a_0.db3, b_0.db3", " choose storage=rosbag2, which does"),
         ("1 file is not read: c_0.MCAP", " rename it"),
     ]

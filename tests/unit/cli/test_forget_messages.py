@@ -367,7 +367,7 @@ def test_what_is_not_read_is_named_with_its_reason(
     (bag_dir / "rec_a" / name).write_bytes(b"any")
     assert forget(0, 100, "--topic", CAMERA) == 1
     kept = f"stays: rec_a/{name}: "
-    [line] = [each for each in capsys.readouterr().out.splitlines() if each.startswith(kept)]
+    [line] = [line for line in capsys.readouterr().out.splitlines() if line.startswith(kept)]
     assert do in line
 
 
