@@ -105,6 +105,12 @@ def _one_topic(name: str) -> str:
     return name
 
 
+def _topic_glob(glob: str) -> str:
+    if not glob.startswith(("/", "*")):
+        raise ValueError("must be a topic's name or a glob of such: it begins with / or *")
+    return glob
+
+
 def _dot_path(path: str) -> str:
     if not re.fullmatch(r"\w+(\.\w+)*", path):
         raise ValueError("must be a dot-path such as pose.pose.position")
@@ -202,6 +208,7 @@ Folder: TypeAlias = Annotated[AnyPath, PathType("dir")]
 ConfigFile: TypeAlias = Annotated[AnyPath, AfterValidator(_in_config_dir)]
 MessageType: TypeAlias = Annotated[Text, AfterValidator(_message_type)]
 BelowBagDir: TypeAlias = Annotated[Text, AfterValidator(_below)]
+TopicGlob: TypeAlias = Annotated[Text, AfterValidator(_topic_glob)]
 DotPath: TypeAlias = Annotated[Text, AfterValidator(_dot_path)]
 RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
 
@@ -254,8 +261,8 @@ class RecordingSettings:
 class LatchedTopics:
     """Names or globs of topics that count as latched whatever QoS is offered, or never do."""
 
-    include: tuple[Text, ...]
-    exclude: tuple[Text, ...]
+    include: tuple[TopicGlob, ...]
+    exclude: tuple[TopicGlob, ...]
 
 
 @section
@@ -338,7 +345,7 @@ class RetentionSettings:
     max_moments_gb: Tolerance
     foreign: Literal["keep", "delete"]
     require_shipped: Flag
-    topics: dict[Text, TopicLife]
+    topics: dict[TopicGlob, TopicLife]
 
 
 @section
@@ -350,7 +357,7 @@ class MemorySettings:
     """
 
     keep: Flag
-    texts: tuple[Text, ...]
+    texts: tuple[TopicGlob, ...]
     labels: tuple[Text, ...]
     people: tuple[Text, ...]
     max_share: Annotated[float, Field(strict=True, gt=0, le=0.5)]

@@ -40,7 +40,7 @@ from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
-from ros2_memory.core.text import MAX_NAMED, counted, listed
+from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
@@ -269,11 +269,10 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
         repaired = f"ros2-memory recover {settings.recording.bag_dir}{rest}"
         yield warning(seen, _NOT_REPAIRED if others == len(broken) else repaired)
-    if covered.unread:
-        names = listed([bag.path.name for bag in covered.unread])
-        files = counted(len(covered.unread), "file is", "files are")
-        do = "storage=rosbag2 reads sqlite and compressed bags, too"
-        yield warning(f"{files} not read: {names}", do)
+    for reason in dict.fromkeys(bag.reason for bag in covered.unread):
+        unread = [bag.path.name for bag in covered.unread if bag.reason == reason]
+        files = counted(len(unread), "file is", "files are")
+        yield warning(f"{files} not read: {listed(unread)}", reason)
     odd = bags_with_remarks(snapshot)
     for forms, bags, do in (
         (
@@ -483,6 +482,7 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     if live is not None and (finding := _other_list(robot, selection, live)):
         yield finding
         return
+    yield from _lives_of_others(robot, selection)
     heard = {*live.subscribed} - {*live.silent} if live else set[str]()
     missing = _unheard_entries(robot, selection, heard)
     unoffered = live.missing if live else ()
@@ -509,6 +509,15 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
         if entry not in missing:
             do = "is its publisher running? compare with `ros2 topic list`"
             yield warning(f"{entry} is in {file}; {unseen}", do)
+
+
+def _lives_of_others(robot: Examined, selection: TopicSelection) -> Iterator[Finding]:
+    """Yields a finding on each key of `retention.topics` that no topic has."""
+    names = (*selection.entries, *robot.snapshot.timeline.topics())
+    for glob in robot.settings.retention.topics:
+        if not (selection.matches(glob) or match_topics(names, glob)):
+            do = "compare with `ros2-memory topics`"
+            yield warning(f"{glob} in retention.topics is no topic that is recorded", do)
 
 
 def _list_file(settings: Settings) -> Path:

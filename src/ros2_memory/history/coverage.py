@@ -323,7 +323,7 @@ def unread_spans(
         ]
         files = counted(len(lost), "bag file")
         yield f"{files} could not be read and may hold more: {listed(names, len(lost))}"
-    active = being_written(snapshot, window)
+    active = being_written(snapshot, window, nothing=nothing)
     # Splits are not served before they were searched.
     if held := [short_name(aside.path) for aside in active if aside.reason == HELD_BACK]:
         yield f"{HELD_BACK}: {listed(held)}"
@@ -358,13 +358,15 @@ def lost_in(
     ]
 
 
-def being_written(snapshot: Snapshot, window: TimeWindow) -> list[SetAside]:
-    """Returns the files still being written that may hold messages of a window."""
-    return [
-        aside
-        for aside in snapshot.active
-        if _touches(snapshot.unread_spans[aside], window, unknown=True)
-    ]
+def being_written(
+    snapshot: Snapshot, window: TimeWindow, *, nothing: bool = False
+) -> list[SetAside]:
+    """Returns the files still being written that probably hold some of a window.
+
+    With `nothing`, those that may hold some.
+    """
+    spans = snapshot.unread_bounds if nothing else snapshot.unread_spans
+    return [aside for aside in snapshot.active if _touches(spans[aside], window, unknown=True)]
 
 
 def _touches(span: TimeWindow | None, window: TimeWindow, *, unknown: bool) -> bool:

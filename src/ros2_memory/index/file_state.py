@@ -227,12 +227,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
         BagVanishedError: the file does not exist any more.
     """
     if not reader.reads(notes.path):
-        reason = (
-            f"this storage does not read {notes.kind} files: choose storage=rosbag2, which does"
-        )
-        if not notes.file.endswith(notes.kind):
-            reason = f"the name of a bag file must end in {notes.kind}, in lower case: rename it"
-        return _set_aside(FileState.UNREAD, notes, reason)
+        return _set_aside(FileState.UNREAD, notes, reason_unread(notes.path))
     if context.gate.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
@@ -251,6 +246,14 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     if notes.summary is None:
         return _set_aside(FileState.DAMAGED, notes, notes.fault or "it cannot be read")
     return _classify_readable(notes, notes.summary)
+
+
+def reason_unread(path: Path) -> str:
+    """Returns why a storage does not read a bag file, and what to do."""
+    kind = bag_kind(path.name) or ""
+    if not path.name.endswith(kind):
+        return f"the name of a bag file must end in {kind}, in lower case: rename it"
+    return f"this storage does not read {kind} files: choose storage=rosbag2, which does"
 
 
 def files_in_metadata(path: Path) -> frozenset[str]:

@@ -266,20 +266,22 @@ class Snapshot:
 
     @cached_property
     def unread_bounds(self) -> Mapping[SetAside, TimeWindow | None]:
-        """Bounds outside of which the closed files that do not answer contain no message.
+        """Bounds outside of which the files that do not answer contain no message.
 
         Wider than `unread_spans`, which estimate how much a file holds. None: anywhere.
         """
-        return self.bounds_of((*self.damaged, *self.unread))
+        return self.bounds_of((*self.damaged, *self.unread, *self.active))
 
     def bounds_of(self, files: Sequence[SetAside]) -> Mapping[SetAside, TimeWindow | None]:
-        """Returns `unread_bounds` of any closed files, even if they do not exist any more."""
+        """Returns `unread_bounds` of any files, even if they do not exist any more."""
         return {
             **dict.fromkeys(files),
             **{file: self._bounds(file) for file in files[-_MAX_PLACED:]},
         }
 
     def _bounds(self, aside: SetAside) -> TimeWindow | None:
+        if aside.until is not None:
+            return self._unread_span(aside, growing=True)
         name = split_of(str(aside.path))
         # Files that `ros2 bag record` did not number may lie in any order.
         is_split = name is not None and is_recording(name.series)

@@ -391,7 +391,7 @@ class Housekeeping(Housekeeper):
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        if before.fits and not collected.fits:
+        if before.total_bytes <= self._max_bytes < collected.total_bytes:
             state, saved = collected.state_bytes, collected.saved_bytes
             others = collected.total_bytes - state - saved
             _log.error(

@@ -52,6 +52,7 @@ from ros2_memory.core.errors import BagError, EpisodicError
 from ros2_memory.core.model import COMPRESSED, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.index.file_state import reason_unread
 from ros2_memory.retention.delete import repair_name
 from ros2_memory.retention.repair import (
     Identity,
@@ -181,7 +182,7 @@ class Eraser:
             OSError: it has gone.
         """
         if not self._reader.reads(paths[0]):
-            return "storage=rosbag2 reads it, which is not configured"
+            return reason_unread(paths[0])
         if paths[0] in self._written:
             span = self._written[paths[0]]
             if span is not None and span.start >= erasure.windows[-1][1]:

@@ -458,3 +458,21 @@ def test_the_list_that_up_wrote_beside_the_bags_is_that_of_its_recorder(
     assert any("another list" in each["seen"] for each in examined(1)["topics"])
     (robot / "topics.yaml").write_text("topics: [/odom]\n")
     assert "topics" not in examined(0)
+
+
+def test_a_shorter_life_of_a_topic_that_nobody_records_is_reported(
+    robot: Path, examined: Examined
+) -> None:
+    lives = "retention.topics={/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, /mic: {max_age_h: 1}}"
+    [finding] = examined(1, lives)["topics"]
+    assert finding["seen"] == "/mic in retention.topics is no topic that is recorded"
+
+
+def test_what_is_not_read_is_reported_with_its_reason(robot: Path, examined: Examined) -> None:
+    for name in ("a_0.db3", "b_0.db3", "c_0.MCAP"):
+        (robot / "rec" / name).write_bytes(b"any")
+    findings = [finding for finding in examined(1)["bags"] if "not read" in finding["seen"]]
+    assert [(finding["seen"], finding["do"].partition(":")[2]) for finding in findings] == [
+        ("2 files are not read: a_0.db3, b_0.db3", " choose storage=rosbag2, which does"),
+        ("1 file is not read: c_0.MCAP", " rename it"),
+    ]

@@ -330,6 +330,22 @@ def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: in
     assert "stays: rec_a/rec_a_3.mcap: it is being written" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("more", [(), ("--topic", CAMERA)])
+@pytest.mark.parametrize("name", ["rec_20990101T000000Z_0.mcap", "copied_0.db3"])
+def test_what_is_being_written_is_named_wherever_its_times_are(
+    bag_dir: Path, capsys: Capture, name: str, more: tuple[str, ...]
+) -> None:
+    active = bag_dir / name.rpartition("_")[0] / name
+    if active.suffix == ".mcap":
+        write_mcap(active, messages(3), McapLayout(finish=False, chunk_size=2048))
+    else:
+        write_db3(active, messages(3))
+    own_all(bag_dir)
+    assert forget(30, 40, *more, "storage=rosbag2") == 1
+    assert f"stays: {active.relative_to(bag_dir)}: " in capsys.readouterr().out
+    assert forget(10, 19.9, *more, "storage=rosbag2") == 0  # it begins later
+
+
 def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Capture) -> None:
     path = bag_dir / "rec_a" / "rec_a_1.mcap"
     data = bytearray(path.read_bytes())
@@ -340,6 +356,19 @@ def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Captur
     assert forget(0, 100, "--topic", CAMERA) == 1
     assert "stays: rec_a/rec_a_1.mcap: " in capsys.readouterr().out
     assert path.read_bytes() == data
+
+
+@pytest.mark.parametrize(
+    ("name", "do"), [("rec_a_3.MCAP", "rename it"), ("rec_a_3.db3", "choose storage=rosbag2")]
+)
+def test_what_is_not_read_is_named_with_its_reason(
+    bag_dir: Path, capsys: Capture, name: str, do: str
+) -> None:
+    (bag_dir / "rec_a" / name).write_bytes(b"any")
+    assert forget(0, 100, "--topic", CAMERA) == 1
+    kept = f"stays: rec_a/{name}: "
+    [line] = [line for line in capsys.readouterr().out.splitlines() if line.startswith(kept)]
+    assert do in line
 
 
 def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:

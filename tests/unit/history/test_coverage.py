@@ -63,6 +63,15 @@ def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
     assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
 
 
+def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:
+    active = SetAside(Path("/b/copied/copied_0.db3"), "still being written")
+    timeline = Timeline.of((split(0), split(1)))
+    snapshot = Snapshot(timeline, active=(active,), scanned_at=T0 + 3 * DAY)
+    assert told(snapshot, 0, 9) == []
+    named = ["still being written and not included: copied/copied_0.db3"]
+    assert told(snapshot, 0, 9, nothing=True) == named
+
+
 def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:
     odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
     snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)

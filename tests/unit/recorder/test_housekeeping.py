@@ -332,6 +332,7 @@ class TestMakingRoom:
         assert files_in(tmp_path) == before
         (said,) = (each for each in logs if each["event"] == "room_out_of_reach")
         assert 0 < said["most_free_bytes"] < said["free_bytes_wanted"] == PLENTY
+        assert not events(logs, "budget_not_held")
 
     def test_what_another_pass_finds_meanwhile_is_not_taken_for_its_own(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

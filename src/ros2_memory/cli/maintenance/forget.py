@@ -142,10 +142,7 @@ class _Forget:
         self._recorder = _recorder_of(self._bag_dir)
         self._unread: set[Path] = set()  # bags whose first messages are unknown
         snapshot = memory.index.snapshot()
-        written = {aside.path: snapshot.unread_spans[aside] for aside in snapshot.active}
-        for bag in snapshot.bags:
-            if bag.state is BagState.ACTIVE:
-                written[bag.path] = TimeWindow(bag.start, MAX_NS)
+        self._written = {aside.path: self._may_hold(aside, snapshot) for aside in snapshot.active}
         every = OwnRecordings(self._bag_dir)
         self._own = every if settings.retention.foreign == "keep" else None
         static_topics = settings.data.tf_static_topics
@@ -155,7 +152,7 @@ class _Forget:
             self._reader,
             McapWriter(),
             self._own,
-            written=written,
+            written=self._written,
             recorder=self._recorder,
         )
 
@@ -293,14 +290,22 @@ class _Forget:
                     going.append(bag)
         deleted_too = {other_form(bag.file) for bag in going}
         for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
-            reason = aside.reason
+            reason, span = aside.reason, self._written.get(aside.path, span)  # noqa: PLW2901
             if span is None:
                 reason = f"when it was recorded is unknown ({reason})"
-            elif aside.answers or not span.overlaps(window.start, window.stop - 1):
+            elif aside.until is not None or not span.overlaps(window.start, window.stop - 1):
                 continue
             if str(aside.path) not in deleted_too:
                 kept.append(f"{self._name(aside)}: {reason}")
         return going, kept
+
+    def _may_hold(self, aside: SetAside, snapshot: Snapshot) -> TimeWindow | None:
+        """Returns what a file may hold that is being written, from the first message in it."""
+        with suppress(BagError):
+            summary = self._reader.summarize(aside.path)
+            if not summary.empty:
+                return TimeWindow(summary.start, MAX_NS)
+        return snapshot.unread_bounds[aside]
 
     def _raw_bags(self, snapshot: Snapshot) -> Iterator[BagFile]:
         """Yields the bags with all messages in them, also those that do not count."""

@@ -4,9 +4,10 @@ A message that stays is as it was recorded. Those go that say again what others 
 
 - What moves has a pose a second (`STEP_NS`), and one in two while it stands: standstills are found,
   and where poses are farther apart none was recorded.
-- Of a boolean, a status or a name every message stays that changes it, and the last one before.
+- Of a boolean, a status or a name every message stays that changes it, and the last one before. An
+  integer is a status in five minutes in which it has few values, or does not change often.
 - Of the detections of a second, and of the transforms of a slot, as few messages stay as show all
-  labels and frames, and the most of a label at once.
+  labels and frames, each label with its highest score (`_STEPS`), and the most of one at once.
 - Of numbers one of each slot stays, and their least and greatest of five minutes.
 
 No topic is silent for longer than a slot and its own period: what counts as a silence, was one.
@@ -19,7 +20,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from math import ceil, log2
+from math import ceil, isnan, log2, nan
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeGuard
 
@@ -29,13 +30,15 @@ from ros2_memory.analysis.clock_steps import SHORTEST_STEP_NS, STAMPS_BESIDE_NS
 from ros2_memory.analysis.intervals import THINNED_NS
 from ros2_memory.bag_dir.layout import utc_day
 from ros2_memory.bag_dir.state_files import Thinned
+from ros2_memory.columns.plan import fields_at, is_time
 from ros2_memory.columns.steps import Step, step_of
 from ros2_memory.columns.table import Column, Elements, Numbers, Table, Texts
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import NAMES_IN_MESSAGES
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.clock_faults import FaultyClock
-from ros2_memory.messages.detections import detections_of
+from ros2_memory.messages.detections import detections_of, looks_like_json
+from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -45,9 +48,10 @@ if TYPE_CHECKING:
     from ros2_memory.columns.detections import DetectionColumns
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.storage.base import Definition, IntArray
+    from ros2_memory.storage.base import IntArray
 
     Name = tuple[str, int]
+    Scored = tuple[float, float]  # the step of a score, and the score
     _Value = tuple[float, Ns]  # and its log time
     Points = NDArray[np.float64]
 
@@ -104,8 +108,14 @@ EXTREMES_NS: Final[Ns] = 300 * NS_PER_S
 _MOVED: Final = 0.05
 """In metres; also of each component of a unit quaternion, which is then a turn by 6 degrees."""
 _FEW: Final = 8
-"""Integers of more values in a bag are measurements or counters."""
-_STATE_BYTES: Final = 4
+_OFTEN: Final = 7
+"""Integers of more than `_FEW` values that change more often in a slot are measurements."""
+_STEPS: Final = 20
+"""Of a unit of scores: one of 0.52 may stay for one of 0.54. Above 0.5 both are found."""
+_HIGHEST: Final = 1e6
+_SINGLE: Final = 1e-6
+"""What a number of 32 bits may be less than what was meant."""
+_UNSCORED: Final = (0.0, 0.0)
 _LONG: Final = 64
 """Messages with longer arrays are samples: scans, maps, sound, features of faces."""
 _DEGREE_M: Final = 111_320.0
@@ -181,6 +191,30 @@ class _Mover:
 
 
 @dataclass(slots=True)
+class _Changes:
+    """The changes of an integer in some minutes: the log times before each, and of each.
+
+    Attributes:
+        values: that it had, up to one more than are few.
+    """
+
+    values: set[int] = field(default_factory=set)
+    count: int = 0
+    _times: list[IntArray] = field(default_factory=list)
+
+    def add(self, numbers: Numbers, before: IntArray, after: IntArray) -> None:
+        """Adds those among some numbers."""
+        if len(self.values) <= _FEW:
+            self.values.update(np.unique(numbers)[: _FEW + 1].tolist())
+        self.count += after.size
+        self._times += [before, after]
+
+    def times(self, most: int) -> Sequence[IntArray]:
+        """Returns the log times, if the values are few or no more than `most` changes."""
+        return self._times if len(self.values) <= _FEW or self.count <= most else ()
+
+
+@dataclass(slots=True)
 class TopicThinning:
     """Chooses the messages of a topic that stay; its tables are added in order of time.
 
@@ -193,11 +227,13 @@ class TopicThinning:
     _last: Ns | None = None
     _stays: list[IntArray] = field(default_factory=list)
     _slot: int = -1
-    _named: set[Name] = field(default_factory=set)
+    _named: dict[Name, Scored] = field(default_factory=dict)
     _values: dict[str, tuple[object, Ns]] = field(default_factory=dict)
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
     _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
     """The least and the greatest value of a column in some minutes."""
+    _changes: dict[tuple[str, int], _Changes] = field(default_factory=dict)
+    """Of integers, likewise."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
@@ -207,11 +243,11 @@ class TopicThinning:
             if isinstance(column, Texts):
                 # A text with detections differs in each message, and is none that holds.
                 if not has_labels:
-                    self._add_changes(path, column.codes, column.values(), times)
-            elif _is_discrete(column):
-                self._add_changes(path, column, column.tolist(), times)
-            elif _is_measured(column) or column.dtype.itemsize <= _STATE_BYTES:
-                self._add_extremes(path, np.asarray(column, np.float64), times)
+                    self._stays += self._changed(path, column.codes, column.values(), times)
+            elif _is_measured(column) or not _is_time(table, path):
+                if not _is_measured(column):
+                    self._add_integers(path, column, times)
+                self._add_extremes(path, column, times)
         self._add_moves("", times, _poses(table.columns))
         for path, inner in table.elements.items():
             self._add_frames(inner, times, named)
@@ -225,7 +261,7 @@ class TopicThinning:
         for start, stop in zip(starts, [*starts[1:], times.size], strict=True):
             self._add_slot(int(slots[start]), times[start:stop], named[start:stop])
 
-    def _add_slot(self, slot: int, times: IntArray, named: Sequence[set[Name]]) -> None:
+    def _add_slot(self, slot: int, times: IntArray, named: Sequence[Mapping[Name, Scored]]) -> None:
         """Adds few messages of a slot that show all labels and frames in it; at least one."""
         is_new = slot != self._slot
         if is_new:
@@ -242,55 +278,68 @@ class TopicThinning:
         self._stays += [around[after], around[after + 1]]
         self._last = int(times[-1])
 
-    def _labels(self, table: Table) -> list[set[Name]]:
+    def _labels(self, table: Table) -> list[dict[Name, Scored]]:
         """Returns the labels of the detections in each message, also in JSON, with their number."""
         in_table = self.detections.of(table)
-        labels: list[list[str]] = [[] for _ in range(len(table))]
+        labels: list[tuple[int, str, float]] = []
         if in_table is not None:
             detections = in_table.detections
-            for row, label in zip(
-                detections.rows.tolist(), detections.labels.values(), strict=True
-            ):
-                labels[row].append(label)
+            rows, scores = detections.rows.tolist(), detections.scores.tolist()
+            labels += zip(rows, detections.labels.values(), scores, strict=True)
         for column in table.columns.values():
-            if isinstance(column, Texts) and column.words[0].startswith(("{", "[")):
+            if isinstance(column, Texts) and looks_like_json(column.words[0]):
                 for row, text in enumerate(column.values()):
-                    labels[row] += [detection.label for detection in detections_of(text)]
-        return [
-            {
-                (label, repeat)
-                for label, count in Counter(of_message).items()
-                for repeat in range(count)
-            }
-            for of_message in labels
-        ]
+                    labels += [
+                        (row, detection.label, nan if detection.score is None else detection.score)
+                        for detection in detections_of(text)
+                    ]
+        named: list[dict[Name, Scored]] = [{} for _ in range(len(table))]
+        counts = Counter[tuple[int, str]]()
+        for row, label, score in labels:
+            first = named[row].get((label, 0))
+            scored = _stepped(score)
+            named[row][label, 0] = scored if first is None else max(first, scored)
+            if repeat := counts[row, label]:
+                named[row][label, repeat] = _UNSCORED
+            counts[row, label] += 1
+        return named
 
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
-        extremes = [
-            extreme[1]
-            for extremes_of_column in self._extremes.values()
-            for extreme in extremes_of_column
-        ]
-        return np.unique(np.concatenate([*self._stays, np.array(extremes, np.int64)]))
+        extremes = [extreme[1] for both in self._extremes.values() for extreme in both]
+        most = EXTREMES_NS // self.numbers_ns * _OFTEN
+        changed = (time for changes in self._changes.values() for time in changes.times(most))
+        return np.unique(np.concatenate([*self._stays, *changed, np.array(extremes, np.int64)]))
 
-    def _add_changes(
+    def _changed(
         self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
-    ) -> None:
-        """Adds the messages between which a value changes; `codes` differ where `values` do."""
-        last, at = self._values.get(path, (values[0], int(times[0])))
-        later = np.flatnonzero(codes[1:] != codes[:-1])
-        self._stays += [times[later], times[later + 1]]
-        if last != values[0]:
-            self._stays.append(np.array([at, times[0]], np.int64))
-        self._values[path] = values[-1], int(times[-1])
+    ) -> tuple[IntArray, IntArray]:
+        """Returns the log times before each change of a value, and of each change.
 
-    def _add_extremes(self, path: str, numbers: Points, times: IntArray) -> None:
+        `codes` differ where `values` do.
+        """
+        last, at = self._values.get(path, (values[0], int(times[0])))
+        self._values[path] = values[-1], int(times[-1])
+        later = np.flatnonzero(codes[1:] != codes[:-1])
+        before, after = times[later], times[later + 1]
+        if last != values[0]:
+            return np.append(before, at), np.append(after, times[0])
+        return before, after
+
+    def _add_integers(self, path: str, column: Numbers, times: IntArray) -> None:
+        before, after = self._changed(path, column, column.tolist(), times)
+        slots, slots_after = times // EXTREMES_NS, after // EXTREMES_NS
+        for slot in np.unique(slots).tolist():
+            inside = slots_after == slot
+            changes = self._changes.setdefault((path, slot), _Changes())
+            changes.add(column[slots == slot], before[inside], after[inside])
+
+    def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         for slot in np.unique(times // EXTREMES_NS).tolist():
             rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
             if not rows.size:
                 continue
-            samples = [(float(numbers[row]), int(times[row])) for row in rows.tolist()]
+            samples = [*zip(numbers[rows].tolist(), times[rows].tolist(), strict=True)]
             least, greatest = min(samples), max(samples, key=itemgetter(0))
             least_before, most_before = self._extremes.get((path, slot), (least, greatest))
             # Of equal ones the earliest.
@@ -307,7 +356,8 @@ class TopicThinning:
         states = [
             column
             for column in inner.columns.values()
-            if not isinstance(column, Texts) and column.dtype.itemsize == 1 and _is_discrete(column)
+            if not isinstance(column, Texts)
+            if column.dtype.itemsize == 1 and np.unique(column).size <= _FEW
         ]
         if not states:
             return
@@ -317,15 +367,18 @@ class TopicThinning:
         ):
             rows[owner] = (*rows[owner], *values)
         codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
-        self._add_changes(path, np.array([codes[value] for value in rows]), rows, times)
+        numbered = np.array([codes[value] for value in rows])
+        self._stays += self._changed(path, numbered, rows, times)
 
-    def _add_frames(self, inner: Elements, times: IntArray, named: Sequence[set[Name]]) -> None:
+    def _add_frames(
+        self, inner: Elements, times: IntArray, named: Sequence[dict[Name, Scored]]
+    ) -> None:
         """Adds the moves of the frames of transforms, and to `named` the frames in each message."""
         column = inner.columns.get(_FRAME)
         if not isinstance(column, Texts):
             return
         for row, frame in zip(inner.owners.tolist(), column.values(), strict=True):
-            named[row].add((frame, 0))
+            named[row][frame, 0] = _UNSCORED
         for code, frame in enumerate(column.words):
             rows = np.flatnonzero(column.codes == code)
             poses = {path: points[rows] for path, points in _poses(inner.columns).items()}
@@ -344,26 +397,47 @@ def is_sampled(table: Table) -> bool:
     )
 
 
-def _covering(named: Sequence[set[Name]], seen: set[Name]) -> list[int]:
-    """Returns few rows in which all names occur that were not `seen`, and adds these to them."""
-    missing: set[Name] = set().union(*named) - seen
+def _stepped(score: float) -> tuple[float, float]:
+    """Returns a score with its step; one that a detector does not give is the lowest."""
+    score = -_HIGHEST if isnan(score) else max(-_HIGHEST, min(score, _HIGHEST))
+    return (score + _SINGLE) * _STEPS // 1, score
+
+
+def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) -> list[int]:
+    """Returns few rows with all names that were not `seen`, or not so high, and adds these to them.
+
+    Each name is in one of them with its highest score, to a step.
+    """
+    missing: dict[Name, Scored] = {}
+    for names in named:
+        for name, score in names.items():
+            if name not in seen or seen[name][0] < score[0]:
+                missing[name] = max(score, missing.get(name, score))
     seen |= missing
+    shown = [
+        {
+            name: score[1]
+            for name, score in names.items()
+            if name in missing and missing[name][0] == score[0]
+        }
+        for names in named
+    ]
     rows: list[int] = []
     while missing:
-        best = max(range(len(named)), key=lambda row: len(named[row] & missing))
+        best = max(range(len(shown)), key=lambda row: (len(shown[row]), sum(shown[row].values())))
         rows.append(best)
-        missing -= named[best]
+        for name in [*shown[best]]:
+            del missing[name]
+            for left in shown:
+                left.pop(name, None)
     return rows
 
 
-def _is_discrete(column: Column) -> TypeGuard[Numbers]:
-    """Returns whether a column of numbers has states: booleans, and integers of few values."""
-    if isinstance(column, Texts):
-        return False
-    # Those of 64 bits are times.
-    if column.dtype.kind not in "biu" or column.dtype.itemsize > _STATE_BYTES:
-        return False
-    return np.unique(column).size <= _FEW
+def _is_time(table: Table, path: str) -> bool:
+    names = path.split(".")
+    along = fields_at(table.definition, names)
+    kind = along[-1].kind if len(along) == len(names) else ""
+    return isinstance(kind, Definition) and is_time(kind)
 
 
 def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:

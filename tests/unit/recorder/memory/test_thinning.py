@@ -84,6 +84,30 @@ def test_every_change_of_a_boolean_stays_wherever_bags_are_cut(
     assert changes | {n - 1 for n in changes} <= stays
 
 
+@pytest.mark.parametrize("kind", ["UInt8", "Int32", "Int64"])
+@pytest.mark.parametrize("cuts", [(), range(20, 1200, 20)])
+def test_of_integers_states_and_extremes_stay_and_measurements_do_not(
+    tmp_path: Path, kind: str, cuts: Sequence[int]
+) -> None:
+    """Twelve states of 5 s each; others for one message each; and a counter, all at 5 Hz."""
+    of = f"std_msgs/msg/{kind}"
+    at = np.arange(1200)
+    short = np.where((at > 240) & (at < 252), at % 100, 0)
+    spike = np.where(at == 777, 222, at % 97)
+    for values in (at // 25 % 12, short, spike):
+        messages = [
+            Msg("/state", of, T0 + n * S // 5, make(of, data=value))
+            for n, value in enumerate(values.tolist())
+        ]
+        stays = {5 * t // S for t in times_that_stay(tmp_path, cut(messages, cuts))}
+        changes = np.flatnonzero(values[1:] != values[:-1])
+        if values is spike:
+            assert 777 in stays
+            assert len(stays) < 120
+        else:
+            assert {*changes.tolist(), *(changes + 1).tolist()} <= stays
+
+
 @given(st.lists(st.integers(S // 20, 12 * S), min_size=2, max_size=120))
 def test_no_silence_is_made_that_was_not_there(
     tmp_path_factory: pytest.TempPathFactory, steps: list[int]
@@ -128,6 +152,18 @@ def test_all_labels_of_a_slot_are_seen_in_it_and_as_many_at_once(tmp_path: Path)
             most = max(seen[n].count(label) for n in inside)
             assert max(seen[n].count(label) for n in inside if n in stays) == most
     assert len(stays) < 250
+
+
+def test_a_label_stays_with_the_highest_score_of_each_second(tmp_path: Path) -> None:
+    chance = np.random.default_rng(7)
+    scores = np.round(chance.random(300), 2).tolist()
+    messages = [detections(T0 + n * S // 5, ["cup"], score=one) for n, one in enumerate(scores)]
+    stays = {5 * t // S for t in times_that_stay(tmp_path, cut(messages, [130, 133]))}
+    for second in range(60):
+        inside = range(5 * second, 5 * second + 5)
+        best, left = (max(scores[n] for n in some) for some in (inside, stays & {*inside}))
+        assert best == left
+    assert len(stays) < 80
 
 
 @given(st.floats(-1e6, 1e6), st.floats(0.0, 6.28))
