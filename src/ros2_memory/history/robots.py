@@ -315,6 +315,24 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     None for latched topics, which each recording receives again, or where the time for the answer
     is over before it is known, or a lake does not hold the messages.
     """
+    try:
+        return _recordings_beside(view, topic, window)
+    except (QueryTimeoutError, NotInLakeError):
+        return []
+
+
+def recordings_apart(
+    view: View, topics: Sequence[str], window: TimeWindow
+) -> frozenset[Path] | None:
+    """Returns the recordings that are beside another one on some topics; None: not known."""
+    try:
+        pairs = [*chain(*(_recordings_beside(view, topic, window) for topic in topics))]
+    except (QueryTimeoutError, NotInLakeError):
+        return None
+    return frozenset(path for pair in pairs for path in (pair.first, pair.other))
+
+
+def _recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
     if topic in view.timeline.transient_local:
         return []
     found: list[Beside] = []
@@ -328,8 +346,6 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
             if not is_known and _differ(view, topic, pair, each.span.intersect(window)):
                 found.append(each)
                 apart.update(() if each.by_clock else pair)
-    except (QueryTimeoutError, NotInLakeError):
-        return []
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_outside(keep=noted_before)

@@ -195,6 +195,26 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(tmp_path: Path, recalls:
         assert compared["minutes"][name] == {"this": 0.5, "with": 0.0}
 
 
+@pytest.mark.parametrize("since", [0, 18])
+def test_what_two_recorders_of_one_robot_have_is_one_visit(tmp_path: Path, since: int) -> None:
+    """Now one, now the other receives a message first; the second may begin in a visit."""
+    poses = [odom(BEGIN + n * S // 5, min(n / 20, 9.0), 0.0) for n in range(300)]
+    late = [
+        replace(
+            each, log_time=each.log_time + (nth % 3 - 1) * S // 10_000, publish_time=each.log_time
+        )
+        for nth, each in enumerate(poses[since * 5 :])
+    ]
+    write_mcap(tmp_path / "one" / "one_0.mcap", poses[: 300 if not since else 110])
+    write_mcap(tmp_path / "two" / "two_0.mcap", late)
+    memory = spots(memory_of(tmp_path), spot=Circle(5.0, 0.0, 1.0))
+    reply = asked(memory, tmp_path, "visits", where="spot")
+    assert (reply["total"], reply["minutes"]) == (1, 0.13)
+    assert "robots" not in str(reply["notes"])
+    span = {"start": BEGIN / S, "end": BEGIN / S + 60}
+    assert asked(memory, tmp_path, "recap", where="spot", **span)["inside_s"] == 8.0
+
+
 @pytest.mark.parametrize("laps", [6, 130])
 def test_counts_of_visits_depend_on_no_limit_and_are_those_of_the_table(
     tmp_path: Path, laps: int
