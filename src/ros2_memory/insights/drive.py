@@ -9,6 +9,7 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import Elapsed
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
@@ -27,6 +28,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
     MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
@@ -133,7 +135,8 @@ def _standstills_in(
 
     And where they lose speed suddenly without standing still next.
 
-    With each comes whether it goes on after the window, or up to the last pose that is known.
+    With each comes whether it goes on after the window, or up to the last pose that is known; not
+    where others were recorded for `SILENCE_NS` after that pose.
 
     Poses outside of the window count too: a standstill that goes on beyond an end of the window
     ends there, however little of it is inside. So those of windows that follow each other add up.
@@ -146,10 +149,12 @@ def _standstills_in(
     found = standstills_of(joined_blocks([each.blocks for each in stands]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
+    later = min(last, MAX_NS - SILENCE_NS) + SILENCE_NS
+    is_silent = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
     standstills = tuple(
         (
             each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or each.end == last,
+            each.end > end or (each.end == last and not is_silent),
         )
         for each in found
         if each.start < end and each.end > start

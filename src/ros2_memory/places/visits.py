@@ -30,6 +30,7 @@ from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import (
+    NEWEST_POSE_NS,
     WHEREABOUTS,
     joined_in,
     map_placement,
@@ -114,8 +115,9 @@ def visits(
     found = RegionVisits(view, placement.frame_id, place.region, window)
     track, every = found.joined.track, found.every
     newest = _newest(view, topic, track, window, now + FUTURE_NS)
-    # A newer pose shows where the robot is now.
+    # A newer pose shows where the robot is now; or what else was recorded since, that none does.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
+    stale = max(stale, min(view.snapshot.latest or MIN_NS, now) - NEWEST_POSE_NS)
     current = newest if newest is not None and newest >= stale else None
     shown = tuple(_within_asked(found.shown(each, current), window) for each in every[:limit])
     if not placement.is_map:

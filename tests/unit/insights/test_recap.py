@@ -446,6 +446,14 @@ def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> Non
     assert "cup in view" not in before  # all the time
 
 
+def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
+    for end, goes_on in ((15, True), (40, False), (60, False)):
+        events = over(memory_of(tmp_path), 0, end).events
+        assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
+
+
 PLACES = (
     Place("room", "map", Rectangle(-1, 5, -1, 4)),
     Place("corner", "map", Circle(0.0, 3.0, 0.5)),
