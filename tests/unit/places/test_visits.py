@@ -148,6 +148,17 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     assert elsewhere.notes == ()
 
 
+@each_way
+def test_places_may_be_in_utm(tmp_path: Path, recalls: bool) -> None:
+    north = 5.4e6
+    poses = [odom(BEGIN + n * S // 5, 5e5 + n / 10, north) for n in range(150)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert spans(memory, 5e5 + 10, north, radius_m=0.55) == [(19.0, 21.0)]
+    # No robot on Earth is here.
+    assert not visits(memory, Call(), 1e9, 0.0, radius_m=1e9 - 1e8).visits
+
+
 def test_a_robot_that_no_pose_shows_while_others_go_on_may_have_left(tmp_path: Path) -> None:
     poses = line((20, 0.5), (10, 0.0))
     for said, is_there in ((35, True), (45, False)):
