@@ -19,7 +19,7 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
+from ros2_memory.analysis.motion.odometry import GAP_NS, GAP_PERIODS, are_places
 from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
 from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.bag_dir.state_files import read_thinned
@@ -118,28 +118,32 @@ def across_steps(found: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajec
     if not skipped or found.poses < 2:
         return found
     least = GAP_PERIODS * duration_s / (found.poses - 1)
-    crossed = sum(
-        path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+    crossed = [
+        stop - begin
         for begin, stop in elapsed.skipped
-    )
-    gaps = max(0, found.totals.gaps - crossed)
+        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+    ]
+    gaps, gap_ns = max(0, found.totals.gaps - len(crossed)), found.totals.gap_ns - sum(crossed)
     elapsed_s = duration_s - unix_from_ns(skipped)
     return replace(
         found,
-        totals=replace(found.totals, gaps=gaps, gap_m=found.totals.gap_m if gaps else 0.0),
+        totals=replace(
+            found.totals,
+            gaps=gaps,
+            gap_m=found.totals.gap_m if gaps else 0.0,
+            gap_ns=gap_ns if gap_ns > GAP_NS else 0,
+        ),
         avg_speed=mean_speed(found.totals.distance_m, elapsed_s) or found.avg_speed,
     )
 
 
-def while_recorded(
-    found: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
-) -> Trajectory:
+def while_recorded(found: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
     """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
 
-    What was driven in the rest, `unrecorded`, is not part of its length either.
+    What was driven in the rest, `gap_ns`, is not part of its length either.
     """
-    recorded = elapsed.between(path.first, path.last) - unrecorded
-    if not unrecorded or recorded <= 0:
+    recorded = elapsed.between(path.first, path.last) - found.totals.gap_ns
+    if not found.totals.gap_ns or recorded <= 0:
         return found
     avg_speed, fastest = mean_speed(found.totals.distance_m, unix_from_ns(recorded)), None
     if found.max_speed_from == "twist":

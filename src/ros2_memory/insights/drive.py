@@ -46,7 +46,6 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.insights.silences import unrecorded_length
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -62,7 +61,7 @@ class Drive:
     """How the robot moved: its path, and its standstills with whether each goes on afterwards.
 
     `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
-    between moments of the window, `unrecorded` for how much of it no poses were recorded.
+    between moments of the window.
     """
 
     path: PathSlice | None = None
@@ -70,7 +69,6 @@ class Drive:
     standstills: tuple[tuple[Standstill, bool], ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     elapsed: Elapsed = field(default_factory=Elapsed)
-    unrecorded: Ns = 0
 
     @property
     def known(self) -> Trajectory | None:
@@ -97,7 +95,7 @@ class Drive:
         known = self.known
         if known is None:
             return stood or None
-        recorded_s = known.totals.duration_s - unix_from_ns(self.unrecorded)
+        recorded_s = known.totals.duration_s - unix_from_ns(known.totals.gap_ns)
         if not stood:
             is_hidden = length >= SHORTEST_NS and known.totals.distance_m <= CREEP_MPS * recorded_s
             return None if is_hidden else 0
@@ -124,8 +122,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
         return Drive(None, None, standstills, drops, elapsed)
     trajectory = across_steps(path.trajectory(0), path, elapsed)
-    unrecorded = unrecorded_length(view, topic, path, elapsed)
-    return Drive(path, trajectory, standstills, drops, elapsed, unrecorded)
+    return Drive(path, trajectory, standstills, drops, elapsed)
 
 
 def _standstills_in(

@@ -621,6 +621,23 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
 
 
+@pytest.mark.parametrize("split_s", [10, 1000])
+@pytest.mark.parametrize(("hz", "hole_s"), [(10, 25), (10, 60), (0.5, 0), (0.2, 0)])
+def test_mean_speed_does_not_depend_on_how_files_are_split(
+    tmp_path: Path, split_s: int, hz: float, hole_s: int
+) -> None:
+    """A robot that drives at 0.5 m/s; poses are missing for a while, or come seldom."""
+    at = [n / hz for n in range(round(200 * hz)) if not 30 <= n / hz < 30 + hole_s]
+    poses = [odom(BEGIN + round(each * S), each / 2, 0.0, vx=0.5) for each in at]
+    flags = [boolean(BEGIN + n * S, False, "/bumper") for n in range(200)]
+    write_splits(tmp_path, [*poses, *flags], split_s)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 200}
+    path = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", **window)
+    assert path["avg_speed"] == pytest.approx(0.5, abs=0.001)
+    unrecorded_s = path["duration_s"] - path.get("recorded_s", path["duration_s"])
+    assert unrecorded_s == pytest.approx(hole_s, abs=0.11)
+
+
 def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:
     messages = [
         each
