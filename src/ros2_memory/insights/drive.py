@@ -9,13 +9,13 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.clock_steps import Elapsed
-from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
     SHORTEST_NS,
+    SILENCE_NS,
     Stands,
     Standstill,
     joined_blocks,
@@ -46,6 +46,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import require_one_robot
+from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -88,14 +89,17 @@ class Drive:
     def stood(self, length: Ns) -> Ns | None:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
 
-        It is not known where no pose has a valid position, nor where the robot neither moved nor
-        stood for most of the time: noise hides where it stood.
+        It is not known where no pose has a valid position, nor where poses are too far apart to
+        show it, nor where the robot neither moved nor stood for most of the time: noise hides where
+        it stood.
         """
         stood = self.elapsed.among((each.start, each.end) for each, _ in self.standstills)
         known = self.known
         if known is None:
             return stood or None
         recorded_s = known.totals.duration_s - unix_from_ns(known.totals.gap_ns)
+        if ns_from_unix(recorded_s) > SILENCE_NS * max(known.poses - 1, 1):
+            return None
         if not stood:
             is_hidden = length >= SHORTEST_NS and known.totals.distance_m <= CREEP_MPS * recorded_s
             return None if is_hidden else 0
@@ -133,7 +137,7 @@ def _standstills_in(
     And where they lose speed suddenly without standing still next.
 
     With each comes whether it goes on after the window, or up to the last pose that is known; not
-    where others were recorded for `SILENCE_NS` after that pose.
+    where others were recorded for long after that pose.
 
     Poses outside of the window count too: a standstill that goes on beyond an end of the window
     ends there, however little of it is inside. So those of windows that follow each other add up.
@@ -146,7 +150,7 @@ def _standstills_in(
     found = standstills_of(joined_blocks([each.blocks for each in stands]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
-    later = min(last, MAX_NS - SILENCE_NS) + SILENCE_NS
+    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
     is_silent = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
     standstills = tuple(
         (

@@ -239,6 +239,17 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
     assert any("too noisy, or too few" in note for note in reply["notes"])
 
 
+@pytest.mark.parametrize("hz", [0.39, 0.2])
+def test_poses_that_are_too_far_apart_do_not_show_whether_the_robot_stood(
+    tmp_path: Path, hz: float
+) -> None:
+    """It stands for 200 s, and drives for 40 s."""
+    at = [n / hz for n in range(round(240 * hz))]
+    poses = [odom(BEGIN + round(each * S), max(each - 200, 0) / 2, 0.0) for each in at]
+    write_splits(tmp_path, poses, 300)
+    assert over(memory_of(tmp_path), 0, 240).stood is None
+
+
 def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_path: Path) -> None:
     draw = random.Random(3)
     write_mcap(
