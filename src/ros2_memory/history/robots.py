@@ -315,6 +315,8 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
     None for latched topics, which each recording receives again, or where the time for the answer
     is over before it is known, or a lake does not hold the messages.
     """
+    if topic in view.timeline.transient_local:
+        return []
     try:
         return _recordings_beside(view, topic, window)
     except (QueryTimeoutError, NotInLakeError):
@@ -324,7 +326,10 @@ def recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside
 def recordings_apart(
     view: View, topics: Sequence[str], window: TimeWindow
 ) -> frozenset[Path] | None:
-    """Returns the recordings that are beside another one on some topics; None: not known."""
+    """Returns the recordings that are beside another one on some topics, latched ones too.
+
+    None where that is not known.
+    """
     try:
         pairs = [*chain(*(_recordings_beside(view, topic, window) for topic in topics))]
     except (QueryTimeoutError, NotInLakeError):
@@ -333,8 +338,6 @@ def recordings_apart(
 
 
 def _recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Beside]:
-    if topic in view.timeline.transient_local:
-        return []
     found: list[Beside] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
