@@ -332,7 +332,7 @@ def pose_frame(view: View, topic: str) -> str:
     known = view.memo.of(_POSE_FRAMES, dict)
     if topic not in known:
         body = robot_body(view) if topic in view.limits.tf_topics else None
-        known[topic] = _newest_frame(view, topic) if body is None else body.parent
+        known[topic] = _newest_frame(view, topic) if body is None else body.odometry
     return known[topic]
 
 
@@ -357,13 +357,15 @@ def _newest_frame(view: View, topic: str) -> str:
 class Body(NamedTuple):
     """The robot's body among the frames that move: `child` in `parent`, and the other frames.
 
-    `above`: the frames above it, the nearest first.
+    `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
+    no correction of the map is driven: that of odometry, else `parent`.
     """
 
     parent: str
     child: str
     others: tuple[str, ...]
     above: tuple[str, ...]
+    odometry: str
 
 
 def robot_body(view: View) -> Body | None:
@@ -382,7 +384,8 @@ def robot_body(view: View) -> Body | None:
     body = min(moving, key=lambda each: (_rank(each, map_frame), len(above[each]), each))
     root = map_frame if map_frame in above[body] else above[body][-1]
     others = sorted({each for each in moving if each != body})
-    return Body(root, body, tuple(others), tuple(above[body]))
+    odometry = next(filter(_is_odometry, above[body]), root)
+    return Body(root, body, tuple(others), tuple(above[body]), odometry)
 
 
 def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -394,9 +397,13 @@ def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
     return found
 
 
+def _is_odometry(frame: str) -> bool:
+    return frame.rpartition("/")[2].startswith("odom")
+
+
 def _rank(frame: str, map_frame: str | None) -> int:
     name = frame.rpartition("/")[2]
-    if name == map_frame or name.startswith("odom"):
+    if name == map_frame or _is_odometry(frame):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
@@ -422,7 +429,7 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
         body = robot_body(view)
     if body is None:
         return resolve_pose_topic(view, name, degrees=degrees)
-    view.notes.add(f"by transforms, of {body.child} in {body.parent}{why}")
+    view.notes.add(f"by transforms, of {body.child}{why}")
     return name or topics[0]
 
 
@@ -458,8 +465,7 @@ def newest_of_body(
 def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     """Returns the poses of the robot's body by transforms, in order; none without such a body.
 
-    In the map or the root of its frames. At most twenty a second: all are looked up for each
-    question.
+    In the frame of its odometry. At most twenty a second: all are looked up for each question.
 
     Raises:
         InvalidArgumentsError: there are too many bags for that.
@@ -475,7 +481,7 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions, parent = sessions_of(view), body.parent
+    sessions, parent = sessions_of(view), body.odometry
     for session in dict.fromkeys(sessions.of(each.bag.recording) for each in bags):
         moving = moving_in(view, window.widened(TF_CACHE_NS), session)
         frames = frames_of(view, static_transforms(view, session), moving, parent)
@@ -486,7 +492,6 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
         if found is None:
             continue
         last = MIN_NS
-        # None is before the first transform of the map, or in its gap.
         for nth in np.flatnonzero(found.valid).tolist():
             if own[nth].log_time - last >= _STEP_NS:
                 last = own[nth].log_time
