@@ -115,6 +115,11 @@ class JoinedTrack:
         """Those of all robots."""
         return self.track, *self.others
 
+    def reaches(self, window: TimeWindow) -> bool:
+        """Whether it is known at any time of a window where a robot was."""
+        pieces = (zip(*each.pieces, strict=True) for each in self.tracks)
+        return any(window.overlaps(start, stop) for start, stop in chain(*pieces))
+
     def inside(self, region: Region, window: TimeWindow) -> list[Inside]:
         """Returns when any robot was inside of a region, in order; times of several may overlap."""
         return sorted(chain(*(robot_inside(each, region, window) for each in self.tracks)))
