@@ -463,6 +463,24 @@ def test_the_path_by_transforms_is_that_by_poses(tmp_path: Path, recalls: bool) 
     assert (there[0]["place"], there[0]["entries"]) == ("door", 1)
 
 
+def test_bodies_of_other_robots_are_named(tmp_path: Path) -> None:
+    messages = [
+        tf(T0 + n * S, *(transform(T0 + n * S, *pair, (x, 0.0, 0.0)) for pair, x in edges))
+        for n in range(9)
+        for edges in [
+            [
+                (("map", "one/base_link"), n),
+                (("one/base_link", "one/arm/base_link"), 0.1 * n),
+                (("map", "two/base_link"), 5.0),
+            ]
+        ]
+    ]
+    write_mcap(tmp_path / "rec_0" / "rec_0_0.mcap", messages)
+    notes = ask(tmp_path, False, "visits", x=5.0, y=0.0)["notes"]
+    assert "by transforms, of one/base_link: no topic has the robot's poses" in notes
+    assert "not of two/base_link, as of other robots" in notes
+
+
 def test_a_path_by_transforms_has_a_bound_but_visits_have_none(tmp_path: Path) -> None:
     for nth in range(130):
         at = T0 + nth * 10 * S

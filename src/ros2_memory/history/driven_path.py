@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.text import counted
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
@@ -358,7 +358,8 @@ class Body(NamedTuple):
     """The robot's body among the frames that move: `child` in `parent`, and the other frames.
 
     `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
-    no correction of the map is driven: that of odometry, else `parent`.
+    no correction of the map is driven: that of odometry, else `parent`. `beside`: the bodies of
+    other robots, by their names.
     """
 
     parent: str
@@ -366,6 +367,7 @@ class Body(NamedTuple):
     others: tuple[str, ...]
     above: tuple[str, ...]
     odometry: str
+    beside: tuple[str, ...]
 
 
 def robot_body(view: View) -> Body | None:
@@ -385,7 +387,9 @@ def robot_body(view: View) -> Body | None:
     root = map_frame if map_frame in above[body] else above[body][-1]
     others = sorted({each for each in moving if each != body})
     odometry = next(filter(_is_odometry, above[body]), root)
-    return Body(root, body, tuple(others), tuple(above[body]), odometry)
+    named = (each for each in others if _rank(each, map_frame) < len(_BODIES))
+    beside = (each for each in named if each not in above[body] and body not in above[each])
+    return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
 
 
 def _above(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -430,6 +434,8 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
     if body is None:
         return resolve_pose_topic(view, name, degrees=degrees)
     view.notes.add(f"by transforms, of {body.child}{why}")
+    if body.beside:
+        view.notes.add(f"not of {listed(body.beside)}, as of other robots")
     return name or topics[0]
 
 
