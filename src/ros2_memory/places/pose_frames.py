@@ -16,9 +16,11 @@ from functools import cached_property
 from heapq import merge
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.analysis.frames import HOLD_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, place_at
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, jumps, place_at
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -373,6 +375,12 @@ class RobotPlaces:
         if self.frame_id != self.map_frame:
             return None
         return place_at(self._track, time, SILENCE_NS)
+
+    def within(self, start: Ns, end: Ns) -> Ns:
+        """Returns a time for where the robot stood: the middle; the start, if the map jumps."""
+        first, last = np.searchsorted(self._track.times, (start, end)).tolist()
+        has_jumped = jumps(self._track)[max(first - 1, 0) : last].any()
+        return start if has_jumped else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""

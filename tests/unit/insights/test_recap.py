@@ -477,6 +477,18 @@ def in_places(memory: Memory, frame_id: str = "map") -> Memory:
     return replace(memory, limits=replace(memory.limits, places=places))
 
 
+def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None:
+    messages = [odom(BEGIN + n * S // 20, 0.0, 2.0, 0.0) for n in range(1200)]
+    for n in range(600):
+        x = 60.5 if n > 300 else 0.0
+        at = BEGIN + n * S // 10 + S // 50
+        messages.append(tf(at, transform(at, "map", "odom", (x, 0.0, 0.0))))
+    write_splits(tmp_path, messages)
+    events = over(in_places(memory_of(tmp_path)), 0, 60).events
+    [stop] = [each for each in events if each.kind == "stop"]
+    assert (stop.text, stop.places) == ("stood at x 0.00, y 2.00", ("room",))
+
+
 @each_way
 def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
     tmp_path: Path, recalls: bool
