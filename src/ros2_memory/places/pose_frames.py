@@ -41,6 +41,7 @@ from ros2_memory.history.driven_path import (
     resolve_path_topic,
     robot_body,
 )
+from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connected,
     connects,
@@ -272,14 +273,29 @@ def known_placement(view: View) -> MapPlacement | None:
 
 
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
-    """Returns whether all poses in some windows are of one session, whose odometry goes on."""
+    """Returns whether all poses in some windows are of one session, whose odometry goes on.
+
+    Or of several that repeat each other where they overlap, as a copy does.
+    """
     sessions, asked = sessions_of(view), tuple(windows)
-    found = {
-        sessions.of(recording)
+    held = sorted(
+        (*span, recording)
         for recording, span in view.timeline.recordings(topic).items()
         if any(window.overlaps(*span) for window in asked)
-    }
-    return len(found) < 2
+    )
+    among = {sessions.of(held[0][2])} if held else set()
+    reach = held[0][1] if held else MIN_NS
+    for first, last, recording in held:
+        if (own := sessions.of(recording)) not in among:
+            both = TimeWindow(first, max(min(reach, last) + 1, first))
+            bags = view.stream.overlapping_bags([topic], both)
+            # One that a wrong clock dated spans years, without bags.
+            overlap = len({each.bag.recording for each in bags}) > 1
+            if not overlap or recordings_apart(view, [topic], both) != frozenset():
+                return False
+            among.add(own)
+        reach = max(reach, last)
+    return True
 
 
 def changing_origin(frame_id: str) -> str:

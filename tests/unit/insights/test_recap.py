@@ -480,7 +480,7 @@ def in_places(memory: Memory, frame_id: str = "map") -> Memory:
 def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None:
     messages = [odom(BEGIN + n * S // 20, 0.0, 2.0, 0.0) for n in range(1200)]
     for n in range(600):
-        x = 60.5 if n > 300 else 0.0
+        x = 60.5 if n >= 300 else 0.0
         at = BEGIN + n * S // 10 + S // 50
         messages.append(tf(at, transform(at, "map", "odom", (x, 0.0, 0.0))))
     write_splits(tmp_path, messages)
