@@ -162,7 +162,9 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     ]
     deleted = (ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back)
     found = (_step_in(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:])
-    return sorted({*steps, *deleted, *filter(None, found)})
+    every = sorted({*steps, *deleted, *filter(None, found)}, reverse=True)
+    # A step back is a minimum: of two at one time the longer one is nearer to the truth.
+    return sorted({each.at: each for each in every}.values())
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:
