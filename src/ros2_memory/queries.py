@@ -92,7 +92,7 @@ from ros2_memory.history.view import (
 )
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.insights.fields import extremes_of
-from ros2_memory.insights.silences import describe_silences, silences_of, unrecorded_length
+from ros2_memory.insights.silences import describe_silences, silences_of
 from ros2_memory.insights.status import (
     bags_with_remarks,
     clock_faults,
@@ -586,9 +586,8 @@ def trajectory_summary(
     note_edges(view, window)
     note_runs(view, name, path.frames[0], window)
     elapsed = elapsed_in(view, window)
-    unrecorded = unrecorded_length(view, name, path, elapsed)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
-    driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path, unrecorded)
+    driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
     drawn = driven
     if max_waypoints < _FEWEST_OF_A_LINE:
         last = driven.waypoints[-1:] if max_waypoints else ()
@@ -605,7 +604,7 @@ def trajectory_summary(
         path.last,
         drawn,
         elapsed.skipped_between(path.first, path.last),
-        unrecorded,
+        driven.totals.gap_ns,
         away,
         notes=view.notes.sentences(),
     )

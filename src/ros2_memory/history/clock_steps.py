@@ -19,7 +19,7 @@ from ros2_memory.analysis.clock_steps import (
     step_by_delays,
     step_over,
 )
-from ros2_memory.analysis.motion.odometry import GAP_PERIODS, are_places
+from ros2_memory.analysis.motion.odometry import GAP_NS, GAP_PERIODS, are_places
 from ros2_memory.analysis.motion.trajectory import PathSlice, Trajectory, mean_speed
 from ros2_memory.analysis.poses import NO_POSES, Poses, joined_poses
 from ros2_memory.bag_dir.state_files import read_thinned
@@ -117,31 +117,35 @@ def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> T
     skipped = elapsed.skipped_between(path.first, path.last)
     if not skipped or trajectory.poses < 2:
         return trajectory
+    totals = trajectory.totals
     least = GAP_PERIODS * duration_s / (trajectory.poses - 1)
-    crossed = sum(
-        path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+    crossed = [
+        stop - begin
         for begin, stop in elapsed.skipped
-    )
-    gaps = max(0, trajectory.totals.gaps - crossed)
+        if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
+    ]
+    gaps, gap_ns = max(0, totals.gaps - len(crossed)), totals.gap_ns - sum(crossed)
     elapsed_s = duration_s - unix_from_ns(skipped)
     return replace(
         trajectory,
         totals=replace(
-            trajectory.totals, gaps=gaps, gap_m=trajectory.totals.gap_m if gaps else 0.0
+            totals,
+            gaps=gaps,
+            gap_m=totals.gap_m if gaps else 0.0,
+            gap_ns=gap_ns if gap_ns > GAP_NS else 0,
         ),
-        avg_speed=mean_speed(trajectory.totals.distance_m, elapsed_s) or trajectory.avg_speed,
+        avg_speed=mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed,
     )
 
 
-def while_recorded(
-    trajectory: Trajectory, elapsed: Elapsed, path: PathSlice, unrecorded: Ns
-) -> Trajectory:
+def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
     """Returns a trajectory whose mean speed is over the time in which its poses were recorded.
 
-    What was driven in the rest, `unrecorded`, is not part of its length either.
+    What was driven in the rest, `gap_ns`, is not part of its length either.
     """
-    recorded = elapsed.between(path.first, path.last) - unrecorded
-    if not unrecorded or recorded <= 0:
+    gap_ns = trajectory.totals.gap_ns
+    recorded = elapsed.between(path.first, path.last) - gap_ns
+    if not gap_ns or recorded <= 0:
         return trajectory
     avg_speed, fastest = mean_speed(trajectory.totals.distance_m, unix_from_ns(recorded)), None
     if trajectory.max_speed_from == "twist":
@@ -162,7 +166,9 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     steps_in_pauses = (
         _step_of_pause(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:]
     )
-    return sorted({*steps, *deleted, *filter(None, steps_in_pauses)})
+    newest_first = sorted({*steps, *deleted, *filter(None, steps_in_pauses)}, reverse=True)
+    # A step back is a minimum: of two at one time the longer one is nearer to the truth.
+    return sorted({step.at: step for step in newest_first}.values())
 
 
 def _suspects(view: View, window: TimeWindow) -> list[Pause]:

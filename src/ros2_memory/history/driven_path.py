@@ -29,7 +29,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
-from ros2_memory.core.text import counted
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
@@ -344,7 +344,7 @@ def pose_frame(view: View, topic: str) -> str:
     frames = view.memo.of(_POSE_FRAMES, dict)
     if topic not in frames:
         body = robot_body(view) if topic in view.limits.tf_topics else None
-        frames[topic] = _newest_frame(view, topic) if body is None else body.parent
+        frames[topic] = _newest_frame(view, topic) if body is None else body.odometry
     return frames[topic]
 
 
@@ -369,13 +369,17 @@ def _newest_frame(view: View, topic: str) -> str:
 class Body(NamedTuple):
     """The robot's body among the frames that move: `child` in `parent`, and the other frames.
 
-    `above`: the frames above it, the nearest first.
+    `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
+    no correction of the map is driven: that of odometry, else `parent`. `beside`: the bodies of
+    other robots, by their names.
     """
 
     parent: str
     child: str
     others: tuple[str, ...]
     above: tuple[str, ...]
+    odometry: str
+    beside: tuple[str, ...]
 
 
 def robot_body(view: View) -> Body | None:
@@ -394,7 +398,10 @@ def robot_body(view: View) -> Body | None:
     body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
     others = sorted({child for child in moving if child != body})
-    return Body(root, body, tuple(others), tuple(above[body]))
+    odometry = next(filter(_is_odometry, above[body]), root)
+    named = (child for child in others if _body_rank(child, map_frame) < len(_BODIES))
+    beside = (child for child in named if child not in above[body] and body not in above[child])
+    return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
 
 
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -406,9 +413,13 @@ def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
     return frames
 
 
+def _is_odometry(frame: str) -> bool:
+    return frame.rpartition("/")[2].startswith("odom")
+
+
 def _body_rank(frame: str, map_frame: str | None) -> int:
     name = frame.rpartition("/")[2]
-    if name == map_frame or name.startswith("odom"):
+    if name == map_frame or _is_odometry(frame):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
@@ -434,7 +445,9 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
         body = robot_body(view)
     if body is None:
         return resolve_pose_topic(view, name, degrees=degrees)
-    view.notes.add(f"by transforms, of {body.child} in {body.parent}{why}")
+    view.notes.add(f"by transforms, of {body.child}{why}")
+    if body.beside:
+        view.notes.add(f"not of {listed(body.beside)}, as of other robots")
     return name or topics[0]
 
 
@@ -471,8 +484,7 @@ def newest_of_body(
 def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     """Returns the poses of the robot's body by transforms, in order; none without such a body.
 
-    In the map or the root of its frames. At most twenty a second: all are looked up for each
-    question.
+    In the frame of its odometry. At most twenty a second: all are looked up for each question.
 
     Raises:
         InvalidArgumentsError: there are too many bags for that.
@@ -500,7 +512,7 @@ def _poses_of_body_in(
 ) -> Iterator[tuple[Ns, Pose]]:
     """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
     moving = moving_in(view, window.widened(TF_CACHE_NS), session)
-    frames = frames_of(view, static_transforms(view, session), moving, body.parent)
+    frames = frames_of(view, static_transforms(view, session), moving, body.odometry)
     of_body = [
         transform
         for transform in moving
@@ -518,4 +530,4 @@ def _poses_of_body_in(
         if log_times[nth] - last >= _STEP_NS:
             last = log_times[nth]
             there = placed.at(nth)
-            yield last, Pose(there.translation, there.rotation, body.parent)
+            yield last, Pose(there.translation, there.rotation, body.odometry)

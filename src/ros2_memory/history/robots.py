@@ -325,6 +325,27 @@ def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[Para
     """
     if topic in view.timeline.transient_local:
         return []
+    try:
+        return _recordings_beside(view, topic, window)
+    except (QueryTimeoutError, NotInLakeError):
+        return []
+
+
+def recordings_apart(
+    view: View, topics: Sequence[str], window: TimeWindow
+) -> frozenset[Path] | None:
+    """Returns the recordings that are beside another one on some topics, latched ones too.
+
+    None where that is not known.
+    """
+    try:
+        pairs = [*chain(*(_recordings_beside(view, topic, window) for topic in topics))]
+    except (QueryTimeoutError, NotInLakeError):
+        return None
+    return frozenset(path for pair in pairs for path in (pair.first, pair.other))
+
+
+def _recordings_beside(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
@@ -336,8 +357,6 @@ def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[Para
             if not is_known and _differ(view, topic, pair, beside.span.intersect(window)):
                 differing.append(beside)
                 apart.update(() if beside.by_clock else pair)
-    except (QueryTimeoutError, NotInLakeError):
-        return []
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_outside(keep=noted_before)

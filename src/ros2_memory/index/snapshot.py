@@ -191,7 +191,8 @@ class Snapshot:
         Between bags or within one; see `index.holes`. Carried messages and bags that a wrong clock
         dated do not count. A step forward of the clock looks alike: see `View.gaps`.
         """
-        return [(pause.start, pause.end) for pause in self._rhythm.gaps(self._pauses)]
+        # Each bag of several that hold the same has it.
+        return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self._pauses)})
 
     @cached_property
     def shortest_gap(self) -> Ns:

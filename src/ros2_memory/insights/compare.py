@@ -243,27 +243,31 @@ def _places(
     where: Where | None,
     elapsed: Sequence[Elapsed],
 ) -> list[dict[str, float | None]]:
-    """Returns the minutes in each named place, or in a region, of each window."""
+    """Returns the minutes in each named place, or in a region, of each window.
+
+    None where it is not known at any time of a window where the robot was.
+    """
     places = view.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
     found: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            inside = [
-                (place.name, joined.inside(place.region, window))
+            asked = [
+                (place.name, place.region, joined)
                 for place, joined in places_in(view, places, placement, window)
             ]
         else:
-            inside = [
-                (place.title, joined_in(view, frame, window).inside(place.region, window))
+            asked = [
+                (place.title, place.region, joined_in(view, frame, window))
                 for place in where.each
                 for frame in [place.frame_id or placement.frame_id]
             ]
-        lasted = {
-            name: passed.among((one.start, one.stop) for one in times) for name, times in inside
-        }
-        found.append({name: unix_from_ns(each) / 60 for name, each in lasted.items()})
+        minutes: dict[str, float | None] = {}
+        for name, region, joined in asked:
+            lasted = passed.among((one.start, one.stop) for one in joined.inside(region, window))
+            minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
+        found.append(minutes)
     return found
 
 

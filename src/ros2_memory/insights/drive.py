@@ -15,6 +15,7 @@ from ros2_memory.analysis.motion.standstills import (
     CONTEXT_NS,
     CREEP_MPS,
     SHORTEST_NS,
+    SILENCE_NS,
     Stands,
     Standstill,
     joined_blocks,
@@ -27,6 +28,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
+    MAX_NS,
     MIN_NS,
     NS_PER_S,
     START_SLACK_NS,
@@ -44,7 +46,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.no_data import resolve_pose_topic
 from ros2_memory.history.robots import require_one_robot
-from ros2_memory.insights.silences import unrecorded_length
+from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -60,7 +62,7 @@ class Drive:
     """How the robot moved: its path, and its standstills with whether each goes on afterwards.
 
     `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
-    between moments of the window, `unrecorded` for how much of it no poses were recorded.
+    between moments of the window.
     """
 
     path: PathSlice | None = None
@@ -68,7 +70,6 @@ class Drive:
     standstills: tuple[tuple[Standstill, bool], ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     elapsed: Elapsed = field(default_factory=Elapsed)
-    unrecorded: Ns = 0
 
     @property
     def known(self) -> Trajectory | None:
@@ -88,14 +89,17 @@ class Drive:
     def stood(self, length: Ns) -> Ns | None:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
 
-        It is not known where no pose has a valid position, nor where the robot neither moved nor
-        stood for most of the time: noise hides where it stood.
+        It is not known where no pose has a valid position, nor where poses are too far apart to
+        show it, nor where the robot neither moved nor stood for most of the time: noise hides where
+        it stood.
         """
         stood = self.elapsed.among((each.start, each.end) for each, _ in self.standstills)
         known = self.known
         if known is None:
             return stood or None
-        recorded_s = known.totals.duration_s - unix_from_ns(self.unrecorded)
+        recorded_s = known.totals.duration_s - unix_from_ns(known.totals.gap_ns)
+        if ns_from_unix(recorded_s) > SILENCE_NS * max(known.poses - 1, 1):
+            return None
         if not stood:
             is_hidden = length >= SHORTEST_NS and known.totals.distance_m <= CREEP_MPS * recorded_s
             return None if is_hidden else 0
@@ -122,8 +126,7 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
         view.notes.add(f"{topic} has no poses in this time: the path is unknown")
         return Drive(None, None, standstills, drops, elapsed)
     trajectory = across_steps(path.trajectory(0), path, elapsed)
-    unrecorded = unrecorded_length(view, topic, path, elapsed)
-    return Drive(path, trajectory, standstills, drops, elapsed, unrecorded)
+    return Drive(path, trajectory, standstills, drops, elapsed)
 
 
 def _standstills_in(
@@ -133,7 +136,8 @@ def _standstills_in(
 
     And where they lose speed suddenly without standing still next.
 
-    With each comes whether it goes on after the window, or up to the last pose that is known.
+    With each comes whether it goes on after the window, or up to the last pose that is known; not
+    where others were recorded for long after that pose.
 
     Poses outside of the window count too: a standstill that goes on beyond an end of the window
     ends there, however little of it is inside. So those of windows that follow each other add up.
@@ -146,10 +150,12 @@ def _standstills_in(
     found = standstills_of(joined_blocks([each.blocks for each in stands]))
     last = max((each.last for each in stands), default=MIN_NS)
     begins = [each.start for each in found]
+    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
+    is_silent = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
     standstills = tuple(
         (
             each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or each.end == last,
+            each.end > end or (each.end == last and not is_silent),
         )
         for each in found
         if each.start < end and each.end > start

@@ -166,7 +166,9 @@ def recap(
     ]
     if places is not None:
         shown = [
-            replace(each, places=places.names_at(_when(each))) if each.kind in _OF_ROBOT else each
+            replace(each, places=places.names_at(_when(each, places)))
+            if each.kind in _OF_ROBOT
+            else each
             for each in shown
         ]
     stood = drive.stood(end - start)
@@ -279,10 +281,10 @@ def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
     )
 
 
-def _when(event: Event) -> Ns:
-    """Returns at which log time (ns) to place an event: in the middle of a stop, or its start."""
+def _when(event: Event, places: RobotPlaces) -> Ns:
+    """Returns at which log time (ns) to place an event."""
     stood = event.kind == "stop" and event.end is not None
-    return (event.start + (event.end or 0)) // 2 if stood else event.start
+    return places.within(event.start, event.end or 0) if stood else event.start
 
 
 def found_events(
@@ -386,7 +388,7 @@ def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None)
         (x, y, _), frame = box.centre, ""
         point: tuple[float, float] | None = (x, y)
         if places is not None and places.frame_id != places.pose_frame:
-            point = places.at((start + end) // 2)
+            point = places.at(places.within(start, end))
             x, y = point or (x, y)
             frame = "" if point else f" in {places.pose_frame}"
         # z: a rounded -0.00 reads as 0.00.

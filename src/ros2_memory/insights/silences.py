@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-import numpy as np
-
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
@@ -19,14 +17,11 @@ from ros2_memory.core.timebase import (
     local_text,
 )
 from ros2_memory.history.coverage import cut_spans, recording_gaps, unix_text
-from ros2_memory.index.holes import SHORTEST_GAP_NS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
-    from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.analysis.motion.trajectory import PathSlice
     from ros2_memory.history.context import Memory
     from ros2_memory.history.view import View
     from ros2_memory.index.snapshot import Snapshot
@@ -96,29 +91,9 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[N
 
     Nothing was recorded, or the topic has a usual rate and was silent.
     """
-    return united([*recording_gaps(view, window), *_silent(view, topic, window)])
-
-
-def unrecorded_length(view: View, topic: str, path: PathSlice, elapsed: Elapsed) -> Ns:
-    """Returns for how long no poses were recorded between the first and the last of a path.
-
-    That is between two bags with poses, whatever others hold, and while the topic was silent.
-    """
-    window = TimeWindow(path.first, path.last + 1)
-    firsts, lasts = view.bounds(topic, window)
-    order = np.argsort(firsts, kind="stable")
-    begins, ends = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
-    apart = begins - ends > SHORTEST_GAP_NS
-    between = zip(ends[apart].tolist(), begins[apart].tolist(), strict=True)
-    return sum(
-        elapsed.between(max(start, path.first), min(end, path.last))
-        for start, end in united([*between, *_silent(view, topic, window)])
-        if start < path.last and path.first < end
-    )
-
-
-def _silent(view: View, topic: str, window: TimeWindow) -> list[tuple[Ns, Ns]]:
-    return [(each.start, each.end) for each in silences_in(view, window) if each.topic == topic]
+    silences = (each for each in silences_in(view, window) if each.topic == topic)
+    silent = ((each.start, each.end) for each in silences)
+    return united([*recording_gaps(view, window), *silent])
 
 
 def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -> tuple[str, ...]:

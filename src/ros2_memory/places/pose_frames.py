@@ -16,9 +16,11 @@ from functools import cached_property
 from heapq import merge
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.analysis.frames import HOLD_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, place_at
+from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, jumps, place_at
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -39,6 +41,7 @@ from ros2_memory.history.driven_path import (
     resolve_path_topic,
     robot_body,
 )
+from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connects,
     connects_in_time,
@@ -271,14 +274,29 @@ def known_placement(view: View) -> MapPlacement | None:
 
 
 def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
-    """Returns whether all poses in some windows are of one session, whose odometry goes on."""
+    """Returns whether all poses in some windows are of one session, whose odometry goes on.
+
+    Or of several that repeat each other where they overlap, as a copy does.
+    """
     sessions, asked = sessions_of(view), tuple(windows)
-    held_by = {
-        sessions.of(recording)
+    spans = sorted(
+        (*span, recording)
         for recording, span in view.timeline.recordings(topic).items()
         if any(window.overlaps(*span) for window in asked)
-    }
-    return len(held_by) < 2
+    )
+    joined = {sessions.of(spans[0][2])} if spans else set()
+    reach = spans[0][1] if spans else MIN_NS
+    for first, last, recording in spans:
+        if (session := sessions.of(recording)) not in joined:
+            both = TimeWindow(first, max(min(reach, last) + 1, first))
+            bags = view.stream.overlapping_bags([topic], both)
+            # One that a wrong clock dated spans years, without bags.
+            has_overlap = len({span.bag.recording for span in bags}) > 1
+            if not has_overlap or recordings_apart(view, [topic], both) != frozenset():
+                return False
+            joined.add(session)
+        reach = max(reach, last)
+    return True
 
 
 def changing_origin(frame_id: str) -> str:
@@ -374,6 +392,12 @@ class RobotPlaces:
         if self.frame_id != self.map_frame:
             return None
         return place_at(self._track, time, SILENCE_NS)
+
+    def within(self, start: Ns, end: Ns) -> Ns:
+        """Returns a time for where the robot stood: the middle; the start, if the map jumps."""
+        first, last = np.searchsorted(self._track.times, (start, end)).tolist()
+        has_jumped = jumps(self._track)[max(first - 1, 0) : last].any()
+        return start if has_jumped else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""

@@ -50,6 +50,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import Body, body_by_transforms, note_left_out, pose_frame
 from ros2_memory.history.poses import PoseReader
+from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
 from ros2_memory.history.transforms import (
     edges_of_rows,
@@ -60,7 +61,7 @@ from ros2_memory.history.transforms import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -121,6 +122,11 @@ class JoinedTrack:
     def tracks(self) -> tuple[RobotTrack, ...]:
         """Those of all robots."""
         return self.track, *self.others
+
+    def reaches(self, window: TimeWindow) -> bool:
+        """Whether it is known at any time of a window where a robot was."""
+        pieces = (zip(*each.pieces, strict=True) for each in self.tracks)
+        return any(window.overlaps(start, stop) for start, stop in chain(*pieces))
 
     def inside(self, region: Region, window: TimeWindow) -> list[Inside]:
         """Returns when any robot was inside of a region, in order; times of several may overlap."""
@@ -184,7 +190,10 @@ class RobotTracks:
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in parts)
-        whole, numbers, is_beside = _tracks_by_robot(parts)
+        apart = recordings_apart(view, self._topics, around)
+        root = str(view.bag_dir)
+        names = None if apart is None else {relative(str(path), root) for path in apart}
+        whole, numbers, is_beside = _tracks_by_robot(parts, names)
         fastest = view.limits.max_plausible_speed_mps
 
         def track(index: NDArray[np.intp]) -> RobotTrack:
@@ -507,11 +516,14 @@ def _positions_in(times: Times, window: TimeWindow) -> Times:
     return np.flatnonzero((times >= window.start) & (times < window.stop))
 
 
-def _tracks_by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask]:
+def _tracks_by_robot(
+    parts: Sequence[TrackPart], apart: Collection[str] | None
+) -> tuple[TrackPart, Times, Mask]:
     """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
 
     Where several recordings place a robot at a time, that which began first is in the track; of
-    those that began at one time the first by name.
+    those that began at one time the first by name. What the other one has then is left out, unless
+    both are among those that are `apart`, as of several robots (None: all may be).
     """
     by_recording: dict[str, list[TrackPart]] = defaultdict(list)
     for part in parts[::-1]:
@@ -524,15 +536,18 @@ def _tracks_by_robot(parts: Sequence[TrackPart]) -> tuple[TrackPart, Times, Mask
     whole, numbers = joined_parts(recordings)
     ends = np.searchsorted(numbers, np.arange(len(recordings) + 1))
     firsts, lasts = whole.times[ends[:-1]], whole.times[ends[1:] - 1]
-    is_beside = np.zeros(len(whole.times), np.bool_)
+    is_beside, repeats = np.zeros((2, len(whole.times)), np.bool_)
     for nth in np.flatnonzero(firsts[1:] <= np.maximum.accumulate(lasts)[:-1]) + 1:
         here = slice(*ends[nth : nth + 2])
         for other in np.flatnonzero(lasts[:nth] >= firsts[nth]):
             placed = whole.times[slice(*ends[other : other + 2])]
             starts, stops = pieces_of(placed, placed)
             piece = np.searchsorted(starts, whole.times[here], side="right") - 1
-            is_beside[here] |= (piece >= 0) & (whole.times[here] <= stops[piece])
-    return whole, numbers, is_beside
+            pair = {recordings[nth][0].recording, recordings[other][0].recording}
+            beside = is_beside if apart is None or pair.issubset(apart) else repeats
+            beside[here] |= (piece >= 0) & (whole.times[here] <= stops[piece])
+    own = np.flatnonzero(~repeats)
+    return whole.some(own), numbers[own], is_beside[own]
 
 
 def _without_jumps(parts: Parts, are_jumps: Mask) -> Parts:

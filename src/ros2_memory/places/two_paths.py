@@ -86,11 +86,13 @@ def farthest_apart(
 def _steps(track: RobotTrack, window: TimeWindow) -> _Steps:
     """Returns the steps of a track inside a window; a piece of one vertex is one of no length.
 
-    Nobody was between the ends of a jump.
+    Nobody was between the ends of a jump, nor at a vertex that was jumped to and from.
     """
-    ends = track.ends | jumps(track)
+    jumped = jumps(track)
+    ends = track.ends | jumped
     after = np.arange(len(ends)) + ~ends
     alone = ends & np.append([True], ends[:-1])[: len(ends)]
+    alone &= ~(jumped & np.append([False], jumped[:-1])[: len(ends)])
     real = (~ends | alone) & (track.times < window.stop) & (track.times[after] >= window.start)
     first, last = np.flatnonzero(real), after[real]
     start = np.maximum(track.times[first], window.start)

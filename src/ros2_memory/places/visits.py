@@ -30,6 +30,7 @@ from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.view import TimeRange, View, open_view, search_window
 from ros2_memory.places.pose_frames import (
+    NEWEST_POSE_NS,
     WHEREABOUTS,
     MapPlacement,
     joined_in,
@@ -94,8 +95,9 @@ def visits(
     region_visits = RegionVisits(view, placement.frame_id, place.region, window)
     track, all_visits = region_visits.joined.track, region_visits.every
     newest = _newest_pose_time(view, topic, track, window, now + FUTURE_NS)
-    # A newer pose shows where the robot is now.
+    # A newer pose shows where the robot is now; or what else was recorded since, that none does.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
+    stale = max(stale, min(view.snapshot.latest or MIN_NS, now) - NEWEST_POSE_NS)
     current = newest if newest is not None and newest >= stale else None
     shown = tuple(
         _within_asked(region_visits.shown(visit, current), window) for visit in all_visits[:limit]

@@ -88,7 +88,7 @@ def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> Non
     assert path.frame == "map"
     assert (path.xs[0], path.xs[-1]) == pytest.approx((0.0, 11.0))
     assert "m in 10.0 s" in path.line
-    assert path.notes[0].startswith("by transforms, of base_link in map")
+    assert path.notes[0].startswith("by transforms, of base_link")
     path = plot.path_in(asked, "/tf", "odom")
     assert path.frame == "odom"
     assert path.xs[-1] == pytest.approx(10.0)

@@ -71,7 +71,8 @@ def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
 
 def two_robots(root: Path, static_at: int, moving_at: int) -> None:
     """One whose map is 100 m off its odometry for ever; and one that slips in its odometry."""
-    record(root / "nav2", [static(static_at, "map", "odom", 100.0), *drive(static_at, 20, 0.4)])
+    first = drive(static_at + 1, 20, 0.4)  # else the first messages of both are one
+    record(root / "nav2", [static(static_at, "map", "odom", 100.0), *first])
     record(root / "boat", [*moving(moving_at, 20, "map", "odom", 5.0, -0.5), *drive(moving_at, 20)])
 
 

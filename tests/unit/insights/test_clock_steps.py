@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.history import clock_steps
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import Msg, battery, boolean, odom, write_mcap, write_splits
+from tests.support.bags import McapLayout, Msg, battery, boolean, odom, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
@@ -216,6 +216,21 @@ def test_pauses_that_are_not_looked_at_are_noted(
         assert any("only the newest 2 of 3 pauses" in note for note in reply["notes"]), tool
     monkeypatch.setattr(clock_steps, "_MOST_SUSPECTS", 3)
     assert len(steps(memory, tmp_path)) == 1
+
+
+def test_a_step_back_that_several_bags_show_is_listed_once(tmp_path: Path) -> None:
+    """The clock is set back by 20 s at 15 s, within the second of files of 10 s."""
+    files: list[list[Msg]] = [[]]
+    for tick in range(900):
+        at = BEGIN * S + tick * S // 10 - (20 * S if tick >= 150 else 0)
+        if files[-1] and at - files[-1][0].log_time >= 10 * S:
+            files.append([])
+        files[-1].append(odom(at, tick / 20, 0.0, vx=0.5))
+    for nth, some in enumerate(files):
+        layout = McapLayout(chunk_size=1 << 14)
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", some, layout)
+    [step] = asked(memory_of(tmp_path), tmp_path, "data_time_range")["clock_steps"]
+    assert -20 <= step["step_s"] <= -19
 
 
 def test_a_clock_that_was_set_back_is_listed_with_a_negative_step(tmp_path: Path) -> None:

@@ -151,6 +151,15 @@ def test_what_another_recording_has_is_no_gap(tmp_path: Path) -> None:
     assert gaps(memory) == [(4.995, 6.0), (14.995, 17.0)]
 
 
+def test_a_gap_that_several_copies_show_is_one(tmp_path: Path) -> None:
+    for name in ("one", "copy"):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", at_rates(20, ((5, 9),)))
+    memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 60) * S))
+    assert gaps(memory) == [(4.995, 9.0)]
+    way = ask(memory, "trajectory_summary", start=BEGIN, end=BEGIN + 20, by="hour")
+    assert way["all"][0] == pytest.approx(16.0, abs=0.1)
+
+
 @pytest.mark.anyio
 async def test_health_counts_the_gaps_of_the_last_hour(tmp_path: Path) -> None:
     memory = memory_with(tmp_path, at_rates(LENGTH, STALLS))

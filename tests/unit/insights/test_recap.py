@@ -239,6 +239,17 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
     assert any("too noisy, or too few" in note for note in reply["notes"])
 
 
+@pytest.mark.parametrize("hz", [0.39, 0.2])
+def test_poses_that_are_too_far_apart_do_not_show_whether_the_robot_stood(
+    tmp_path: Path, hz: float
+) -> None:
+    """It stands for 200 s, and drives for 40 s."""
+    at = [n / hz for n in range(round(240 * hz))]
+    poses = [odom(BEGIN + round(each * S), max(each - 200, 0) / 2, 0.0) for each in at]
+    write_splits(tmp_path, poses, 300)
+    assert over(memory_of(tmp_path), 0, 240).stood is None
+
+
 def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_path: Path) -> None:
     draw = random.Random(3)
     write_mcap(
@@ -446,6 +457,14 @@ def test_what_goes_on_at_the_end_of_what_is_known_says_so(tmp_path: Path) -> Non
     assert "cup in view" not in before  # all the time
 
 
+def test_a_stop_does_not_go_on_while_poses_are_silent(tmp_path: Path) -> None:
+    stood = [odom(BEGIN + at * S // 2, 1.0, 2.0, 0.0) for at in range(40)]
+    write_splits(tmp_path, [*stood, *(boolean(BEGIN + at * S, False) for at in range(60))], 20)
+    for end, goes_on in ((15, True), (40, False), (60, False)):
+        events = over(memory_of(tmp_path), 0, end).events
+        assert [each.goes_on for each in events if each.kind == "stop"] == [goes_on]
+
+
 PLACES = (
     Place("room", "map", Rectangle(-1, 5, -1, 4)),
     Place("corner", "map", Circle(0.0, 3.0, 0.5)),
@@ -456,6 +475,18 @@ PLACES = (
 def in_places(memory: Memory, frame_id: str = "map") -> Memory:
     places = tuple(replace(each, frame_id=frame_id) for each in PLACES)
     return replace(memory, limits=replace(memory.limits, places=places))
+
+
+def test_a_stop_in_which_the_map_jumps_is_where_it_began(tmp_path: Path) -> None:
+    messages = [odom(BEGIN + n * S // 20, 0.0, 2.0, 0.0) for n in range(1200)]
+    for n in range(600):
+        x = 60.5 if n >= 300 else 0.0
+        at = BEGIN + n * S // 10 + S // 50
+        messages.append(tf(at, transform(at, "map", "odom", (x, 0.0, 0.0))))
+    write_splits(tmp_path, messages)
+    events = over(in_places(memory_of(tmp_path)), 0, 60).events
+    [stop] = [each for each in events if each.kind == "stop"]
+    assert (stop.text, stop.places) == ("stood at x 0.00, y 2.00", ("room",))
 
 
 @each_way
@@ -611,6 +642,23 @@ def test_what_was_not_recorded_is_part_of_no_duration_and_of_no_mean(tmp_path: P
     assert path["avg_speed"] <= path["max_speed"]
     assert path["duration_s"] == pytest.approx(7219.9)
     assert path["recorded_s"] == pytest.approx(59.7, abs=0.1)
+
+
+@pytest.mark.parametrize("split_s", [10, 1000])
+@pytest.mark.parametrize(("hz", "hole_s"), [(10, 25), (10, 60), (0.5, 0), (0.2, 0)])
+def test_mean_speed_does_not_depend_on_how_files_are_split(
+    tmp_path: Path, split_s: int, hz: float, hole_s: int
+) -> None:
+    """A robot that drives at 0.5 m/s; poses are missing for a while, or come seldom."""
+    at = [n / hz for n in range(round(200 * hz)) if not 30 <= n / hz < 30 + hole_s]
+    poses = [odom(BEGIN + round(each * S), each / 2, 0.0, vx=0.5) for each in at]
+    flags = [boolean(BEGIN + n * S, False, "/bumper") for n in range(200)]
+    write_splits(tmp_path, [*poses, *flags], split_s)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 200}
+    path = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", **window)
+    assert path["avg_speed"] == pytest.approx(0.5, abs=0.001)
+    unrecorded_s = path["duration_s"] - path.get("recorded_s", path["duration_s"])
+    assert unrecorded_s == pytest.approx(hole_s, abs=0.11)
 
 
 def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None:

@@ -99,6 +99,7 @@ def test_places_over_several_runs_of_odometry_have_a_note(
     """The same coordinates are not the same place, unless a map places both runs."""
     drive = [odom(BEGIN + n * S // 5, min(n / 50, 1.0), 0.0) for n in range(300)]
     write_mcap(tmp_path / "first" / "first_0.mcap", drive)
+    write_mcap(tmp_path / "copy" / "copy_0.mcap", drive[50:250])
     alone = asked(memory_of(tmp_path), tmp_path, tool, **given)
     assert "error" not in alone
     assert not any("changes with every start" in note for note in alone.get("notes", ()))

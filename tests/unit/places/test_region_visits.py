@@ -15,7 +15,7 @@ from ros2_memory.core.regions import Circle, Place, Polygon, Rectangle
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
-from tests.support.bags import odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
@@ -157,14 +157,21 @@ def spots(memory: Memory, **where: Circle) -> Memory:
     return replace(memory, limits=replace(memory.limits, places=places))
 
 
-@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
-def test_each_of_two_robots_in_a_folder_is_in_its_place(tmp_path: Path, recalls: bool) -> None:
+@pytest.mark.parametrize(
+    ("recalls", "latched"),
+    [(False, ()), (True, ()), (False, ("/odom",))],
+    ids=["plain", "catalogue", "latched"],
+)
+def test_each_of_two_robots_in_a_folder_is_in_its_place(
+    tmp_path: Path, recalls: bool, latched: tuple[str, ...]
+) -> None:
     """The second one has a track of its own, in every tool that takes a place."""
     words = [text(BEGIN + n * S, "hello") for n in range(90)]
     for name, since, x, said in (("left", 0, 0.0, words), ("right", 5, 30.0, [])):
         poses = [odom(BEGIN + since * S + n * S // 5, x + 9 * (n >= 150), 0.0) for n in range(400)]
         messages = sorted([*poses, *said], key=lambda message: message.log_time)
-        write_mcap(tmp_path / name / f"{name}_0.mcap", messages)
+        layout = McapLayout(latched=frozenset(latched))
+        write_mcap(tmp_path / name / f"{name}_0.mcap", messages, layout)
     memory = memory_of(tmp_path, recalls=recalls)
     memory = spots(memory, here=Circle(0.0, 0.0, 1.0), there=Circle(30.0, 0.0, 1.0))
     span = {"start": BEGIN / S, "end": BEGIN / S + 90}
@@ -193,6 +200,26 @@ def test_each_of_two_robots_in_a_folder_is_in_its_place(tmp_path: Path, recalls:
         later = {"with_start": BEGIN / S + 45, "with_end": BEGIN / S + 90}
         compared = asked(memory, tmp_path, "compare", **span | {"end": BEGIN / S + 45}, **later)
         assert compared["minutes"][name] == {"this": 0.5, "with": 0.0}
+
+
+@pytest.mark.parametrize("since", [0, 18])
+def test_what_two_recorders_of_one_robot_have_is_one_visit(tmp_path: Path, since: int) -> None:
+    """Now one, now the other receives a message first; the second may begin in a visit."""
+    poses = [odom(BEGIN + n * S // 5, min(n / 20, 9.0), 0.0) for n in range(300)]
+    late = [
+        replace(
+            each, log_time=each.log_time + (nth % 3 - 1) * S // 10_000, publish_time=each.log_time
+        )
+        for nth, each in enumerate(poses[since * 5 :])
+    ]
+    write_mcap(tmp_path / "one" / "one_0.mcap", poses[: 300 if not since else 110])
+    write_mcap(tmp_path / "two" / "two_0.mcap", late)
+    memory = spots(memory_of(tmp_path), spot=Circle(5.0, 0.0, 1.0))
+    reply = asked(memory, tmp_path, "visits", where="spot")
+    assert (reply["total"], reply["minutes"]) == (1, 0.13)
+    assert "robots" not in str(reply["notes"])
+    span = {"start": BEGIN / S, "end": BEGIN / S + 60}
+    assert asked(memory, tmp_path, "recap", where="spot", **span)["inside_s"] == 8.0
 
 
 @pytest.mark.parametrize("laps", [6, 130])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import TYPE_CHECKING
 
@@ -88,6 +89,14 @@ def test_only_the_window_and_the_region_count_and_no_way_is_drawn_across_a_gap()
     across = farthest_apart((middle, EVER), (way, EVER))[0]
     assert across is not None
     assert across.away_m == 2.5
+
+
+def test_a_vertex_that_was_jumped_to_and_from_is_no_place_of_the_way() -> None:
+    way = track([(0.0, 0.0, 0.0), (9.9, 1.0, 0.0), (10.0, 50.0, 0.0), (10.1, 1.0, 0.0)])
+    way = dataclasses.replace(way, fastest_mps=10.0)
+    far = farthest_apart((way, EVER), (track([(0.0, 0.0, 0.0)]), EVER))[0]
+    assert far is not None
+    assert far.x == 1.0
 
 
 def test_standstills_are_where_the_track_is_and_nowhere_where_it_is_not() -> None:

@@ -22,7 +22,7 @@ from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.closed_form import SESSIONS, written_session
 from tests.support.examples import examples
@@ -146,6 +146,29 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     elsewhere = visits(at(memory, newest + 365 * 86_400 * S), Call(), 5.0, 0.0, radius_m=1.0)
     assert elsewhere.visits
     assert elsewhere.notes == ()
+
+
+@each_way
+def test_places_may_be_in_utm(tmp_path: Path, recalls: bool) -> None:
+    north = 5.4e6
+    poses = [odom(BEGIN + n * S // 5, 5e5 + n / 10, north) for n in range(150)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert spans(memory, 5e5 + 10, north, radius_m=0.55) == [(19.0, 21.0)]
+    # No robot on Earth is here.
+    assert not visits(memory, Call(), 1e9, 0.0, radius_m=1e9 - 1e8).visits
+
+
+def test_a_robot_that_no_pose_shows_while_others_go_on_may_have_left(tmp_path: Path) -> None:
+    poses = line((20, 0.5), (10, 0.0))
+    for said, is_there in ((35, True), (45, False)):
+        words = [text(BEGIN + at * S, "on") for at in range(said)]
+        memory = remembering(tmp_path / str(said), [*poses, *words])
+        memory = at(memory, BEGIN + said * S)
+        answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
+        shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+        assert shown["there_now"] is is_there
+        assert (shown["visits"][0]["departed"] is None) is is_there
 
 
 def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> None:

@@ -212,6 +212,13 @@ def test_way_minutes_and_errors_are_listed_where_they_differ(tmp_path: Path) -> 
     assert reports == {"this": 1, "with": 0}
 
 
+def test_minutes_are_null_where_no_pose_says_where_the_robot_was(tmp_path: Path) -> None:
+    fault = log_entry((BEGIN + 70) * S, 40, "drive", "motor is hot")
+    reply = compared(tmp_path, [*looked(0, 30, HERE), fault])
+    assert reply["minutes"] == {"kitchen": {"this": None, "with": 0.48}}
+    assert reply["way"]["stood_s"]["this"] is None
+
+
 def drive(start: int, *corners: tuple[float, float]) -> list[Msg]:
     """Drives through corners (m) at 0.5 m/s, looking along x, two poses a second."""
     messages: list[Msg] = []

@@ -298,6 +298,7 @@ class MotionTotals:
         jumped_m: their total length.
         gaps: times in which nothing was recorded.
         gap_m: the distance across them in straight lines.
+        gap_ns: how long they last, and other steps of more than a second that are left out.
         resets: the first pose after each reset of odometry; the earliest, of very many.
         speed_mps: the highest speed measured; None where the poses are too few.
     """
@@ -310,6 +311,7 @@ class MotionTotals:
     jumped_m: float = 0.0
     gaps: int = 0
     gap_m: float = 0.0
+    gap_ns: Ns = 0
     resets: tuple[Ns, ...] = ()
     speed_mps: float | None = None
 
@@ -459,6 +461,7 @@ class Motion:
         totals.jumped_m += later.jumped_m
         totals.gaps += later.gaps
         totals.gap_m += later.gap_m
+        totals.gap_ns += later.gap_ns
         totals.resets = (*totals.resets, *later.resets)[:_MAX_RESETS]
         if later.tail is not None:
             self._end_leg()
@@ -511,6 +514,8 @@ class Motion:
         """Counts what ends a leg."""
         totals = self.totals
         step_m = distance(before.position, after.position)
+        if after.time - before.time > GAP_NS:
+            totals.gap_ns += after.time - before.time
         if kind == "gap":
             totals.gaps += 1
             totals.gap_m += step_m

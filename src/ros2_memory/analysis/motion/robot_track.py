@@ -37,7 +37,8 @@ _SLOT_NS: Final[Ns] = NS_PER_S // 5
 
 _JUMP_NS: Final[Ns] = 2 * NS_PER_S
 """A step that is faster, and not longer than this, is a jump."""
-_MAX_M: Final = 1e6
+_MAX_M: Final = 1e8
+"""Poses beyond are no place; northings of UTM are up to 1e7."""
 _PER_M: Final = 10_000
 """Vertices are rounded to 0.1 mm, as the store has poses."""
 _WEIGHT: Final = TOLERANCE_M / TOLERANCE_RAD

@@ -15,7 +15,6 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import Poses, headings
@@ -48,26 +47,19 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     times = poses.times[rows]
     moved = np.diff(poses.positions[rows, :2], axis=0)
     speeds = np.hypot(moved[:, 0], moved[:, 1]) / (np.diff(times) / NS_PER_S)
-    # Of each slot from the fourth on, the six speeds around it.
-    around = sliding_window_view(speeds, _ROWS - 1)
+    # Of two slots: a robot whose position jumps, and is back, gets no farther.
+    away = poses.positions[rows[2:], :2] - poses.positions[rows[:-2], :2]
+    ahead = np.hypot(away[:, 0], away[:, 1]) / ((times[2:] - times[:-2]) / NS_PER_S)
+    before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
+    after = np.maximum(speeds[:-1], speeds[1:])
+    falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])
     slots = times // SLOT_NS
     in_a_row = slots[_ROWS - 1 :] - slots[: 1 - _ROWS] < _ROWS
-    falls = in_a_row & _falls(around[:, 1:]) & ~_falls(around[:, :-1])
-    drops = np.flatnonzero(falls)
+    drops = np.flatnonzero(in_a_row & falls[1:] & ~falls[:-1])
     turned = headings(poses.turns[rows[drops + 6]]) - headings(poses.turns[rows[drops + 2]])
     # Where a heading is not known, it turns no more than others.
     drops = drops[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
     return tuple(
-        SpeedDrop(int(times[at + 3]), float(around[at, 1:3].min()), float(around[at, 4:].max()))
+        SpeedDrop(int(times[at + 3]), float(before[at + 1]), float(after[at + 4]))
         for at in drops.tolist()
     )
-
-
-def _falls(
-    speeds: np.ndarray[tuple[int, int], np.dtype[np.float64]],
-) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Returns whether a robot that moved clearly is slow from the fourth of five speeds on."""
-    before, after = speeds[:, :2].min(axis=1), speeds[:, 3:].max(axis=1)
-    is_slow: np.ndarray[tuple[int], np.dtype[np.bool_]] = before >= MOVING_MPS
-    is_slow &= after <= FRACTION * before
-    return is_slow

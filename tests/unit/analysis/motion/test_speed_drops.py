@@ -58,6 +58,10 @@ def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
         driven((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
         driven((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
         driven((20, 0.5, 0), (20, 0.0, 0), rate=1),  # too seldom
+        [  # a single position is wrong
+            (at, (x + 5 * (at == BEGIN + 5 * S), y, z), turn)
+            for at, (x, y, z), turn in driven((10, 0.3, 0))
+        ],
         [  # the position jumps back
             (at, (x - 0.2 * (at >= BEGIN + 5.2 * S), y, z), turn)
             for at, (x, y, z), turn in driven((10, 0.4, 0))
