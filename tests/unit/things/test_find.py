@@ -21,6 +21,7 @@ from tests.support.bags import (
     make,
     odom,
     point,
+    text,
     tf,
     transform,
     write_splits,
@@ -140,6 +141,36 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
 def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
     write_splits(tmp_path, looked(0, 3, HERE))
     assert "notes" not in ask(tmp_path)
+
+
+CUP_AS_JSON = json.dumps(
+    {"frame_id": "map", "detections": [{"label": "cup", "position": {"x": 3, "y": 0, "z": 1}}]}
+)
+
+
+@pytest.mark.parametrize("recalls", [False, True])
+def test_a_detector_that_sees_nothing_for_ten_minutes_goes_on_looking(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """Its type does not say what it is, and neither do other topics that hold JSON."""
+
+    def said(at: int, topic: str, data: str) -> list[Msg]:
+        robot = [each for each in scene(at, HERE, ()) if "vision" not in each.topic]
+        return [*robot, text((BEGIN + at) * S, data, topic)]
+
+    there = [each for at in range(350, 380) for each in said(at, "/seen", CUP_AS_JSON)]
+    later = {
+        topic: [each for at in range(1100, 1130) for each in said(at, topic, '{"detections": []}')]
+        for topic in ("/seen", "/other")
+    }
+    states = {}
+    for topic, some in later.items():
+        write_splits(tmp_path / topic[1:], [*there, *some])
+        memory = memory_of(tmp_path / topic[1:], recalls=recalls)
+        [cup] = asked(memory, tmp_path / topic[1:], "find_things", label="cup")["things"]
+        states[topic] = cup["still_there"]
+    assert states["/seen"].keys() == {"not_seen_where_expected", "looks"}
+    assert states["/other"].keys() == {"in_view"}
 
 
 def test_chairs_are_counted(tmp_path: Path) -> None:
