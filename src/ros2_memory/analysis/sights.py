@@ -33,6 +33,7 @@ Flags: TypeAlias = NDArray[np.bool_]
 
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
+NO_YAW: Final = -1
 _CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG)
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05, what lies above 1 in the last one."""
@@ -77,7 +78,10 @@ class Spot(IntEnum):
 
 
 class Look(IntEnum):
-    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages."""
+    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
+
+    Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`.
+    """
 
     SLICE = 0
     TOPIC = 1
@@ -288,17 +292,16 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
 
 def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
-    known = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
-    x, y, yaw = seen.robot[known].T
-    columns = (_mm(x), _mm(y), _decideg(yaw) % 3600)
+    is_known = np.isfinite(seen.robot).all(axis=1)
+    x, y, yaw = np.where(is_known[:, None], seen.robot, 0.0).T
+    columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW))
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
-    _, number = distinct_rows((slices[known], *cells))
-    look = np.full(len(seen.times), -1, np.int64)
-    look[known] = number
+    _, number = distinct_rows((slices, *cells))
+    look = np.where(is_known, number, -1)
     by = Groups.of(number)
     means = [by.sums(column) // by.sizes for column in columns]
-    first, last = by.ends(_rounded(seen.times[known]))
-    slices = slices[known][by.firsts]
+    first, last = by.ends(_rounded(seen.times))
+    slices = slices[by.firsts]
     topic = np.zeros(len(slices), np.int64)
     return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
 

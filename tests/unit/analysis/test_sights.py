@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import (
+    NO_YAW,
     Beside,
     Fix,
     Hit,
@@ -83,9 +84,9 @@ def test_looks_differ_by_place_and_direction() -> None:
     assert looks[0, Look.YAW] == 43  # the mean of 2.9 and 5.7 degrees
 
 
-def test_without_a_pose_of_the_robot_a_detection_counts_and_no_look_does() -> None:
+def test_without_a_pose_of_the_robot_a_detection_counts_and_its_look_is_from_nowhere() -> None:
     found = sights_of([mug(1.0)], robot=None)
-    assert len(found.looks) == 0
+    assert found.looks[:, [Look.N, Look.YAW]].tolist() == [[1, NO_YAW]]
     assert found.hits.tolist() == [[0, -1, 1]]
 
 
@@ -159,7 +160,9 @@ def test_nothing_that_was_detected_is_lost(
     count = sum(len(detections) for *_, detections in seen)
     assert int(found.spots[:, Spot.N].sum() + found.unplaced[:, Unplaced.N].sum()) == count
     assert int(found.hits[:, Hit.N].sum()) == int(found.spots[:, Spot.N].sum())
-    assert int(found.looks[:, Look.N].sum()) == sum(robot is not None for _, robot, _ in seen)
+    from_somewhere = found.looks[found.looks[:, Look.YAW] != NO_YAW]
+    assert int(from_somewhere[:, Look.N].sum()) == sum(robot is not None for _, robot, _ in seen)
+    assert int(found.looks[:, Look.N].sum()) == len(seen)
 
 
 @given(messages, messages)

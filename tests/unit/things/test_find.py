@@ -173,6 +173,16 @@ def test_a_detector_that_sees_nothing_for_ten_minutes_goes_on_looking(
     assert states["/other"].keys() == {"in_view"}
 
 
+@pytest.mark.parametrize("later", [(), (("chair", 2.0, 1.0),)])
+def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
+    tmp_path: Path, later: tuple[Seen, ...]
+) -> None:
+    messages = [*looked(0, 30, HERE, ("cup", 3.0, 0.0)), *looked(30, 90, HERE, *later)]
+    write_splits(tmp_path, [each for each in messages if each.topic != "/odom"])
+    reply = ask(tmp_path, label="cup")
+    assert reply["things"][0]["still_there"].keys() == {"not_looked_at_since"}
+
+
 def test_chairs_are_counted(tmp_path: Path) -> None:
     chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
     write_splits(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
