@@ -244,11 +244,15 @@ class Estimate:
 
 @dataclass(slots=True)
 class _Group:
-    """The places of one label in one epoch, each with its spots."""
+    """The places of one label in one epoch, each with its spots.
+
+    `unplaced` are its rows of `Sights.unplaced`, of all epochs.
+    """
 
     key: str
     epoch: int
     rows: Ints
+    unplaced: Ints
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
     evidence: Evidence | None = None
@@ -411,7 +415,9 @@ def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
     groups = []
     for each in np.unique(of[of >= 0]).tolist():
         nth, key = divmod(each, len(shown) + 1)
-        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each)))
+        unplaced = seen.sights.unplaced
+        unplaced = unplaced[number[unplaced[:, Unplaced.LABEL]] == key]
+        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each), unplaced))
     return groups
 
 
@@ -463,7 +469,7 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     rows = _rows_of(mine, seen.hits, seen.starts)
     rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
     of = np.repeat(of, seen.starts[mine + 1] - seen.starts[mine])
-    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of)
+    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of, group.unplaced)
     for place, stay in stays_at(seen.cells, group.evidence):
         go_on()
         spots = group.places[place]

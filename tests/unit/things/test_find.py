@@ -183,6 +183,24 @@ def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
     assert reply["things"][0]["still_there"].keys() == {"not_looked_at_since"}
 
 
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
+def test_a_thing_that_is_detected_without_a_place_is_not_missed(
+    tmp_path: Path, lost: float
+) -> None:
+    there, taken = ("cup", 3.0, 0.0), ("fork", 3.0, -1.0)
+    seen = [
+        *looked(0, 30, HERE, there, taken),
+        *looked(30, 90, HERE, ("cup", lost, lost)),
+    ]
+    write_splits(tmp_path, seen)
+    reply = ask(tmp_path)
+    states = {each["label"]: each["still_there"].keys() for each in reply["things"]}
+    assert states["cup"] == {"not_looked_at_since"}
+    assert states["fork"] == {"not_seen_where_expected", "looks"}
+    [note] = reply["notes"]
+    assert "could not be placed: cup (60 times" in note
+
+
 def test_chairs_are_counted(tmp_path: Path) -> None:
     chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
     write_splits(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
