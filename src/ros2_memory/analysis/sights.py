@@ -292,7 +292,7 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
 
 def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
-    is_known: Flags = np.isfinite(seen.robot).all(axis=1)
+    is_known = np.isfinite(seen.robot[:, 0] + seen.robot[:, 1] + seen.robot[:, 2])
     x, y, yaw = np.where(is_known[:, None], seen.robot, 0.0).T
     columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW))
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]

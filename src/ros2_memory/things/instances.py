@@ -430,7 +430,9 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
             continue
         go_on()
         rows = seen.firm(group.rows)
-        place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
+        place = places_of(
+            spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows], spots[rows, Spot.SLICE]
+        )
         rows, place = rows[place >= 0], place[place >= 0]
         several, counts = (
             _are_several(place, seen.groups[rows]),
@@ -469,7 +471,7 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     rows = _rows_of(mine, seen.hits, seen.starts)
     rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
     of = np.repeat(of, seen.starts[mine + 1] - seen.starts[mine])
-    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of, group.unplaced)
+    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of, unplaced=group.unplaced)
     for place, stay in stays_at(seen.cells, group.evidence):
         go_on()
         spots = group.places[place]
@@ -519,6 +521,7 @@ def _fold(
             host_group, host = every[other]
             share = _HALO_SHARE if host_group is group else _SMALL_SHARE
             few = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
+            few &= not (host_group is group and _is_beside(stay, hosted, seen))
             if other not in gone and (few or stay.count <= hosted * share) and hosted > most:
                 best, most = other, hosted
         if best is not None:
@@ -531,6 +534,12 @@ def _fold(
     for nth, (group, stay) in enumerate(every):
         if nth not in gone and not stay.weak:
             group.stays.append(stay)
+
+
+def _is_beside(stay: PlacedStay, hosted: int, seen: _Seen) -> bool:
+    """Whether most messages that have one of a label also have this one, which is no noise then."""
+    together = seen.sights.spots[stay.spots, Spot.TOGETHER]
+    return 2 * stay.count > hosted and bool(np.median(together) > 1)
 
 
 class _Hosts:

@@ -4,9 +4,9 @@ What was seen is known by slice (`analysis.sights`): 10 s of the clock.
 A *cell* is a pose of the robot, to 25 cm and 10 degrees, from which the place was seen at least
 once. How often a message from a cell has the label, while it is there, is its rate. A look from
 such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is evidence
-of presence, as strong as false detections are rare. A message that has the label somewhere unknown is
-neither: it may be the thing. The likeliest sequence of being there and not
-being there (Viterbi, two states) gives the stays.
+of presence, as strong as false detections are rare. A message that has the label somewhere unknown
+is neither. The likeliest sequence of being there and not being there (Viterbi, two states) gives
+the stays.
 """
 
 from __future__ import annotations
@@ -259,6 +259,7 @@ def evidence_at(
     places: Floats,
     rows: Ints,
     place: Ints,
+    *,
     unplaced: Ints,
 ) -> Evidence:
     """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.

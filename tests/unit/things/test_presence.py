@@ -38,7 +38,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     cells, hits = _seen(given_looks, unplaced)
     place = np.array([[3000.0, 100.0]])
     found = evidence_at(
-        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), no_sights().unplaced
+        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), unplaced=no_sights().unplaced
     )
 
     whole = _with_every_look(cells, found, hits)
@@ -63,7 +63,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
     cells, hits = _seen([*given_looks, *others], unplaced)
     place = np.array(is_second, np.int64)[: len(hits)]
     places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
-    found = evidence_at(cells, _ANYWHERE, places, hits, place, no_sights().unplaced)
+    found = evidence_at(cells, _ANYWHERE, places, hits, place, unplaced=no_sights().unplaced)
     stays = [*stays_at(cells, found)]
 
     assert stays == sorted(stays, key=lambda each: each[0])
@@ -75,7 +75,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
             places[[nth]],
             mine,
             np.zeros(len(mine), np.int64),
-            no_sights().unplaced,
+            unplaced=no_sights().unplaced,
         )
         at_once = found.at(nth)
         assert (at_once.looks & 0xFFFF_FFFF).tolist() == alone.looks.tolist()
