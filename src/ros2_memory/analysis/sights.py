@@ -34,7 +34,7 @@ Flags: TypeAlias = NDArray[np.bool_]
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
 NO_YAW: Final = -1
-_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG)
+_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG, CELL_DECIDEG)
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05, what lies above 1 in the last one."""
 SLICE_NS: Final = 10 * NS_PER_S
@@ -80,7 +80,8 @@ class Spot(IntEnum):
 class Look(IntEnum):
     """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
 
-    Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`.
+    Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`. `PAN`
+    is how far the detector was turned from the robot's heading, to `CELL_DECIDEG`.
     """
 
     SLICE = 0
@@ -88,9 +89,10 @@ class Look(IntEnum):
     X = 2
     Y = 3
     YAW = 4
-    N = 5
-    FIRST = 6
-    LAST = 7
+    PAN = 5
+    N = 6
+    FIRST = 7
+    LAST = 8
 
 
 class Hit(IntEnum):
@@ -153,7 +155,8 @@ class Seen(NamedTuple):
 
     Attributes:
         times: log times of the messages (ns).
-        robot: x, y (m) and yaw (rad) of the robot at each (M x 3); NaN where that is not known.
+        robot: x, y (m) and yaw (rad) of the robot at each, and how far the detector was turned from
+            that (rad) by what moves it (M x 4); NaN where that is not known.
         rows: of each detection its message, ascending.
         labels: the place of their names in `names`.
         names: of labels; there may be some that none has.
@@ -292,9 +295,10 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
 
 def _looks(seen: Seen, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
-    is_known = np.isfinite(seen.robot[:, 0] + seen.robot[:, 1] + seen.robot[:, 2])
-    x, y, yaw = np.where(is_known[:, None], seen.robot, 0.0).T
-    columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW))
+    is_known = ~np.isnan(seen.robot.sum(axis=1))
+    x, y, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
+    turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
+    columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW), turned)
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
     _, number = distinct_rows((slices, *cells))
     look = np.where(is_known, number, -1)

@@ -85,10 +85,12 @@ class Found(NamedTuple):
     Attributes:
         detections: by the place of their message among these.
         stamps: of the messages' headers (ns); None where they have none.
+        frames: of the messages' headers, empty where they have none.
     """
 
     detections: Detections
     stamps: Ints | None
+    frames: Texts
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +153,8 @@ class DetectionColumns:
             parts = [part for source in sources for part in found_in(values, source, places=True)]
             own = _own_frame(definition)
             found = joined_detections([_with_frames(values, part, own) for part in parts])
-            return Found(found, _stamps(values, definition))
+            frames = texts_of(values, own[0]) if own else _no_frames(len(table))
+            return Found(found, _stamps(values, definition), frames)
         except UnknownShapeError:
             return None
 

@@ -14,6 +14,7 @@ from ros2_memory.columns.detections import (
     joined_detections,
 )
 from ros2_memory.columns.steps import METRES
+from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.arrays import merged_times
 from ros2_memory.history.scan import messages_of, of_columns
 from ros2_memory.messages.conversions import nanoseconds
@@ -39,11 +40,13 @@ class Detected(NamedTuple):
         times: in the clock of the transforms, as far as is known: of their stamps where these agree
             with the log times, else those.
         found: by the place of their message; places are rounded to 0.1 mm, as the store has them.
+        frames: of the messages, empty where their headers name none.
     """
 
     log_times: IntArray
     times: IntArray
     found: Detections
+    frames: Texts
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
@@ -56,7 +59,8 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
         for place, part in zip(places, parts, strict=True)
     ]
     times = np.concatenate([part.times for part in parts])[order]
-    return Detected(log_times, times, joined_detections(found))
+    frames = joined_texts([part.frames for part in parts]).rows(order)
+    return Detected(log_times, times, joined_detections(found), frames)
 
 
 class DetectionRows:
@@ -84,21 +88,22 @@ class DetectionRows:
         known = self._columns.of(rows.table)
         if known is None:
             return None
-        found, stamps = known
+        found, stamps, frames = known
         if rows.index is not None:
-            found = found.at(rows.index)
+            found, frames = found.at(rows.index), frames.rows(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _detected(rows.times, stamps, found)
+        return _detected(rows.times, stamps, found, frames)
 
     def _decoded(self, rows: Rows) -> Detected:
         read = [one for found in messages_of(self._view, rows) for one in self._one(found)]
         # Those of a part come bag after bag, in the order in which bags were stored.
         read.sort(key=lambda one: one[0])
         log_times, stamps = (np.array([one[nth] for one in read], np.int64) for nth in (0, 1))
-        return _detected(log_times, stamps, detections_by([one[2] for one in read]))
+        frames = Texts.of([one[3] for one in read])
+        return _detected(log_times, stamps, detections_by([one[2] for one in read]), frames)
 
-    def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection]]]:
-        """Returns log time, stamp and detections of a message; nothing if it cannot be decoded."""
+    def _one(self, found: StoredMessage) -> list[tuple[Ns, Ns, list[Detection], str]]:
+        """Returns log time, stamp, detections and frame of a message, if it can be decoded."""
         extractor, message = self._view.extractor, self._view.bags.decode(found)
         if message is None:
             return []
@@ -108,13 +113,15 @@ class DetectionRows:
             one if one.frame_id else one._replace(frame_id=frame)
             for one in detections_of(extractor.exact(message, found.type))
         ]
-        return [(found.time, found.time if stamp is None else stamp, detections)]
+        return [(found.time, found.time if stamp is None else stamp, detections, frame)]
 
 
-def _detected(log_times: IntArray, stamps: IntArray | None, found: Detections) -> Detected:
+def _detected(
+    log_times: IntArray, stamps: IntArray | None, found: Detections, frames: Texts
+) -> Detected:
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.
         times = np.where(np.abs(stamps - log_times) <= AGREEMENT_NS, stamps, log_times)
     places = np.rint(found.places * METRES.per_unit) / METRES.per_unit
-    return Detected(log_times, times, found._replace(places=places))
+    return Detected(log_times, times, found._replace(places=places), frames)

@@ -368,7 +368,8 @@ class _Seen:
             for topic in np.unique(topics).tolist()
             for of in (topics == topic,)
         }
-        heading = np.radians(bearing + self.cells.yaw[hits[:, Hit.LOOK]])
+        ahead = self.cells.yaw + self.cells.pan
+        heading = np.radians(bearing + ahead[hits[:, Hit.LOOK]])
         spot, n, size = hits[:, Hit.SPOT], hits[:, Hit.N], len(sights.spots)
         sums = [np.bincount(spot, n * of(heading), size) for of in (np.cos, np.sin)]
         self.side: Floats = (

@@ -246,12 +246,41 @@ def _seen(detected: Detected, poses: Poses, frames: Frames) -> Seen:
             x, y, z = found.places[some].T
             placed = np.stack(known.points((x, y, z)), axis=1)
             places[some] = np.where(known.valid[:, None], placed, math.nan)
-    robot = _robot_at(poses, detected.times, frames)
+    robot = _robot_at(poses, detected, frames)
     labels = found.labels.codes.astype(np.int64), found.labels.words
     return Seen(detected.log_times, robot, found.rows, *labels, places, found.scores)
 
 
-def _robot_at(poses: Poses, times: Ints, frames: Frames) -> Floats:
+def _robot_at(poses: Poses, detected: Detected, frames: Frames) -> Floats:
+    """Returns the pose of the robot at each message, and how far its detector was turned from it.
+
+    As `Seen.robot` has them. Where the poses do not say it, transforms of what carries the
+    detector may. What does not name the frame of its message is taken to be in that of the others.
+    """
+    times, own = detected.times, poses.frames.words[0] if len(poses) else ""
+    robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
+    codes, words = detected.frames.codes, detected.frames.words
+    seen_in = detected.found.frames
+    usual = seen_in.words[np.bincount(seen_in.codes).argmax()] if len(seen_in) else ""
+    for code, name in enumerate(words):
+        carriers = frames.carriers(name or usual, own)
+        some = np.flatnonzero(codes == code)
+        if carriers is None:
+            continue
+        turned, body = (frames.poses(each, times[some]) for each in carriers)
+        if turned is None or body is None:
+            continue
+        x, y, _ = body.translation
+        yaw = _yaw(body.rotation)
+        posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
+        robot[some] = np.where(np.isnan(robot[some]), posed, robot[some])
+        if carriers[0] != carriers[1]:
+            is_known = turned.valid & body.valid
+            robot[some, 3] = np.where(is_known, _yaw(turned.rotation) - yaw, math.nan)
+    return robot
+
+
+def _posed_at(poses: Poses, times: Ints, frames: Frames) -> Floats:
     """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
 
     That is farther than 1 s from a pose, or where no transform leads from its frame.

@@ -1,12 +1,12 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
 What was seen is known by slice (`analysis.sights`): 10 s of the clock.
-A *cell* is a pose of the robot, to 25 cm and 10 degrees, from which the place was seen at least
-once. How often a message from a cell has the label, while it is there, is its rate. A look from
-such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is evidence
-of presence, as strong as false detections are rare. A message that has the label somewhere unknown
-is neither. The likeliest sequence of being there and not being there (Viterbi, two states) gives
-the stays.
+A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees, from which the place was
+seen at least once. How often a message from a cell has the label, while it is there, is its rate. A
+look from such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is
+evidence of presence, as strong as false detections are rare. A message that has the label somewhere
+unknown is neither. The likeliest sequence of being there and not being there (Viterbi, two states)
+gives the stays.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class Cells:
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
-        self.yaw = looks[:, Look.YAW] / 10.0
+        self.yaw, self.pan = looks[:, Look.YAW] / 10.0, looks[:, Look.PAN] / 10.0
         _, self.cell = distinct_rows(
             (
                 self.topic + poor * (len(sights.topics) + 1),
@@ -96,6 +96,7 @@ class Cells:
                 looks[:, Look.X] // CELL_MM,
                 looks[:, Look.Y] // CELL_MM,
                 looks[:, Look.YAW] // CELL_DECIDEG,
+                looks[:, Look.PAN],
             )
         )
         order = np.argsort(self.cell, kind="stable")
@@ -160,7 +161,8 @@ class Cells:
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
         dx, dy = x - self.x[looks], y - self.y[looks]
-        bearing = (np.degrees(np.arctan2(dy, dx)) - self.yaw[looks] + 180.0) % 360.0 - 180.0
+        ahead = self.yaw[looks] + self.pan[looks]
+        bearing = (np.degrees(np.arctan2(dy, dx)) - ahead + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
 
 

@@ -173,14 +173,49 @@ def test_a_detector_that_sees_nothing_for_ten_minutes_goes_on_looking(
     assert states["/other"].keys() == {"in_view"}
 
 
-@pytest.mark.parametrize("later", [(), (("chair", 2.0, 1.0),)])
 def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
-    tmp_path: Path, later: tuple[Seen, ...]
+    tmp_path: Path,
 ) -> None:
-    messages = [*looked(0, 30, HERE, ("cup", 3.0, 0.0)), *looked(30, 90, HERE, *later)]
-    write_splits(tmp_path, [each for each in messages if each.topic != "/odom"])
-    reply = ask(tmp_path, label="cup")
-    assert reply["things"][0]["still_there"].keys() == {"not_looked_at_since"}
+    said = [CUP_AS_JSON] * 30 + ['{"detections": []}'] * 60
+    write_splits(tmp_path, [text((BEGIN + at) * S, each) for at, each in enumerate(said)])
+    [cup] = ask(tmp_path, label="cup")["things"]
+    assert cup["still_there"].keys() == {"not_looked_at_since"}
+
+
+def test_transforms_alone_say_from_where_a_detector_looked(tmp_path: Path) -> None:
+    there, gone = looked(0, 30, HERE, ("cup", 3.0, 0.0)), looked(30, 90, HERE)
+    elsewhere = looked(30, 90, AWAY, ("chair", -2.0, 0.0))
+    states = []
+    for nth, later in enumerate((gone, elsewhere)):
+        messages = [each for each in [*there, *later] if each.topic != "/odom"]
+        write_splits(tmp_path / str(nth), messages)
+        [cup] = ask(tmp_path / str(nth), label="cup")["things"]
+        assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
+        states.append([*cup["still_there"]])
+    assert states == [["not_seen_where_expected", "looks"], ["not_looked_at_since"]]
+
+
+@pytest.mark.parametrize(
+    ("pan", "state"), [(0.0, "not_seen_where_expected"), (math.pi / 2, "not_looked_at_since")]
+)
+def test_a_camera_that_is_turned_away_by_its_own_joint_misses_nothing(
+    tmp_path: Path, pan: float, state: str
+) -> None:
+    """The robot stands; an empty message names the frame of the camera, too."""
+
+    def seen_by_camera(at: int, turned: float, *things: Seen) -> list[Msg]:
+        *robot, seen = scene(at, HERE, things)
+        seen.body.header.frame_id = "camera"  # type: ignore[attr-defined]
+        at_ns = BEGIN * S + at * S
+        camera = transform(at_ns, "base_link", "camera", (0.0, 0.0, 1.0), turned)
+        return [*robot, tf(at_ns, camera), seen]
+
+    there = [each for at in range(350, 400) for each in seen_by_camera(at, 0.0, ("cup", 3.0, 0.0))]
+    later = [each for at in range(400, 460) for each in seen_by_camera(at, pan)]
+    write_splits(tmp_path, [*there, *later])
+    [cup] = ask(tmp_path, label="cup")["things"]
+    assert next(iter(cup["still_there"])) == state
+    assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
 
 
 @pytest.mark.parametrize("lost", [math.nan, math.inf])
