@@ -49,7 +49,8 @@ _BESIDE_MM: Final = 600
 _MAX_SPOTS: Final = 64
 _MAX_LABELS: Final = 512
 _MAX_LABEL_CHARS: Final = 120
-_MAX_COMPARED: Final = 32
+_MAX_COMPARED: Final = 128
+"""Of more detections of a message that lie so near in x, not all are compared."""
 _MAX_AWAY_M: Final = 1e6
 _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
@@ -469,17 +470,15 @@ def _unplaced(lost: _Detections, times: Ints) -> Ints:
 
 def _beside(found: _Detections) -> tuple[Ints, Ints]:
     """Returns detections and another label that is beside each, each pair once."""
-    counts = np.bincount(found.message)
-    few = np.flatnonzero(counts[found.message] <= _MAX_COMPARED)
-    ones, others = [few[:0]], [few[:0]]
-    for step in range(1, int(counts.max(initial=0))):
-        a, b = few[:-step], few[step:]
-        near = found.message[a] == found.message[b]
+    order = np.lexsort((found.x, found.message))
+    ones, others = [order[:0]], [order[:0]]
+    for step in range(1, _MAX_COMPARED):
+        a, b = order[:-step], order[step:]
+        near = (found.message[a] == found.message[b]) & (found.x[b] - found.x[a] < _BESIDE_MM)
         if not near.any():
             break
         near &= found.label[a] != found.label[b]
-        for column in (found.x, found.y):
-            near &= np.abs(column[a] - column[b]) < _BESIDE_MM
+        near &= np.abs(found.y[a] - found.y[b]) < _BESIDE_MM
         ones += [a[near], b[near]]
         others += [b[near], a[near]]
     rows, _ = distinct_rows((np.concatenate(ones), found.label[np.concatenate(others)]))

@@ -123,6 +123,14 @@ def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
     assert found.unplaced[:, Unplaced.N].tolist() == [136]
 
 
+def test_labels_beside_a_detection_are_counted_in_a_crowd_too() -> None:
+    crowd = [PlacedDetection("box", (3.0 + nth, 0.0, 0.7)) for nth in range(200)]
+    cup = PlacedDetection("cup", (1.2, 0.0, 0.7))
+    found = sights_of([cup, *crowd, mug(1.0)])
+    names = [found.labels[label] for label in found.beside[:, Beside.LABEL].tolist()]
+    assert sorted(names) == ["cup", "mug"]
+
+
 def test_messages_of_one_slice_of_the_clock_are_looked_at_together_and_no_others() -> None:
     messages = [Message("/a", nth * SECOND, HERE, [mug(1.0)]) for nth in range(7, 24)]
     found = sights_of_messages(messages)
