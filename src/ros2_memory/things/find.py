@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
+_NEWEST_BESIDE: Final = 9
+"""So many slices say how many there are now: of more, some may have been taken away since."""
 _MOST_NAMES: Final = 5
 _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
@@ -305,10 +307,11 @@ class _Finder:
         """Returns how many of a label are at one place, where messages have several at once.
 
         Places are no finer than the noise of far detections, but two of one message are never one.
-        A slice counts where each was seen at least half as often as the one seen most.
+        A slice counts where each was seen at least half as often as the one seen most, three times
+        or as often as a slow detector sees them.
         """
         spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
-        many = counts >= _FEWEST_BESIDE
+        many = counts >= min(_FEWEST_BESIDE, int(counts.max()))
         of = spots[many]
         order = np.argsort(of[:, Spot.SLICE], kind="stable")
         slices, together, often = (
@@ -325,6 +328,7 @@ class _Finder:
             at_once = np.maximum.reduceat(together, begins)
             numbers = np.minimum(beside, at_once).tolist()
         # What most slices have, so that no single one with a false detection counts.
+        numbers = numbers[-_NEWEST_BESIDE:]
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None
 

@@ -263,6 +263,24 @@ def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path
     assert "at_once" not in reply["things"][0]
 
 
+@pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 2)])
+def test_things_side_by_side_are_counted_as_of_the_end(
+    tmp_path: Path, before: int, after: int
+) -> None:
+    cups = [("cup", 3.0, nth * 0.25) for nth in range(3)]
+    seen = [*looked(0, 240, HERE, *cups[:before]), *looked(240, 360, HERE, *cups[:after])]
+    write_splits(tmp_path, seen, 60.0)
+    assert ask(tmp_path, label="cup")["total"] == after
+    assert ask(tmp_path, label="cup", end=BEGIN + 230)["total"] == before
+
+
+def test_a_slow_detector_counts_things_side_by_side(tmp_path: Path) -> None:
+    cups = ("cup", 3.0, 0.0), ("cup", 3.0, 0.3)
+    messages = [each for at in range(0, 300, 7) for each in looked(at, at + 1, HERE, *cups)]
+    write_splits(tmp_path, messages, 60.0)
+    assert ask(tmp_path, label="cup")["total"] == 2
+
+
 def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
     mug, moved = ("mug", 3.0, 0.5), ("mug", -2.0, 0.5)
     messages = [
