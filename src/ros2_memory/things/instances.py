@@ -694,9 +694,11 @@ def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None
 def most_at_once(spots: Ints) -> int:
     """Returns how many of a label were seen at once; one message in a hundred may have a false one.
 
-    `spots` are its rows of `Sights.spots`, at least one.
+    `spots` are its rows of `Sights.spots`, at least one: of those in a region, no more than there
+    are in a slice.
     """
-    together = np.sort(spots[:, Spot.TOGETHER])
+    nth = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
+    together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(nth)[nth]))
     return max(1, int(together[-max(1, len(together) // 100)]))
 
 

@@ -398,6 +398,23 @@ def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
     assert "still_there" not in people
 
 
+def test_people_are_counted_in_the_region_that_is_asked_for(tmp_path: Path) -> None:
+    people = [("person", x, 0.0) for x in (2.0, 6.0, 8.0)]
+    write_splits(tmp_path, looked(0, 60, HERE, *people, ("cup", 8.3, 0.0)))
+
+    def counted(**given: Any) -> tuple[int, float]:
+        reply = ask(tmp_path, label="person", **given)
+        return reply["total"], reply["things"][0]["place"]["x"]
+
+    assert ask(tmp_path, label="person")["total"] == 3
+    assert counted(where={"x": [1, 3], "y": [-1, 1]}) == (1, 2.0)
+    assert counted(where={"x": [5, 9], "y": [-1, 1]})[0] == 2
+    for x in (2.0, 6.0, 8.0):
+        assert counted(near={"x": x, "y": 0.1, "radius_m": 0.5}) == (1, x)
+    assert counted(near={"label": "cup", "radius_m": 1}) == (1, 8.0)
+    assert ask(tmp_path, label="cup", near={"label": "person", "radius_m": 1})["total"] == 1
+
+
 def test_a_score_that_no_thing_can_have_is_refused(tmp_path: Path) -> None:
     write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     assert "from 0 to 1" in ask(tmp_path, label="mug", min_score=60)["detail"]
