@@ -46,7 +46,10 @@ _SAME_SQUARED: Final = 500.0**2
 _TOGETHER_SHARE: Final = 0.05
 _BESIDE_MM: Final = 600
 """Another label this near in the same message is not this one under a wrong name."""
-_MAX_SPOTS: Final = 64
+MAX_SPOTS: Final = 128
+"""Of more of a label at once, detections are left out as if they had no place."""
+_MANY_PAIRS: Final = 200
+"""So many are compared sooner as arrays."""
 _MAX_LABELS: Final = 512
 _MAX_LABEL_CHARS: Final = 120
 _MAX_COMPARED: Final = 128
@@ -408,20 +411,28 @@ def _grown(messages: Sequence[int], places: Sequence[tuple[int, int]]) -> list[i
 
 def _assigned(spots: list[_Growing], places: Sequence[tuple[int, int]]) -> list[int]:
     """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
-    pairs = sorted(
-        (squared, nth, which)
-        for nth, place in enumerate(places)
-        for which, spot in enumerate(spots)
-        if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
-    )
+    if len(spots) * len(places) < _MANY_PAIRS:
+        pairs = [
+            (squared, nth, which)
+            for nth, place in enumerate(places)
+            for which, spot in enumerate(spots)
+            if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
+        ]
+    else:
+        middles = np.array([(spot.x, spot.y) for spot in spots])
+        away = ((middles - np.array(places)[:, None]) ** 2).sum(axis=2)
+        near = np.nonzero(away <= _GATE_SQUARED)
+        pairs = [*zip(away[near].tolist(), *(column.tolist() for column in near), strict=True)]
     taken: dict[int, int] = {}
-    for _, nth, which in pairs:
-        if nth not in taken and which not in taken.values():
+    others: set[int] = set()
+    for _, nth, which in sorted(pairs):
+        if nth not in taken and which not in others:
             taken[nth] = which
+            others.add(which)
     chosen = []
     for nth, place in enumerate(places):
         which = taken.get(nth, -1)
-        if which < 0 and len(spots) < _MAX_SPOTS:
+        if which < 0 and len(spots) < MAX_SPOTS:
             which = len(spots)
             spots.append(_Growing())
         if which >= 0:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SLICE_NS, Ints, Spot, Unplaced
+from ros2_memory.analysis.sights import MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
@@ -48,7 +48,8 @@ class Asked(NamedTuple):
 class _Detected(NamedTuple):
     """How often a label was detected: as counts, with too low scores, and without a place.
 
-    `first` and `last` are of those without a place, `placed` is when it was last seen at one.
+    `first` and `last` are of those without a place, `placed` is when it was last seen at one;
+    `together` how many were seen at once.
     """
 
     name: str
@@ -58,6 +59,7 @@ class _Detected(NamedTuple):
     first: Ns
     last: Ns
     placed: Ns
+    together: int
 
 
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
@@ -112,7 +114,10 @@ def vague_notes(
 
 
 def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator[str]:
-    """Yields which labels were detected without a place since they were last seen at one."""
+    """Yields which labels were detected without a place since they were last seen at one.
+
+    And those of which there were too many at once to tell them apart.
+    """
     for window in windows:
         every = [_detected(known, key, window) for key in sorted(known.estimate.names)]
         unplaced = [
@@ -121,6 +126,13 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
             for each in every
             if each.last > each.placed + SLICE_NS
         ]
+        crowded = [each.name for each in every if each.together > MAX_SPOTS]
+        if crowded:
+            yield repeating(
+                f"of more than {MAX_SPOTS} at once, the others are left out: "
+                f"{listed(crowded, at_most=_MOST_NAMED)}",
+                crowded,
+            )
         if unplaced:
             yield repeating(
                 f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}",
@@ -167,6 +179,7 @@ def _detected(known: KnownThings, key: str, window: TimeWindow) -> _Detected:
         int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
         int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
         int(sights.spots[rows, Spot.LAST].max(initial=MIN_NS)),
+        int(sights.spots[rows, Spot.TOGETHER].max(initial=0)),
     )
 
 

@@ -119,7 +119,7 @@ def test_other_labels_beside_a_detection_of_the_same_message_are_counted() -> No
 
 def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
     found = sights_of(*[[mug(float(nth))] for nth in range(200)])
-    assert len(found.spots) == 64
+    assert len(found.spots) == 128
     assert found.unplaced[:, Unplaced.N].tolist() == [136]
 
 

@@ -243,6 +243,19 @@ def test_chairs_are_counted(tmp_path: Path) -> None:
     assert ask(tmp_path)["labels"] == {"chair": 3, "table": 1}
 
 
+@pytest.mark.parametrize(("chairs", "notes"), [(110, 0), (140, 1)])
+def test_all_chairs_of_a_hall_are_counted_or_it_is_said_that_some_are_not(
+    tmp_path: Path, chairs: int, notes: int
+) -> None:
+    hall = [("chair", 2.0 + nth % 12, nth // 12 - 5.0) for nth in range(chairs)]
+    write_splits(tmp_path, looked(0, 20, HERE, *hall))
+    reply = ask(tmp_path, limit=100)
+    assert reply["total"] == min(chairs, 128)
+    assert [each for each in reply.get("notes", ()) if "more than 128 at once" in each][
+        notes:
+    ] == []
+
+
 def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
     beside, one = ("chair", 3.0, 0.4), ("chair", 3.0, 0.0)
     write_splits(tmp_path / "two", looked(0, 30, HERE, one, beside))
