@@ -165,7 +165,7 @@ class Seen(NamedTuple):
         labels: the place of their names in `names`.
         names: of labels; there may be some that none has.
         places: N x 3 (m); NaN where that is not known.
-        scores: NaN where there is none.
+        scores: not finite where there is none.
     """
 
     times: Ints
@@ -326,7 +326,8 @@ def _detections(seen: Seen, slices: Ints) -> tuple[_Detections, tuple[str, ...]]
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
-    found = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
+    scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
+    found = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
     if len(names) > _MAX_LABELS:
         rows, nth = distinct_rows((found.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
