@@ -307,6 +307,24 @@ class FrameTree:
         is_known = name == self.target or self.reaches(name)
         return self._compose(name, times) if is_known else None
 
+    def carriers(self, frame: str, odometry: str = "") -> tuple[str, str] | None:
+        """Returns what a frame is fixed to by static transforms, and the body that carries that.
+
+        The body is the frame next to the world, which is the target, odometry, and what is above
+        these. None of a frame of the world.
+        """
+        world = self._newest_chain(self.target)
+        chain: list[str] = []
+        for name in self._newest_chain(frame.lstrip("/")):
+            is_odometry = name == odometry or name.rpartition("/")[2].startswith("odom")
+            if name in world or is_odometry:
+                break
+            chain.append(name)
+        if not chain:
+            return None
+        fixed = takewhile(lambda name: name not in self._moving, chain[:-1])
+        return chain[sum(1 for _ in fixed)], chain[-1]
+
     def lookup(self, frame: str, time: Ns) -> Transform:
         """Returns the pose of a frame in the target at one time (tf2: source and target).
 
@@ -424,11 +442,17 @@ class FrameTree:
 
     def _root_of(self, frame: str) -> str:
         """Returns the newest known root above a frame; in a loop, the frame where it closes."""
-        seen: set[str] = set()
-        while frame not in seen and (history := self._history(frame)) is not None:
-            seen.add(frame)
+        return [*self._newest_chain(frame)][-1]
+
+    def _newest_chain(self, frame: str) -> dict[str, None]:
+        """Returns the frames from one upwards to the newest known root, or once round a loop."""
+        chain = {frame: None}
+        while (history := self._history(frame)) is not None:
             frame = history.newest_parent()
-        return frame
+            if frame in chain:
+                break
+            chain[frame] = None
+        return chain
 
 
 def agreeing_clock(moving: Edges) -> TfClock:

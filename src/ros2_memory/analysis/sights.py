@@ -33,7 +33,8 @@ Flags: TypeAlias = NDArray[np.bool_]
 
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
-_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG)
+NO_YAW: Final = -1
+_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG, CELL_DECIDEG)
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05, what lies above 1 in the last one."""
 SLICE_NS: Final = 10 * NS_PER_S
@@ -45,10 +46,14 @@ _SAME_SQUARED: Final = 500.0**2
 _TOGETHER_SHARE: Final = 0.05
 _BESIDE_MM: Final = 600
 """Another label this near in the same message is not this one under a wrong name."""
-_MAX_SPOTS: Final = 64
+MAX_SPOTS: Final = 128
+"""Of more of a label at once, detections are left out as if they had no place."""
+_MANY_PAIRS: Final = 200
+"""So many are compared sooner as arrays."""
 _MAX_LABELS: Final = 512
 _MAX_LABEL_CHARS: Final = 120
-_MAX_COMPARED: Final = 32
+_MAX_COMPARED: Final = 128
+"""Of more detections of a message that lie so near in x, not all are compared."""
 _MAX_AWAY_M: Final = 1e6
 _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
@@ -77,16 +82,21 @@ class Spot(IntEnum):
 
 
 class Look(IntEnum):
-    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages."""
+    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
+
+    Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`. `PAN`
+    is how far the detector was turned from the robot's heading, to `CELL_DECIDEG`.
+    """
 
     SLICE = 0
     TOPIC = 1
     X = 2
     Y = 3
     YAW = 4
-    N = 5
-    FIRST = 6
-    LAST = 7
+    PAN = 5
+    N = 6
+    FIRST = 7
+    LAST = 8
 
 
 class Hit(IntEnum):
@@ -149,12 +159,13 @@ class DetectorMessages(NamedTuple):
 
     Attributes:
         times: log times of the messages (ns).
-        robot: x, y (m) and yaw (rad) of the robot at each (M x 3); NaN where that is not known.
+        robot: x, y (m) and yaw (rad) of the robot at each, and how far the detector was turned from
+            that (rad) by what moves it (M x 4); NaN where that is not known.
         rows: of each detection its message, ascending.
         labels: the place of their names in `names`.
         names: of labels; there may be some that none has.
         places: N x 3 (m); NaN where that is not known.
-        scores: NaN where there is none.
+        scores: not finite where there is none.
     """
 
     times: Ints
@@ -292,17 +303,17 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
-    placed = np.flatnonzero(np.isfinite(seen.robot).all(axis=1))
-    x, y, yaw = seen.robot[placed].T
-    columns = (_mm(x), _mm(y), _decideg(yaw) % 3600)
+    is_known = ~np.isnan(seen.robot.sum(axis=1))
+    x, y, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
+    turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
+    columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW), turned)
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
-    _, number = distinct_rows((slices[placed], *cells))
-    look = np.full(len(seen.times), -1, np.int64)
-    look[placed] = number
+    _, number = distinct_rows((slices, *cells))
+    look = np.where(is_known, number, -1)
     by = Groups.of(number)
     means = [by.sums(column) // by.sizes for column in columns]
-    first, last = by.ends(_rounded(seen.times[placed]))
-    slices = slices[placed][by.firsts]
+    first, last = by.ends(_rounded(seen.times))
+    slices = slices[by.firsts]
     topic = np.zeros(len(slices), np.int64)
     return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
 
@@ -319,7 +330,8 @@ def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tupl
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
-    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, seen.scores, near)
+    scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
+    detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
     if len(names) > _MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
@@ -404,20 +416,28 @@ def _cluster_label(messages: Sequence[int], places: Sequence[tuple[int, int]]) -
 
 def _assign(spots: list[_GrowingSpot], places: Sequence[tuple[int, int]]) -> list[int]:
     """Adds the detections of a message to spots, and returns these; -1 where there are too many."""
-    pairs = sorted(
-        (squared, nth, which)
-        for nth, place in enumerate(places)
-        for which, spot in enumerate(spots)
-        if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
-    )
+    if len(spots) * len(places) < _MANY_PAIRS:
+        pairs = [
+            (squared, nth, which)
+            for nth, place in enumerate(places)
+            for which, spot in enumerate(spots)
+            if (squared := spot.squared_to(*place)) <= _GATE_SQUARED
+        ]
+    else:
+        middles = np.array([(spot.x, spot.y) for spot in spots])
+        away = ((middles - np.array(places)[:, None]) ** 2).sum(axis=2)
+        near = np.nonzero(away <= _GATE_SQUARED)
+        pairs = [*zip(away[near].tolist(), *(column.tolist() for column in near), strict=True)]
     taken: dict[int, int] = {}
-    for _, nth, which in pairs:
-        if nth not in taken and which not in taken.values():
+    others: set[int] = set()
+    for _, nth, which in sorted(pairs):
+        if nth not in taken and which not in others:
             taken[nth] = which
+            others.add(which)
     chosen = []
     for nth, place in enumerate(places):
         which = taken.get(nth, -1)
-        if which < 0 and len(spots) < _MAX_SPOTS:
+        if which < 0 and len(spots) < MAX_SPOTS:
             which = len(spots)
             spots.append(_GrowingSpot())
         if which >= 0:
@@ -468,17 +488,16 @@ def _unplaced(lost: _Detections, times: Ints) -> Ints:
 
 def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
     """Returns detections and another label that is beside each, each pair once."""
-    counts = np.bincount(detections.message)
-    few = np.flatnonzero(counts[detections.message] <= _MAX_COMPARED)
-    ones, others = [few[:0]], [few[:0]]
-    for step in range(1, int(counts.max(initial=0))):
-        a, b = few[:-step], few[step:]
+    order = np.lexsort((detections.x, detections.message))
+    ones, others = [order[:0]], [order[:0]]
+    for step in range(1, _MAX_COMPARED):
+        a, b = order[:-step], order[step:]
         near = detections.message[a] == detections.message[b]
+        near &= detections.x[b] - detections.x[a] < _BESIDE_MM
         if not near.any():
             break
         near &= detections.label[a] != detections.label[b]
-        for column in (detections.x, detections.y):
-            near &= np.abs(column[a] - column[b]) < _BESIDE_MM
+        near &= np.abs(detections.y[a] - detections.y[b]) < _BESIDE_MM
         ones += [a[near], b[near]]
         others += [b[near], a[near]]
     rows, _ = distinct_rows((np.concatenate(ones), detections.label[np.concatenate(others)]))

@@ -91,10 +91,12 @@ class StampedDetections(NamedTuple):
     Attributes:
         detections: by the place of their message among these.
         stamps: of the messages' headers (ns); None where they have none.
+        frames: of the messages' headers, empty where they have none.
     """
 
     detections: Detections
     stamps: Ints | None
+    frames: Texts
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +161,10 @@ class DetectionColumns:
             detections = joined_detections(
                 [_with_frames(values, part, header_frames) for part in parts]
             )
-            return StampedDetections(detections, _stamps(values, definition))
+            frames = texts_of(values, header_frames[0]) if header_frames else None
+            return StampedDetections(
+                detections, _stamps(values, definition), frames or _no_frames(len(table))
+            )
         except UnknownShapeError:
             return None
 

@@ -14,6 +14,7 @@ from ros2_memory.columns.detections import (
     joined_detections,
 )
 from ros2_memory.columns.steps import METRES
+from ros2_memory.columns.table import Texts, joined_texts
 from ros2_memory.core.arrays import merged_times
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.scan import messages_of, of_columns
@@ -43,19 +44,22 @@ class Detected(NamedTuple):
         times: in the clock of the transforms, as far as is known: of their stamps where these agree
             with the log times, else those.
         found: by the place of their message; places are rounded to 0.1 mm, as the store has them.
+        frames: of the messages, empty where their headers name none.
     """
 
     log_times: IntArray
     times: IntArray
     found: Detections
+    frames: Texts
 
 
 class _DecodedMessage(NamedTuple):
-    """A decoded message: log time and header stamp (ns; the log time if none), and detections."""
+    """A decoded message: log time and header stamp (ns; the log time if none), what is in it."""
 
     log_time: Ns
     stamp: Ns
     detections: list[Detection]
+    frame: str
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
@@ -68,7 +72,8 @@ def joined_detected(parts: Sequence[Detected]) -> Detected:
         for place, part in zip(places, parts, strict=True)
     ]
     times = np.concatenate([part.times for part in parts])[order]
-    return Detected(log_times, times, joined_detections(detections))
+    frames = joined_texts([part.frames for part in parts]).rows(order)
+    return Detected(log_times, times, joined_detections(detections), frames)
 
 
 class DetectionRows:
@@ -96,11 +101,11 @@ class DetectionRows:
         columns = self._columns.of(rows.table)
         if columns is None:
             return None
-        detections, stamps = columns
+        detections, stamps, frames = columns
         if rows.index is not None:
-            detections = detections.at(rows.index)
+            detections, frames = detections.at(rows.index), frames.rows(rows.index)
             stamps = None if stamps is None else stamps[rows.index]
-        return _with_times(rows.times, stamps, detections)
+        return _with_times(rows.times, stamps, detections, frames)
 
     def _by_messages(self, rows: Rows) -> Detected:
         decoded = (self._decode(stored) for stored in messages_of(self._view, rows))
@@ -110,6 +115,7 @@ class DetectionRows:
             np.array([message.log_time for message in messages], np.int64),
             np.array([message.stamp for message in messages], np.int64),
             detections_by([message.detections for message in messages]),
+            Texts.of([message.frame for message in messages]),
         )
 
     def _decode(self, stored: StoredMessage) -> _DecodedMessage | None:
@@ -122,10 +128,13 @@ class DetectionRows:
             detection if detection.frame_id else detection._replace(frame_id=frame)
             for detection in detections_of(extractor.exact(message, stored.type))
         ]
-        return _DecodedMessage(stored.time, stored.time if stamp is None else stamp, detections)
+        log_time = stored.time
+        return _DecodedMessage(log_time, log_time if stamp is None else stamp, detections, frame)
 
 
-def _with_times(log_times: IntArray, stamps: IntArray | None, detections: Detections) -> Detected:
+def _with_times(
+    log_times: IntArray, stamps: IntArray | None, detections: Detections, frames: Texts
+) -> Detected:
     times = log_times
     if stamps is not None:
         # A stamp of another clock cannot be compared with those of transforms.
@@ -133,4 +142,4 @@ def _with_times(log_times: IntArray, stamps: IntArray | None, detections: Detect
         is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
         times = np.where(is_of_this_clock, stamps, log_times)
     places = np.rint(detections.places * METRES.per_unit) / METRES.per_unit
-    return Detected(log_times, times, detections._replace(places=places))
+    return Detected(log_times, times, detections._replace(places=places), frames)

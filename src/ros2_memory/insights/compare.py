@@ -40,7 +40,7 @@ from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things, note_other_frames
-from ros2_memory.things.unseen import vague_notes
+from ros2_memory.things.unseen import unplaced_notes, vague_notes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -157,7 +157,7 @@ def _things(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    view.notes.add(*vague_notes(known, windows))
+    view.notes.add(*vague_notes(known, windows), *unplaced_notes(known, (first, second)))
     places = places_asked(limits, where, known.frames)
     return frame, ThingsBetween(known, first, second, where, places).compared()
 

@@ -43,6 +43,8 @@ if TYPE_CHECKING:
 
 LIMIT: Final = 12
 _FEWEST_BESIDE: Final = 3
+_NEWEST_BESIDE: Final = 9
+"""So many slices say how many there are now: of more, some may have been taken away since."""
 _MOST_NAMES: Final = 5
 _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
@@ -108,7 +110,18 @@ def find_things(
     note_unread(view, whole, nothing=not found, gaps=not found)
     if not found and asked_for != whole:
         view.notes.add(describe_misdated(view.snapshot.misdated))
-    things = tuple(replace(each.described(), near_m=each.near_m) for each in found[:limit])
+    things = tuple(
+        each.described()
+        if beside is None
+        else replace(
+            each.described(),
+            place=each.place,
+            inside=places_at(places, known.frames[each.thing.epoch], *each.place[:2]),
+            at_once=each.at_once,
+            near_m=each.near_m,
+        )
+        for each in found[:limit]
+    )
     totals: Counter[str] = Counter()
     for each in found:
         totals[each.label] += each.at_once or 1
@@ -154,6 +167,8 @@ class _Found(NamedTuple):
     is_vague: bool
     described: Callable[[], Thing]
     thing: Instance | Mover
+    also_at: tuple[tuple[float, float, float], ...] = ()
+    """Of what moves by itself: where others were in the slice that was seen last."""
     near_m: float | None = None
 
 
@@ -166,17 +181,23 @@ class Near(NamedTuple):
     def among(self, found: Iterable[_Found], others: Sequence[_Found]) -> Iterator[_Found]:
         """Yields those near the circle's middle, or one of the others, each with its distance."""
         for each in found:
-            x, y, _ = each.place
             points = [(self.circle.x, self.circle.y)]
             if self.label:
                 points = [
-                    one.place[:2]
+                    place[:2]
                     for one in others
                     if one.thing is not each.thing and one.thing.epoch == each.thing.epoch
+                    for place in (one.place, *one.also_at)
                 ]
-            near_m = min((math.dist((x, y), point) for point in points), default=math.inf)
-            if near_m <= self.circle.radius_m:
-                yield each._replace(near_m=near_m)
+            away = [
+                (min((math.dist(place[:2], point) for point in points), default=math.inf), place)
+                for place in (each.place, *each.also_at)
+            ]
+            near = [one for one in away if one[0] <= self.circle.radius_m]
+            if near:
+                near_m, place = min(near)
+                at_once = min(each.at_once or 1, len(near)) if each.also_at else each.at_once
+                yield each._replace(near_m=near_m, place=place, at_once=at_once)
 
 
 def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
@@ -305,10 +326,11 @@ class _Finder:
         """Returns how many of a label are at one place, where messages have several at once.
 
         Places are no finer than the noise of far detections, but two of one message are never one.
-        A slice counts where each was seen at least half as often as the one seen most.
+        A slice counts where each was seen at least half as often as the one seen most, three times
+        or as often as a slow detector sees them.
         """
         spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
-        many = counts >= _FEWEST_BESIDE
+        many = counts >= min(_FEWEST_BESIDE, int(counts.max()))
         of = spots[many]
         order = np.argsort(of[:, Spot.SLICE], kind="stable")
         slices, together, often = (
@@ -325,6 +347,7 @@ class _Finder:
             at_once = np.maximum.reduceat(together, begins)
             numbers = np.minimum(beside, at_once).tolist()
         # What most slices have, so that no single one with a false detection counts.
+        numbers = numbers[-_NEWEST_BESIDE:]
         number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
         return number if number > 1 else None
 
@@ -336,8 +359,11 @@ class _Finder:
             return
         spots = result.sights.spots[rows]
         newest = int(spots[:, Spot.LAST].argmax())
-        x, y, z = spots[newest, [Spot.X, Spot.Y, Spot.Z]].tolist()
-        place = x / _MM, y / _MM, z / _MM
+        places = (spots[:, [Spot.X, Spot.Y, Spot.Z]] / _MM).tolist()
+        x, y, z = places[newest]
+        place = x, y, z
+        together = np.flatnonzero(spots[:, Spot.SLICE] == spots[newest, Spot.SLICE]).tolist()
+        others = [places[nth] for nth in together if nth != newest]
         thing = replace(
             self._thing(result.names[mover.key], frame, place, rows, rows[[newest]]),
             spread_m=int(spots[newest, Spot.DEV]) / _MM,
@@ -353,6 +379,7 @@ class _Finder:
             result.is_vague(rows),
             lambda: replace(thing, usually=self._usually(frame, rows)),
             mover,
+            tuple((x, y, z) for x, y, z in others),
         )
 
     def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:

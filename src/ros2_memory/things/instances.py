@@ -244,11 +244,15 @@ class Estimate:
 
 @dataclass(slots=True)
 class _Group:
-    """The places of one label in one epoch, each with its spots."""
+    """The places of one label in one epoch, each with its spots.
+
+    `unplaced` are its rows of `Sights.unplaced`, of all epochs.
+    """
 
     key: str
     epoch: int
     rows: Ints
+    unplaced: Ints
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
     evidence: Evidence | None = None
@@ -364,7 +368,8 @@ class _Seen:
             for topic in np.unique(topics).tolist()
             for of in (topics == topic,)
         }
-        heading = np.radians(bearing + self.cells.yaw[hits[:, Hit.LOOK]])
+        ahead = self.cells.yaw + self.cells.pan
+        heading = np.radians(bearing + ahead[hits[:, Hit.LOOK]])
         spot, n, size = hits[:, Hit.SPOT], hits[:, Hit.N], len(sights.spots)
         sums = [np.bincount(spot, n * of(heading), size) for of in (np.cos, np.sin)]
         self.side: Floats = (
@@ -411,7 +416,9 @@ def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
     groups = []
     for each in np.unique(of[of >= 0]).tolist():
         nth, key = divmod(each, len(shown) + 1)
-        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each)))
+        unplaced = seen.sights.unplaced
+        unplaced = unplaced[number[unplaced[:, Unplaced.LABEL]] == key]
+        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each), unplaced))
     return groups
 
 
@@ -424,7 +431,9 @@ def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None
             continue
         go_on()
         rows = seen.firm(group.rows)
-        place = places_of(spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows])
+        place = places_of(
+            spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows], spots[rows, Spot.SLICE]
+        )
         rows, place = rows[place >= 0], place[place >= 0]
         several, counts = (
             _are_several(place, seen.groups[rows]),
@@ -463,7 +472,7 @@ def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
     rows = _rows_of(mine, seen.hits, seen.starts)
     rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
     of = np.repeat(of, seen.starts[mine + 1] - seen.starts[mine])
-    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of)
+    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of, unplaced=group.unplaced)
     for place, stay in stays_at(seen.cells, group.evidence):
         go_on()
         spots = group.places[place]
@@ -513,6 +522,7 @@ def _fold(
             host_group, host = every[other]
             share = _HALO_SHARE if host_group is group else _SMALL_SHARE
             few = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
+            few &= not (host_group is group and _is_beside(stay, hosted, seen))
             if other not in gone and (few or stay.count <= hosted * share) and hosted > most:
                 best, most = other, hosted
         if best is not None:
@@ -525,6 +535,12 @@ def _fold(
     for nth, (group, stay) in enumerate(every):
         if nth not in gone and not stay.weak:
             group.stays.append(stay)
+
+
+def _is_beside(stay: PlacedStay, hosted: int, seen: _Seen) -> bool:
+    """Whether most messages that have one of a label also have this one, which is no noise then."""
+    together = seen.sights.spots[stay.spots, Spot.TOGETHER]
+    return 2 * stay.count > hosted and bool(np.median(together) > 1)
 
 
 class _Hosts:
@@ -678,9 +694,11 @@ def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None
 def most_at_once(spots: Ints) -> int:
     """Returns how many of a label were seen at once; one message in a hundred may have a false one.
 
-    `spots` are its rows of `Sights.spots`, at least one.
+    `spots` are its rows of `Sights.spots`, at least one: of those in a region, no more than there
+    are in a slice.
     """
-    together = np.sort(spots[:, Spot.TOGETHER])
+    nth = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
+    together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(nth)[nth]))
     return max(1, int(together[-max(1, len(together) // 100)]))
 
 

@@ -295,7 +295,7 @@ class _Loader:
         Raises:
             _TakesTooLongError: that takes longer than an answer may, and fewer would do.
         """
-        stretches = [stretch for part in parts for stretch in part]
+        stretches = _of_detectors([stretch for part in parts for stretch in part])
         epochs, names = self._epochs(stretches)
         sessions = {one: nth for nth, one in enumerate(dict.fromkeys(s.session for s in stretches))}
         until = self._view.call.partial_after(_ESTIMATING_S)
@@ -308,14 +308,14 @@ class _Loader:
 
         self._view.memory.large.acquire()
         sights, of_slice = joined(
-            [one for stretch in stretches for one in stretch.sights],
+            [one.packed for stretch in stretches for one in stretch.sights],
             [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],
             [sessions[each.session] for each in stretches for _ in each.sights],
         )
         found = estimate(sights, self._labels, of_slice, self._min_score, go_on)
         since = self._since
         if crowded:
-            since = max(stretches[0].start, MIN_NS if since is None else since)
+            since = max(parts[0][0].start, MIN_NS if since is None else since)
         has_map = bool(sights.topics) and 0 in epochs
         return KnownThings(found, self._labels, names, since, has_map, crowded, self._until)
 
@@ -335,6 +335,19 @@ class _Loader:
                 names.append(stretch.frame_id)
             epochs.append(known[key])
         return epochs, tuple(names)
+
+
+def _of_detectors(stretches: Sequence[Stretch]) -> list[Stretch]:
+    """Returns stretches with the sights of topics that have detections in any of them."""
+    every = [one for stretch in stretches for one in stretch.sights]
+    detectors = {topic for one in every if one.detects for topic in one.topics}
+    kept = (
+        stretch._replace(
+            sights=tuple(one for one in stretch.sights if detectors.issuperset(one.topics))
+        )
+        for stretch in stretches
+    )
+    return [stretch for stretch in kept if any(one.topics for one in stretch.sights)]
 
 
 def _spots(part: Sequence[Stretch]) -> int:

@@ -7,14 +7,14 @@ far detections overlaps.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.core.arrays import distinct_rows
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.sights import Floats, Ints
+    from ros2_memory.analysis.sights import Flags, Floats, Ints
 
 
 _CELL_MM: Final = 100
@@ -24,9 +24,12 @@ _CLAIM_MM: Final = 600
 """Spots this near to a place are of it before another place is looked for."""
 GATE_MM: Final = 900
 """What was seen farther from a place is not of it."""
-_HALO_MM: Final = 950
 _HALO_SHARE: Final = 0.1
-"""A peak this near to another one, and lighter than this share of it, is its noise."""
+"""A peak within `GATE_MM` of another one, and lighter than this share of it, is its noise."""
+_OWN_SHARE: Final = 0.5
+"""But for one that has this share of its weight while it is seen: a thing that came there."""
+_MIDDLE: Final = (10, 90)
+"""Between these percentiles of its spots: noise of another one may have been there before."""
 _SCATTER_MM: Final = 800
 _FEW: Final = 25.0
 """So few detections, far away, may scatter as widely."""
@@ -35,13 +38,15 @@ _FULL_WEIGHT: Final = 10
 """A spot of more detections weighs no more: all of one slice share its error of localisation."""
 
 
-def places_of(x: Ints, y: Ints, n: Ints) -> Ints:
-    """Returns the number of the place of each spot (mm); -1 of none."""
+def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
+    """Returns the number of the place of each spot (mm), seen in a slice; -1 of none."""
     weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
     centre = np.stack([np.bincount(cell_of, weight * each) / mass for each in (x, y)], axis=1)
-    peaks = _peaks(cells, centre, mass)
+    order = np.argsort(-_density(cells, mass), kind="stable")
+    spots = _Spots(np.argsort(order, kind="stable")[cell_of], weight, slices)
+    peaks = _peaks(centre[order], mass[order], spots)
     if not len(peaks):
         return np.full(len(x), -1, np.int64)
     place, away = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
@@ -49,14 +54,30 @@ def places_of(x: Ints, y: Ints, n: Ints) -> Ints:
     return place
 
 
-def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
-    """Returns where the spots are densest, the densest first, `_CLAIM_MM` or more apart."""
-    order = np.argsort(-_density(cells, mass), kind="stable")
-    centre, mass = centre[order], mass[order]
-    free = np.ones(len(cells), bool)
+class _Spots(NamedTuple):
+    """The cell, the weight and the slice of each spot."""
+
+    cell: Ints
+    weight: Floats
+    slice: Ints
+
+    def share(self, one: Flags, other: Flags) -> float:
+        """Returns the weight of some cells by that of others, while most of it is seen."""
+        mine = one[self.cell]
+        first, last = np.percentile(self.slice[mine], _MIDDLE)
+        weight = self.weight * ((self.slice >= first) & (self.slice <= last))
+        return float(weight[mine].sum() / max(weight[other[self.cell]].sum(), 1.0))
+
+
+def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
+    """Returns where the spots are densest, the densest first, `_CLAIM_MM` or more apart.
+
+    `centre` and `mass` are of cells, the densest first.
+    """
+    free = np.ones(len(mass), bool)
     peaks, masses = np.empty((_MAX_PLACES, 2)), np.empty(_MAX_PLACES)
     count = 0
-    for at in range(len(cells)):
+    for at in range(len(mass)):
         if not free[at]:
             continue
         middle, left, rest = centre[at], free[at:], centre[at:]
@@ -72,7 +93,15 @@ def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
         claimed[0] = True
         weight = float(mass[at:][claimed].sum())
         left[claimed] = False
-        if not _is_halo(middle, weight, peaks[:count], masses[:count]):
+        mine = np.append(np.zeros(at, bool), claimed)
+        heavy = peaks[:count][_with_noise_at(middle, weight, peaks[:count], masses[:count])]
+        if not len(heavy) or (
+            weight >= _FEW
+            and all(
+                spots.share(mine, _away_squared(centre, peak) <= _CLAIM_MM**2) > _OWN_SHARE
+                for peak in heavy
+            )
+        ):
             peaks[count], masses[count] = middle, weight
             count += 1
         if count == _MAX_PLACES:
@@ -80,11 +109,13 @@ def _peaks(cells: Ints, centre: Floats, mass: Floats) -> Floats:
     return peaks[:count]
 
 
-def _is_halo(middle: Floats, weight: float, peaks: Floats, masses: Floats) -> bool:
+def _with_noise_at(middle: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
+    """Returns which peaks are so heavy that one this light may be their noise."""
     away = _away_squared(peaks, middle)
-    noise = (away <= _HALO_MM**2) & (masses > weight / _HALO_SHARE)
+    noise = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
     scattered = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    return bool((noise | scattered).any())
+    found: Flags = noise | scattered
+    return found
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:

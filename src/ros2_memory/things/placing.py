@@ -1,7 +1,8 @@
 """What detectors saw in some rows of one session: placed in the map, as sights.
 
-Which topics are of detectors shows in their messages: in these ten minutes they hold detections, or
-their type is named for them. Other messages of such a topic count as looks that saw nothing.
+Which topics are of detectors shows in their messages: at some time they hold detections, or their
+type is named for them. Other messages of such a topic count as looks that saw nothing. So there are
+looks of all topics that may have detections; `detectors` are those that show it in these rows.
 """
 
 from __future__ import annotations
@@ -68,11 +69,13 @@ class SessionSights(NamedTuple):
     Attributes:
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
-        sights: of each topic.
+        sights: of each topic; those without a topic have the fixes.
+        detectors: topics that are surely of detectors.
     """
 
     frame_id: str
     sights: tuple[Sights, ...]
+    detectors: frozenset[str]
 
 
 class Placer:
@@ -90,7 +93,7 @@ class Placer:
     def placed(
         self, window: TimeWindow, own: Session, among: Session, found: Sequence[tuple[str, Rows]]
     ) -> SessionSights | None:
-        """Returns the sights of some rows of a session; None where no detector published.
+        """Returns the sights of some rows of a session; None where there are no messages.
 
         Args:
             window: the rows are of this time.
@@ -109,11 +112,13 @@ class Placer:
         for topic, rows in order:
             by_topic[topic].append(rows)
         detected: dict[str, Detected] = {}
+        detectors: set[str] = set()
         for topic, some in by_topic.items():
             all_of = joined_detected([self.rows.of(rows) for rows in some])
             named = any(is_named_for_detections(rows.table.channel.type) for rows in some)
-            if all_of.found.rows.size or (named and all_of.log_times.size):
+            if all_of.log_times.size:
                 detected[topic] = all_of
+                detectors |= {topic} if named or all_of.found.rows.size else set()
         if not detected:
             return None
         poses = self._poses(own, window)
@@ -122,8 +127,8 @@ class Placer:
         if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([each.log_times for each in detected.values()])
             fixes = self._fixes(own, poses.frames.words[0], frames, times)
-            sights[0] = sights[0].with_fixes(fixes)
-        return SessionSights(target, tuple(sights))
+            sights.append(replace(sights[0].only().with_fixes(fixes), topics=(), labels=()))
+        return SessionSights(target, tuple(sights), frozenset(detectors))
 
     def _poses(self, own: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -241,12 +246,42 @@ def _seen(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessag
             x, y, z = found.places[some].T
             placed = np.stack(known.points((x, y, z)), axis=1)
             places[some] = np.where(known.valid[:, None], placed, math.nan)
-    robot = _robot_at(poses, detected.times, frames)
+    robot = _robot_at(poses, detected, frames)
     labels = found.labels.codes.astype(np.int64), found.labels.words
     return DetectorMessages(detected.log_times, robot, found.rows, *labels, places, found.scores)
 
 
-def _robot_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
+def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
+    """Returns the pose of the robot at each message, and how far its detector was turned from it.
+
+    As `DetectorMessages.robot` has them. Where the poses do not say it, transforms of what carries
+    the detector may. What does not name the frame of its message is taken to be in that of the
+    others.
+    """
+    times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
+    robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
+    codes, words = detected.frames.codes, detected.frames.words
+    seen_in = detected.found.frames
+    usual = seen_in.words[np.bincount(seen_in.codes).argmax()] if len(seen_in) else ""
+    for code, name in enumerate(words):
+        carriers = frames.carriers(name or usual, pose_frame)
+        rows = np.flatnonzero(codes == code)
+        if carriers is None:
+            continue
+        turned, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
+        if turned is None or body is None:
+            continue
+        x, y, _ = body.translation
+        yaw = _yaw(body.rotation)
+        posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
+        robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
+        if carriers[0] != carriers[1]:
+            is_known = turned.valid & body.valid
+            robot[rows, 3] = np.where(is_known, _yaw(turned.rotation) - yaw, math.nan)
+    return robot
+
+
+def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
 
     That is farther than 1 s from a pose, or where no transform leads from its frame.

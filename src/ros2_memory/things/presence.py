@@ -1,11 +1,12 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
 What was seen is known by slice (`analysis.sights`): 10 s of the clock.
-A *cell* is a pose of the robot, to 25 cm and 10 degrees, from which the place was seen at least
-once. How often a message from a cell has the label, while it is there, is its rate. A look from
-such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is evidence
-of presence, as strong as false detections are rare. The likeliest sequence of being there and not
-being there (Viterbi, two states) gives the stays.
+A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees, from which the place was
+seen at least once. How often a message from a cell has the label, while it is there, is its rate. A
+look from such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is
+evidence of presence, as strong as false detections are rare. A message that has the label somewhere
+unknown is neither. The likeliest sequence of being there and not being there (Viterbi, two states)
+gives the stays.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from ros2_memory.analysis.sights import (
     Ints,
     Look,
     Sights,
+    Unplaced,
 )
 from ros2_memory.core.arrays import distinct_rows
 
@@ -86,7 +88,7 @@ class Cells:
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
-        self.yaw = looks[:, Look.YAW] / 10.0
+        self.yaw, self.pan = looks[:, Look.YAW] / 10.0, looks[:, Look.PAN] / 10.0
         _, self.cell = distinct_rows(
             (
                 self.topic + poor * (len(sights.topics) + 1),
@@ -94,6 +96,7 @@ class Cells:
                 looks[:, Look.X] // CELL_MM,
                 looks[:, Look.Y] // CELL_MM,
                 looks[:, Look.YAW] // CELL_DECIDEG,
+                looks[:, Look.PAN],
             )
         )
         order = np.argsort(self.cell, kind="stable")
@@ -123,6 +126,18 @@ class Cells:
         looks = in_ranges(first, last - first)
         return _keys(np.repeat(_place(slices), last - first), looks)
 
+    def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
+        """Returns how many detections without a place the slice and topic of each look have."""
+        topics = int(self.topic.max(initial=0)) + 1
+        keys, n = _totals(
+            unplaced[:, Unplaced.SLICE] * topics + unplaced[:, Unplaced.TOPIC],
+            unplaced[:, Unplaced.N],
+        )
+        own = self.slice[looks] * topics + self.topic[looks]
+        at = np.searchsorted(keys, own)
+        found: Ints = np.where(_are_in(keys, own), np.append(n, 0)[at], 0)
+        return found
+
     def looked_in(self, number: int) -> Ns | None:
         """Returns when the first look of a slice ended; None without any."""
         first, last = np.searchsorted(self.slice, (number, number + 1))
@@ -146,7 +161,8 @@ class Cells:
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
         dx, dy = x - self.x[looks], y - self.y[looks]
-        bearing = (np.degrees(np.arctan2(dy, dx)) - self.yaw[looks] + 180.0) % 360.0 - 180.0
+        ahead = self.yaw[looks] + self.pan[looks]
+        bearing = (np.degrees(np.arctan2(dy, dx)) - ahead + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
 
 
@@ -188,6 +204,8 @@ class Evidence(NamedTuple):
     Attributes:
         looks: their places and numbers, as keys in order.
         cell: of each look; cells are numbered for each place.
+        n: how many messages of each of these looks say whether it was there: those that have the
+            label without a place do not.
         hits: how many messages of each of these looks have the label there.
         blind: the places and slices, as keys in order, of hits by messages without a known pose.
         times: how many hits each of these has.
@@ -197,6 +215,7 @@ class Evidence(NamedTuple):
 
     looks: Ints
     cell: Ints
+    n: Ints
     hits: Ints
     blind: Ints
     times: Ints
@@ -211,6 +230,7 @@ class Evidence(NamedTuple):
         return Evidence(
             self.looks[looks],
             self.cell[looks],
+            self.n[looks],
             self.hits[looks],
             self.blind[blind],
             self.times[blind],
@@ -236,11 +256,17 @@ class Stay(NamedTuple):
 
 
 def evidence_at(
-    cells: Cells, view: dict[int, FieldOfView], places: Floats, rows: Ints, place: Ints
+    cells: Cells,
+    view: dict[int, FieldOfView],
+    places: Floats,
+    rows: Ints,
+    place: Ints,
+    *,
+    unplaced: Ints,
 ) -> Evidence:
     """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
 
-    `place` has the number of the place of each row.
+    `place` has the number of the place of each row; `unplaced` are the rows of the label.
     """
     placed, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
     blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~placed], n[~placed])
@@ -265,7 +291,8 @@ def evidence_at(
         inside = (bearing >= each.least_deg) & (bearing <= each.most_deg) & (away <= each.most_mm)
         covered |= inside & (cells.topic[seeing] == topic)
     fair[fair] = covered
-    return Evidence(looks, cell, hits, blind, times, fair)
+    n = np.maximum(cells.n[_number(looks)] - cells.totals_in(_number(looks), unplaced), hits)
+    return Evidence(looks, cell, n, hits, blind, times, fair)
 
 
 _BITS: Final = 32
@@ -330,7 +357,7 @@ def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
     looks, cell = _number(evidence.looks), evidence.cell
-    n, blind, times = cells.n[looks], evidence.blind, evidence.times
+    n, blind, times = evidence.n, evidence.blind, evidence.times
     hit = np.flatnonzero(evidence.hits)  # few of them all
     hits = evidence.hits[hit]
     own = _keys(_place(evidence.looks), cells.slice[looks])
@@ -391,7 +418,7 @@ def looks_without(
     after = (cells.first[looks] >= window[0]) & (last < window[1]) & evidence.fair & ~during
     known: dict[int, list[float]] = {}
     for each, n, hit in zip(
-        cell[during].tolist(), cells.n[looks[during]].tolist(), hits[during].tolist(), strict=True
+        cell[during].tolist(), evidence.n[during].tolist(), hits[during].tolist(), strict=True
     ):
         entry = known.setdefault(each, [1.0, 1.0])
         entry[0] += hit
@@ -400,7 +427,7 @@ def looks_without(
     crossed: Ns | None = None
     for each, n, hit, ended in zip(
         cell[after].tolist(),
-        cells.n[looks[after]].tolist(),
+        evidence.n[after].tolist(),
         hits[after].tolist(),
         last[after].tolist(),
         strict=True,

@@ -77,14 +77,26 @@ class Stretch(NamedTuple):
             lead to the map.
         session: its recordings.
         spots: how many spots there are.
-        sights: packed, as `joined` takes them.
+        sights: of each topic.
     """
 
     start: Ns
     frame_id: str
     session: Session
     spots: int
-    sights: tuple[bytes, ...]
+    sights: tuple[TopicSights, ...]
+
+
+class TopicSights(NamedTuple):
+    """The sights of a topic in a stretch, packed as `joined` takes them.
+
+    Of `topics` there is one, or none of those that have the fixes. Where it `detects` nothing it
+    may still be of a detector, which shows in other stretches.
+    """
+
+    topics: tuple[str, ...]
+    detects: bool
+    packed: bytes
 
 
 class SeenBytes(NamedTuple):
@@ -177,9 +189,14 @@ class Watching:
             [size] = _SIZE.unpack_from(data)
             at = _SIZE.size + size
             found = []
-            for nth, frame, spots, lengths in json.loads(data[_SIZE.size : at]):
-                ends = [*accumulate(lengths, initial=at)]
-                parts = tuple(data[begin:end] for begin, end in pairwise(ends))
+            for nth, frame, spots, described in json.loads(data[_SIZE.size : at]):
+                ends = [*accumulate((length for *_, length in described), initial=at)]
+                parts = tuple(
+                    TopicSights(tuple(topics), detects, data[begin:end])
+                    for (topics, detects, _), (begin, end) in zip(
+                        described, pairwise(ends), strict=True
+                    )
+                )
                 at = ends[-1]
                 own = around.sessions[nth].own
                 found.append(Stretch(around.window.start, frame, own, spots, parts))
@@ -345,12 +362,12 @@ class Watching:
     def _read(self, around: _Around) -> bytes:
         """Returns what was seen: of each session what there is, as JSON, then the sights.
 
-        With each comes which of the sessions around it is. Empty where no detector published.
+        With each comes which of the sessions around it is. Empty where there are no messages.
         """
         every: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
         for topic, rows in self._found(around.window):
             every[self._sessions.of(rows.recording)].append((topic, rows))
-        head: list[tuple[int, str, int, list[int]]] = []
+        head: list[tuple[int, str, int, list[tuple[tuple[str, ...], bool, int]]]] = []
         data: list[bytes] = []
         for nth, (own, among, slices) in enumerate(around.sessions):
             found = every[own]
@@ -363,10 +380,14 @@ class Watching:
             if seen is not None:
                 some = [*map(packed, seen.sights)]
                 spots = sum(len(sights.spots) for sights in seen.sights)
-                head.append((nth, seen.frame_id, spots, [*map(len, some)]))
+                described = [
+                    (sights.topics, not seen.detectors.isdisjoint(sights.topics), len(each))
+                    for sights, each in zip(seen.sights, some, strict=True)
+                ]
+                head.append((nth, seen.frame_id, spots, described))
                 data += some
-        described = json.dumps(head).encode()
-        return b"".join((_SIZE.pack(len(described)), described, *data)) if head else b""
+        packed_head = json.dumps(head).encode()
+        return b"".join((_SIZE.pack(len(packed_head)), packed_head, *data)) if head else b""
 
     def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
         """Yields the rows in a window that may have detections."""

@@ -88,7 +88,7 @@ def _alternate(every: Ints, counts: Ints, epoch: Ints, of: Sequence[Mask]) -> bo
     for each in np.unique(epoch[mine]).tolist():
         rows = mine[epoch[mine] == each]
         spots, n = every[rows], counts[rows]
-        place = places_of(spots[:, Spot.X], spots[:, Spot.Y], n)
+        place = places_of(spots[:, Spot.X], spots[:, Spot.Y], n, spots[:, Spot.SLICE])
         for nth in range(int(place.max(initial=-1)) + 1):
             here = place == nth
             which = of[1][spots[here, Spot.LABEL]].astype(np.int64)

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import Ints, Spot, Unplaced
+from ros2_memory.analysis.sights import MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.insights.silences import describe_silences
 
@@ -48,7 +48,8 @@ class Asked(NamedTuple):
 class _Detected(NamedTuple):
     """How often a label was detected: as counts, with too low scores, and without a place.
 
-    `first` and `last` are of those without a place.
+    `first` and `last` are of those without a place, `placed` is when it was last seen at one;
+    `together` how many were seen at once.
     """
 
     name: str
@@ -57,6 +58,8 @@ class _Detected(NamedTuple):
     unplaced: int
     first: Ns
     last: Ns
+    placed: Ns
+    together: int
 
 
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
@@ -76,8 +79,9 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
         )
     yield from vague_notes(known, (asked.window,), asked.labels, asked.vague)
     if not asked.labels:
+        yield from unplaced_notes(known, (asked.window,))
         others = sorted(known.estimate.names.keys() - asked.found)
-        yield from _left_out([_detected(known, key, asked.window) for key in others], asked)
+        yield from _too_low([_detected(known, key, asked.window) for key in others], asked)
     for key, label in asked.labels.items():
         about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
         for note in _of_label(known, key, asked):
@@ -107,6 +111,33 @@ def vague_notes(
             f"they may be elsewhere: {listed(sorted(labels), at_most=_MOST_NAMED)}",
             labels,
         )
+
+
+def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Iterator[str]:
+    """Yields which labels were detected without a place since they were last seen at one.
+
+    And those of which there were too many at once to tell them apart.
+    """
+    for window in windows:
+        every = [_detected(known, key, window) for key in sorted(known.estimate.names)]
+        unplaced = [
+            f"{each.name} ({counted(each.unplaced, 'time')}, "
+            f"from {unix_text(each.first)} to {unix_text(each.last)})"
+            for each in every
+            if each.last > each.placed + SLICE_NS
+        ]
+        crowded = [each.name for each in every if each.together > MAX_SPOTS]
+        if crowded:
+            yield repeating(
+                f"of more than {MAX_SPOTS} at once, the others are left out: "
+                f"{listed(crowded, at_most=_MOST_NAMED)}",
+                crowded,
+            )
+        if unplaced:
+            yield repeating(
+                f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}",
+                [each.name for each in every],
+            )
 
 
 def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
@@ -146,30 +177,22 @@ def _detected(known: KnownThings, key: str, window: TimeWindow) -> _Detected:
         int(sights.spots[rows, Spot.N].sum()) - count,
         int(lost[:, Unplaced.N].sum()),
         int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
-        int(lost[:, Unplaced.LAST].max(initial=0)),
+        int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
+        int(sights.spots[rows, Spot.LAST].max(initial=MIN_NS)),
+        int(sights.spots[rows, Spot.TOGETHER].max(initial=0)),
     )
 
 
-def _left_out(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
-    """Yields which labels were detected, and are no things."""
-    unplaced = [
-        f"{each.name} ({counted(each.unplaced, 'time')}, "
-        f"from {unix_text(each.first)} to {unix_text(each.last)})"
-        for each in detected
-        if each.unplaced
-    ]
+def _too_low(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
+    """Yields which labels were detected, and do not count."""
     low = [
         f"{each.name} ({counted(each.low, 'time')})"
         for each in detected
         if each.low and not each.counted
     ]
-    names = [each.name for each in detected]
-    if unplaced:
-        text = f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}"
-        yield repeating(text, names)
     if low:
         text = f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
-        yield repeating(text, names)
+        yield repeating(text, [each.name for each in detected])
 
 
 def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:

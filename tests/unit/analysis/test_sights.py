@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import (
+    NO_YAW,
     Beside,
     Fix,
     Hit,
@@ -83,9 +84,9 @@ def test_looks_differ_by_place_and_direction() -> None:
     assert looks[0, Look.YAW] == 43  # the mean of 2.9 and 5.7 degrees
 
 
-def test_without_a_pose_of_the_robot_a_detection_counts_and_no_look_does() -> None:
+def test_without_a_pose_of_the_robot_a_detection_counts_and_its_look_is_from_nowhere() -> None:
     found = sights_of([mug(1.0)], robot=None)
-    assert len(found.looks) == 0
+    assert found.looks[:, [Look.N, Look.YAW]].tolist() == [[1, NO_YAW]]
     assert found.hits.tolist() == [[0, -1, 1]]
 
 
@@ -103,6 +104,12 @@ def test_scores_are_counted_in_bins_and_the_best_is_kept() -> None:
     assert found.scores[:, [Score.BIN, Score.N]].tolist() == [[10, 2], [19, 1]]
 
 
+def test_a_score_that_is_no_number_is_none() -> None:
+    found = sights_of([mug(1.0, score=math.inf)], [mug(1.0, score=0.5)])
+    assert found.spots[0, Spot.BEST] == 500
+    assert found.scores[:, [Score.BIN, Score.N]].tolist() == [[10, 1]]
+
+
 def test_other_labels_beside_a_detection_of_the_same_message_are_counted() -> None:
     cup = PlacedDetection("cup", (1.2, 0.0, 0.7))
     found = sights_of([mug(1.0), cup], [mug(1.0)], [cup, mug(3.0)])
@@ -118,8 +125,16 @@ def test_other_labels_beside_a_detection_of_the_same_message_are_counted() -> No
 
 def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
     found = sights_of(*[[mug(float(nth))] for nth in range(200)])
-    assert len(found.spots) == 64
-    assert found.unplaced[:, Unplaced.N].tolist() == [136]
+    assert len(found.spots) == 128
+    assert found.unplaced[:, Unplaced.N].tolist() == [72]
+
+
+def test_labels_beside_a_detection_are_counted_in_a_crowd_too() -> None:
+    crowd = [PlacedDetection("box", (3.0 + nth, 0.0, 0.7)) for nth in range(200)]
+    cup = PlacedDetection("cup", (1.2, 0.0, 0.7))
+    found = sights_of([cup, *crowd, mug(1.0)])
+    names = [found.labels[label] for label in found.beside[:, Beside.LABEL].tolist()]
+    assert sorted(names) == ["cup", "mug"]
 
 
 def test_messages_of_one_slice_of_the_clock_are_looked_at_together_and_no_others() -> None:
@@ -159,7 +174,9 @@ def test_nothing_that_was_detected_is_lost(
     count = sum(len(detections) for *_, detections in seen)
     assert int(found.spots[:, Spot.N].sum() + found.unplaced[:, Unplaced.N].sum()) == count
     assert int(found.hits[:, Hit.N].sum()) == int(found.spots[:, Spot.N].sum())
-    assert int(found.looks[:, Look.N].sum()) == sum(robot is not None for _, robot, _ in seen)
+    from_somewhere = found.looks[found.looks[:, Look.YAW] != NO_YAW]
+    assert int(from_somewhere[:, Look.N].sum()) == sum(robot is not None for _, robot, _ in seen)
+    assert int(found.looks[:, Look.N].sum()) == len(seen)
 
 
 @given(messages, messages)

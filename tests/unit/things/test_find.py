@@ -22,6 +22,7 @@ from tests.support.bags import (
     make,
     odom,
     point,
+    text,
     tf,
     transform,
     write_splits,
@@ -143,11 +144,115 @@ def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
     assert "notes" not in ask(tmp_path)
 
 
+CUP_AS_JSON = json.dumps(
+    {"frame_id": "map", "detections": [{"label": "cup", "position": {"x": 3, "y": 0, "z": 1}}]}
+)
+
+
+@pytest.mark.parametrize("recalls", [False, True])
+def test_a_detector_that_sees_nothing_for_ten_minutes_goes_on_looking(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """Its type does not say what it is, and neither do other topics that hold JSON."""
+
+    def said(at: int, topic: str, data: str) -> list[Msg]:
+        robot = [each for each in scene(at, HERE, ()) if "vision" not in each.topic]
+        return [*robot, text((BEGIN + at) * S, data, topic)]
+
+    there = [each for at in range(350, 380) for each in said(at, "/seen", CUP_AS_JSON)]
+    later = {
+        topic: [each for at in range(1100, 1130) for each in said(at, topic, '{"detections": []}')]
+        for topic in ("/seen", "/other")
+    }
+    states = {}
+    for topic, some in later.items():
+        write_splits(tmp_path / topic[1:], [*there, *some])
+        memory = memory_of(tmp_path / topic[1:], recalls=recalls)
+        [cup] = asked(memory, tmp_path / topic[1:], "find_things", label="cup")["things"]
+        states[topic] = cup["still_there"]
+    assert states["/seen"].keys() == {"not_seen_where_expected", "looks"}
+    assert states["/other"].keys() == {"in_view"}
+
+
+def test_where_the_robots_pose_is_not_known_a_thing_of_long_ago_is_not_in_view(
+    tmp_path: Path,
+) -> None:
+    said = [CUP_AS_JSON] * 30 + ['{"detections": []}'] * 60
+    write_splits(tmp_path, [text((BEGIN + at) * S, each) for at, each in enumerate(said)])
+    [cup] = ask(tmp_path, label="cup")["things"]
+    assert cup["still_there"].keys() == {"not_looked_at_since"}
+
+
+def test_transforms_alone_say_from_where_a_detector_looked(tmp_path: Path) -> None:
+    there, gone = looked(0, 30, HERE, ("cup", 3.0, 0.0)), looked(30, 90, HERE)
+    elsewhere = looked(30, 90, AWAY, ("chair", -2.0, 0.0))
+    states = []
+    for nth, later in enumerate((gone, elsewhere)):
+        messages = [each for each in [*there, *later] if each.topic != "/odom"]
+        write_splits(tmp_path / str(nth), messages)
+        [cup] = ask(tmp_path / str(nth), label="cup")["things"]
+        assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
+        states.append([*cup["still_there"]])
+    assert states == [["not_seen_where_expected", "looks"], ["not_looked_at_since"]]
+
+
+@pytest.mark.parametrize(
+    ("pan", "state"), [(0.0, "not_seen_where_expected"), (math.pi / 2, "not_looked_at_since")]
+)
+def test_a_camera_that_is_turned_away_by_its_own_joint_misses_nothing(
+    tmp_path: Path, pan: float, state: str
+) -> None:
+    """The robot stands; an empty message names the frame of the camera, too."""
+
+    def seen_by_camera(at: int, turned: float, *things: Seen) -> list[Msg]:
+        *robot, seen = scene(at, HERE, things)
+        seen.body.header.frame_id = "camera"  # type: ignore[attr-defined]
+        at_ns = BEGIN * S + at * S
+        camera = transform(at_ns, "base_link", "camera", (0.0, 0.0, 1.0), turned)
+        return [*robot, tf(at_ns, camera), seen]
+
+    there = [each for at in range(350, 400) for each in seen_by_camera(at, 0.0, ("cup", 3.0, 0.0))]
+    later = [each for at in range(400, 460) for each in seen_by_camera(at, pan)]
+    write_splits(tmp_path, [*there, *later])
+    [cup] = ask(tmp_path, label="cup")["things"]
+    assert next(iter(cup["still_there"])) == state
+    assert cup["seen_from"] == {"x": 1.0, "y": 0.0, "yaw_deg": 0.0}
+
+
+@pytest.mark.parametrize("lost", [math.nan, math.inf])
+def test_a_thing_that_is_detected_without_a_place_is_not_missed(
+    tmp_path: Path, lost: float
+) -> None:
+    there, taken = ("cup", 3.0, 0.0), ("fork", 3.0, -1.0)
+    seen = [
+        *looked(0, 30, HERE, there, taken),
+        *looked(30, 90, HERE, ("cup", lost, lost)),
+    ]
+    write_splits(tmp_path, seen)
+    reply = ask(tmp_path)
+    states = {each["label"]: each["still_there"].keys() for each in reply["things"]}
+    assert states["cup"] == {"not_looked_at_since"}
+    assert states["fork"] == {"not_seen_where_expected", "looks"}
+    [note] = reply["notes"]
+    assert "could not be placed: cup (60 times" in note
+
+
 def test_chairs_are_counted(tmp_path: Path) -> None:
     chairs = [("chair", 3.0, 0.0), ("chair", 3.0, 1.2), ("chairs", 4.2, -1.0)]
     write_splits(tmp_path, looked(0, 20, HERE, *chairs, ("table", 4.0, 0.2)))
     assert ask(tmp_path, label="Chairs")["total"] == 3
     assert ask(tmp_path)["labels"] == {"chair": 3, "table": 1}
+
+
+@pytest.mark.parametrize(("chairs", "notes"), [(110, 0), (140, 1)])
+def test_all_chairs_of_a_hall_are_counted_or_it_is_said_that_some_are_not(
+    tmp_path: Path, chairs: int, notes: int
+) -> None:
+    hall = [("chair", 2.0 + nth % 12, nth // 12 - 5.0) for nth in range(chairs)]
+    write_splits(tmp_path, looked(0, 20, HERE, *hall))
+    reply = ask(tmp_path, limit=100)
+    assert reply["total"] == min(chairs, 128)
+    assert sum("of more than 128 at once" in each for each in reply.get("notes", ())) == notes
 
 
 def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
@@ -168,6 +273,24 @@ def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path
     reply = ask(tmp_path / "double", label="chair")
     assert reply["total"] == 1
     assert "at_once" not in reply["things"][0]
+
+
+@pytest.mark.parametrize(("before", "after"), [(3, 1), (1, 2)])
+def test_things_side_by_side_are_counted_as_of_the_end(
+    tmp_path: Path, before: int, after: int
+) -> None:
+    cups = [("cup", 3.0, nth * 0.25) for nth in range(3)]
+    seen = [*looked(0, 240, HERE, *cups[:before]), *looked(240, 360, HERE, *cups[:after])]
+    write_splits(tmp_path, seen, 60.0)
+    assert ask(tmp_path, label="cup")["total"] == after
+    assert ask(tmp_path, label="cup", end=BEGIN + 230)["total"] == before
+
+
+def test_a_slow_detector_counts_things_side_by_side(tmp_path: Path) -> None:
+    cups = ("cup", 3.0, 0.0), ("cup", 3.0, 0.3)
+    messages = [each for at in range(0, 300, 7) for each in looked(at, at + 1, HERE, *cups)]
+    write_splits(tmp_path, messages, 60.0)
+    assert ask(tmp_path, label="cup")["total"] == 2
 
 
 def test_a_moved_thing_has_its_places_in_order(tmp_path: Path) -> None:
@@ -285,6 +408,23 @@ def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
     assert people["moves"] is True
     assert people["at_once"] == 2
     assert "still_there" not in people
+
+
+def test_people_are_counted_in_the_region_that_is_asked_for(tmp_path: Path) -> None:
+    people = [("person", x, 0.0) for x in (2.0, 6.0, 8.0)]
+    write_splits(tmp_path, looked(0, 60, HERE, *people, ("cup", 8.3, 0.0)))
+
+    def counted(**given: Any) -> tuple[int, float]:
+        reply = ask(tmp_path, label="person", **given)
+        return reply["total"], reply["things"][0]["place"]["x"]
+
+    assert ask(tmp_path, label="person")["total"] == 3
+    assert counted(where={"x": [1, 3], "y": [-1, 1]}) == (1, 2.0)
+    assert counted(where={"x": [5, 9], "y": [-1, 1]})[0] == 2
+    for x in (2.0, 6.0, 8.0):
+        assert counted(near={"x": x, "y": 0.1, "radius_m": 0.5}) == (1, x)
+    assert counted(near={"label": "cup", "radius_m": 1}) == (1, 8.0)
+    assert ask(tmp_path, label="cup", near={"label": "person", "radius_m": 1})["total"] == 1
 
 
 def test_a_score_that_no_thing_can_have_is_refused(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pytest
+
 from ros2_memory.analysis.sights import Sights
 from ros2_memory.things.instances import estimate
 from ros2_memory.things.labels import Labels
@@ -59,3 +61,32 @@ def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:
     [mug] = estimate(whole([bag_of(*messages)]), LABELS).instances
     assert mug.key == "mug"
     assert mug.stays[0].also == {"cup": 10}
+
+
+@pytest.mark.parametrize("away_m", [0.62, 0.88, 0.92, 0.96])
+def test_a_thing_that_was_moved_by_less_than_a_metre_after_long_is_where_it_was_seen_last(
+    away_m: float,
+) -> None:
+    """However little that is of all its detections, it is no noise around its old place."""
+    there = [(HERE, seen_at(2, 0))] * 1200
+    [mug] = estimate(whole([bag_of(*there, *[(HERE, seen_at(2, away_m))] * 60)]), LABELS).instances
+    assert mug.stays[-1].y == pytest.approx(away_m * 1000)
+    assert (len(mug.stays), mug.missed_by) == (2, None)
+
+
+@pytest.mark.parametrize("away_m", [0.62, 0.9])
+def test_a_second_thing_that_comes_beside_one_after_long_is_a_second_thing(away_m: float) -> None:
+    alone = [(HERE, seen_at(2, 0))] * 1800
+    both = [(HERE, [*seen_at(2, 0), *seen_at(2, away_m)])] * 60
+    found = estimate(whole([bag_of(*alone, *both)]), LABELS).instances
+    assert [(len(each.stays), each.stays[0].count) for each in found] == [(1, 1860), (1, 60)]
+
+
+def test_a_detector_that_has_a_thing_twice_now_and_then_makes_no_second_one() -> None:
+    messages = [
+        (HERE, [*seen_at(2, 0), *seen_at(2, 0.7)] if nth % 4 == 0 else seen_at(2, 0))
+        for nth in range(600)
+    ]
+    alone = [(HERE, seen_at(2, 0))] * 1800
+    [mug] = estimate(whole([bag_of(*alone, *messages)]), LABELS).instances
+    assert len(mug.stays) == 1

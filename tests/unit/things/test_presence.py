@@ -37,7 +37,9 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     """From where the robot mostly stands, all looks of a week are at what it once saw there."""
     cells, hits = _seen(given_looks, unplaced)
     place = np.array([[3000.0, 100.0]])
-    found = evidence_at(cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64))
+    found = evidence_at(
+        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), unplaced=no_sights().unplaced
+    )
 
     whole = _with_every_look(cells, found, hits)
     left_out = np.setdiff1d(whole.looks, found.looks)
@@ -61,13 +63,20 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
     cells, hits = _seen([*given_looks, *others], unplaced)
     place = np.array(is_second, np.int64)[: len(hits)]
     places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
-    found = evidence_at(cells, _ANYWHERE, places, hits, place)
+    found = evidence_at(cells, _ANYWHERE, places, hits, place, unplaced=no_sights().unplaced)
     stays = [*stays_at(cells, found)]
 
     assert stays == sorted(stays, key=lambda each: each[0])
     for nth in (0, 1):
         mine = hits[place == nth]
-        alone = evidence_at(cells, _ANYWHERE, places[[nth]], mine, np.zeros(len(mine), np.int64))
+        alone = evidence_at(
+            cells,
+            _ANYWHERE,
+            places[[nth]],
+            mine,
+            np.zeros(len(mine), np.int64),
+            unplaced=no_sights().unplaced,
+        )
         at_once = found.at(nth)
         assert (at_once.looks & 0xFFFF_FFFF).tolist() == alone.looks.tolist()
         assert at_once.hits.tolist() == alone.hits.tolist()
@@ -88,7 +97,7 @@ def _seen(
     for step, place, n, seen in given_looks:
         bag += step
         time = len(looks) * 1000
-        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, n, time, time + 900))
+        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, 0, n, time, time + 900))
         if seen > 0:  # few looks see it
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
@@ -107,7 +116,7 @@ def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidenc
     np.add.at(of := np.zeros(len(cells.n), np.int64), seen_in, rows[rows[:, 1] >= 0, Hit.N])
     assert (hits == np.minimum(of, cells.n)[looks]).all()
     cell = np.searchsorted(known, cells.cell[looks])
-    return Evidence(looks, cell, hits, found.blind, found.times, fair)
+    return Evidence(looks, cell, cells.n[looks], hits, found.blind, found.times, fair)
 
 
 def _sights(looks: list[tuple[int, ...]], bags: int) -> Sights:

@@ -39,7 +39,7 @@ def day() -> list[Msg]:
 
 def sights_in(memory: Memory) -> Sights:
     stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
-    return joined([part for stretch in stretches for part in stretch.sights])[0]
+    return joined([part.packed for stretch in stretches for part in stretch.sights])[0]
 
 
 def things_in(memory: Memory) -> tuple[Thing, ...]:
