@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 _MOST_NAMED: Final = 5
 _UNDECODED: Final = Reason(
-    "could not be decoded, so what was detected then is not known", "topic", of="messages of "
+    "could not be decoded, so detections in them are not known", "topic", of="messages of "
 )
 
 
