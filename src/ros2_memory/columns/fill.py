@@ -270,6 +270,7 @@ class Filling:
                 return self._put_long(to_store, self._released_groups(begin, groups))
             pending.add(to_store, begin[0] if begin else [])
         except BagError as error:
+            self._scanner.met_damage(bag, error)
             self._refuse(bag, error.reason)
         except Exception as error:
             # The next bag may be whole.

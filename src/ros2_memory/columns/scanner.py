@@ -22,6 +22,7 @@ from ros2_memory.columns.stored import StoredTable, lazy_columns
 from ros2_memory.columns.table import Column, Table, Zone, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
 from ros2_memory.columns.zones import PartZones, Zones
+from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagFile, StampedTransform, TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -54,6 +55,8 @@ _FEW_DAYS_NS: Final = 3 * DAY_NS
 _DROPPED: Final = "beyond the share of the store (store.max_share)"
 _ABSENT: Final = Packed("", 0, 0.0, Zone(), b"")
 """Stands for a column that a part does not have."""
+_MOST_DAMAGED: Final = 10_000
+"""Files whose damage is remembered."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,9 +174,25 @@ class Scanner:
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._settings = settings
         self._fragments: dict[str, object] = {}
+        self._damaged: dict[tuple[str, int, Ns], str] = {}
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments[OUTLINE.name] = self._outlines
+
+    def met_damage(self, bag: BagFile, error: BagError) -> None:
+        """Remembers why a part of a bag is lost, if it is: only who reads it finds that out."""
+        if error.lost is None or isinstance(error, BagContradictionError):
+            return
+        if len(self._damaged) >= _MOST_DAMAGED:
+            self._damaged.clear()
+        self._damaged[bag.file, bag.size, bag.mtime_ns] = error.reason
+
+    def damaged_parts(self, bags: Sequence[BagFile]) -> list[tuple[BagFile, str]]:
+        """Returns the bags of which a part was found lost since the program began, and why."""
+        if not self._damaged:
+            return []
+        reasons = ((bag, self._damaged.get((bag.file, bag.size, bag.mtime_ns))) for bag in bags)
+        return [(bag, reason) for bag, reason in reasons if reason is not None]
 
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""

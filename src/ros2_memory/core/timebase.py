@@ -39,6 +39,9 @@ _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
 _SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
 _LONGEST_TIME: Final = 64
 _MINUTE_S: Final = 60.0
+_END_S: Final = 1.125e-6
+"""How long before its end a span ends, so that a time in a query, which is granted a microsecond
+and is a float of seconds, reaches no message at the end itself."""
 
 MIN_NS: Final[Ns] = -(2**63)
 MAX_NS: Final[Ns] = 2**63 - 1
@@ -152,13 +155,13 @@ def require_no_date(seconds: float) -> None:
 
 
 def rest_of_text_s(text: str) -> float:
-    """Returns how long a time as text lasts after its first moment (s, whole microseconds).
+    """Returns how long a time as text lasts after its first moment (s), less `_END_S`.
 
-    Its last decimal is all part of it: 14:05:03.74 lasts 9.999 ms longer, to 14:05:03.749999, and
+    Its last decimal is all part of it: 14:05:03.74 lasts 10 ms, up to, but not at, 14:05:03.75, and
     14:05:03 all of its second. One without seconds is exact, as Unix seconds are.
     """
     match = _SECONDS.search(text)
-    return max(10.0 ** -len(match[1] or "") - 1e-6, 0.0) if match else 0.0
+    return max(10.0 ** -len(match[1] or "") - _END_S, 0.0) if match else 0.0
 
 
 def rest_of_end_s(text: str) -> float:
@@ -184,16 +187,16 @@ def window_end_s(text: str, end_s: float, start_s: float | None) -> float:
 def _named_span_s(written: str) -> float:
     """Returns how long the minute or the local day that a text names goes on after its begin (s).
 
-    Up to its last microsecond; 0 for a text with seconds, Unix seconds, and what is no ISO 8601.
+    Less `_END_S`; 0 for a text with seconds, Unix seconds, and what is no ISO 8601.
     """
     if _SECONDS.search(written) or not _ISO.fullmatch(written):
         return 0.0
     if ":" in written:
-        return _MINUTE_S - 1e-6
+        return _MINUTE_S - _END_S
     read = datetime.fromisoformat(written)
     if (read.hour, read.minute) != (0, 0) or "T" in written.upper():
         return 0.0
-    return (read + timedelta(days=1)).timestamp() - read.timestamp() - 1e-6
+    return (read + timedelta(days=1)).timestamp() - read.timestamp() - _END_S
 
 
 def _without_weekday(text: str) -> tuple[str | None, str]:

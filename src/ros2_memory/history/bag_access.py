@@ -139,6 +139,7 @@ class BagAccess:
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:
         """Notes that a bag, or a part of it, is not in the answer; unless it is of no such time."""
+        self.memory.columns.met_damage(bag, error)
         is_whole = isinstance(error, BagContradictionError)
         first, until = (bag.start, bag.end) if is_whole or error.lost is None else error.lost
         if not window.overlaps(first, until):

@@ -40,7 +40,7 @@ from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
 from ros2_memory.things.compared import ThingsBetween
 from ros2_memory.things.known import known_things, note_other_frames
-from ros2_memory.things.unseen import unplaced_notes, vague_notes
+from ros2_memory.things.unseen import note_undecoded, unplaced_notes, vague_notes
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -132,6 +132,8 @@ def _things(
     """Returns the frame of things, and what became of them from the earlier window to the later."""
     limits = view.limits
     both = TimeWindow(min(one.start for one in windows), max(one.stop for one in windows))
+    for each in windows:
+        note_undecoded(view, each)
     known = known_things(view, limits.min_score, limits.labels, both)
     note_other_frames(view, known, where)
     first, second = sorted(windows, key=lambda each: (each.start, each.stop))

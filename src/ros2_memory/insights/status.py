@@ -215,6 +215,9 @@ def missing_data(view: View) -> Iterator[str]:
     if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
+    if broken := len(view.memory.columns.damaged_parts(snapshot.bags)):
+        bags = counted(broken, "bag")
+        yield f"{bags} could not be read whole; data_time_range names what is damaged"
     if misdated := len(snapshot.dating.misdated):
         bags = counted(misdated, "bag is", "bags are")
         yield f"{bags} dated by a wrong clock; data_time_range has the details"

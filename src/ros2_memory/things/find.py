@@ -33,7 +33,7 @@ from ros2_memory.things.instances import (
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
 from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
-from ros2_memory.things.unseen import Asked, notes_on
+from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -94,6 +94,7 @@ def find_things(
             f"min_score was {lowest:g}; scores of things are counted from 0 to 1"
         )
     note_robots(view, view.pose_topic, window)
+    undecoded = note_undecoded(view, window)
     known = known_things(view, lowest, limits.labels, window)
     view.notes.retract_outside(whole)
     note_other_frames(view, known, region)
@@ -134,6 +135,7 @@ def find_things(
         window=window,
         inside=f" in this {' and '.join(bounds)}" if bounds else "",
         min_score=f"min_score {lowest:g}" + " (data.min_score)" * (min_score is None),
+        undecoded=undecoded,
     )
     return Things(
         frame_id=_frame_of(known, things),

@@ -6,16 +6,27 @@ Those are too few, score too low, or could not be placed.
 from __future__ import annotations
 
 import difflib
+from contextlib import suppress
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.sights import MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
+from ros2_memory.core.errors import NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import abbreviate, counted, listed, repeating, still_quoted
+from ros2_memory.core.text import (
+    Reason,
+    abbreviate,
+    counted,
+    listed,
+    repeating,
+    still_quoted,
+)
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.insights.silences import describe_silences
+from ros2_memory.things.seen import may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -24,6 +35,9 @@ if TYPE_CHECKING:
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
+_UNDECODED: Final = Reason(
+    "could not be decoded, so detections in them are not known", "topic", of="messages of "
+)
 
 
 class Asked(NamedTuple):
@@ -35,6 +49,7 @@ class Asked(NamedTuple):
             while localisation was poor.
         inside: says how things were asked for.
         min_score: names the limit of scores, and where it is from.
+        undecoded: topics with messages that cannot be decoded, as of `note_undecoded`.
     """
 
     labels: Mapping[str, str]
@@ -43,6 +58,7 @@ class Asked(NamedTuple):
     window: TimeWindow
     inside: str
     min_score: str
+    undecoded: Collection[str]
 
 
 class _Detected(NamedTuple):
@@ -62,17 +78,38 @@ class _Detected(NamedTuple):
     together: int
 
 
+def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
+    """Notes topics that may have detections, and of which messages in a window cannot be decoded.
+
+    Returns these topics. Of each topic the first and the newest message are tried: where only some
+    between them are broken, there is no note.
+    """
+    timeline = view.timeline
+    failures: list[UndecodableError] = []
+    for topic in timeline.topics():
+        if any(map(may_have_detections, timeline.types_of(topic))):
+            with suppress(NotInLakeError):
+                newest = view.stream.newest(topic, window)
+                first = None if newest is None else view.stream.first([topic], window)
+                for found in filter(None, (newest, first)):
+                    view.bags.decode(found, failures)
+    reasons = {each.topic: each.reason for each in failures}
+    for topic, reason in reasons.items():
+        view.notes.add_lack(Note(_UNDECODED, topic, reason))
+    return frozenset(reasons)
+
+
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields what the things that were found do not say."""
     sights = known.estimate.sights
     if not asked.found:
-        yield from _silences(view, known, asked.window)
+        yield from _silences(view, known, asked)
     if len(known.frames) > 2:  # the first is the map's
         yield (
             "without a map, each run of odometry has its own coordinates: a thing may be listed "
             "once for each run"
         )
-    if not sights.topics and known.since is None:
+    if not sights.topics and known.since is None and not asked.undecoded:
         yield (
             "no things are known: there is no message of a detector "
             "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
@@ -119,14 +156,14 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
     And those of which there were too many at once to tell them apart.
     """
     for window in windows:
-        every = [_detected(known, key, window) for key in sorted(known.estimate.names)]
+        labels = [_detected(known, key, window) for key in sorted(known.estimate.names)]
         unplaced = [
-            f"{each.name} ({counted(each.unplaced, 'time')}, "
-            f"from {unix_text(each.first)} to {unix_text(each.last)})"
-            for each in every
-            if each.last > each.placed + SLICE_NS
+            f"{label.name} ({counted(label.unplaced, 'time')}, "
+            f"from {unix_text(label.first)} to {unix_text(label.last)})"
+            for label in labels
+            if label.last > label.placed + SLICE_NS
         ]
-        crowded = [each.name for each in every if each.together > MAX_SPOTS]
+        crowded = [label.name for label in labels if label.together > MAX_SPOTS]
         if crowded:
             yield repeating(
                 f"of more than {MAX_SPOTS} at once, the others are left out: "
@@ -136,22 +173,23 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
         if unplaced:
             yield repeating(
                 f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}",
-                [each.name for each in every],
+                [label.name for label in labels],
             )
 
 
-def _silences(view: View, known: KnownThings, window: TimeWindow) -> Iterator[str]:
+def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    sights, cells = known.estimate.sights, known.estimate.cells
+    sights, cells, window = known.estimate.sights, known.estimate.cells, asked.window
+    topics = [topic for topic in sights.topics if topic not in asked.undecoded]
     tables = (
         (np.stack((cells.first, cells.last), axis=1), 0, 1),
         (sights.spots, Spot.FIRST, Spot.LAST),
         (sights.unplaced, Unplaced.FIRST, Unplaced.LAST),
     )
     is_empty = not any(len(_during(window, *table)) for table in tables)
-    if sights.topics and is_empty and known.reaches_back(window):
+    if topics and is_empty and known.reaches_back(window):
         yield (
-            f"{listed(sights.topics)} published nothing in this window: whether things were there "
+            f"{listed(topics)} published nothing in this window: whether things were there "
             "is not known"
         )
     yield from describe_silences(view, sights.topics, window)

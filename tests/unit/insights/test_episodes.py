@@ -230,6 +230,21 @@ def test_a_minute_or_a_day_that_is_start_and_end_is_meant_as_a_whole(memory: Mem
     assert exact["error"] == "no_data"
 
 
+@pytest.mark.parametrize("late_ns", [0, 1, 1000])
+def test_a_text_does_not_reach_into_the_second_or_the_minute_after_it(
+    tmp_path: Path, late_ns: int
+) -> None:
+    ticks = [text((BEGIN + at) * S + late_ns, f"{at}") for at in range(0, 200, 20)]
+    write_mcap(tmp_path / "bag.mcap", ticks)
+    memory = memory_of(tmp_path)
+    for second in ("2026-07-14T03:33:39Z", "2026-07-14T03:33:39.9Z"):  # 19 s after BEGIN
+        asked = {"topic": "/chatter", "timestamp": second, "tolerance_s": 60}
+        assert ask(memory, "get_topic_at_time", **asked)["value"] == {"value": "0"}
+    minute = dict.fromkeys(("start", "end"), "2026-07-14T03:34Z")
+    reply = ask(memory, "get_topic_in_range", topic="/chatter", **minute)
+    assert [sample["value"]["value"] for sample in reply["samples"]] == ["40", "60", "80"]
+
+
 def only(memory: Memory, tables: int, monkeypatch: pytest.MonkeyPatch) -> Memory:
     """The memory, whose time for reading is over after so many tables of each question."""
     left = [tables]

@@ -24,10 +24,21 @@ from ros2_memory.results import SilentTopic
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.health import Health
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, boolean, log_entry, odom, text, tf, transform, write_mcap
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    log_entry,
+    odom,
+    text,
+    tf,
+    transform,
+    write_mcap,
+)
 from tests.support.clocks import SettableClock
 from tests.support.log_lines import with_checks
-from tests.support.memories import asked, memory_of
+from tests.support.mcap_surgery import spoil_chunk
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -377,6 +388,27 @@ def test_no_growth_is_predicted_of_bags_that_nobody_writes(
     assert (told["max_gb"], told["growth_gb_per_day"]) == (1.0, None)
     assert "full_in_days" not in told
     assert "keeps_days" not in told
+
+
+@pytest.mark.parametrize("fills", [False, True])
+def test_a_part_of_a_bag_that_cannot_be_read_is_named_once_something_met_it(
+    tmp_path: Path, fills: bool
+) -> None:
+    driven = [odom(BEGIN + t * S // 10, t / 20, 0.0) for t in range(100)]
+    bag = write_mcap(tmp_path / "rec" / "rec_0.mcap", driven, McapLayout(chunk_size=3000))
+    spoil_chunk(bag, 3)
+    memory = memory_of(tmp_path, clock=SettableClock(BEGIN + 60 * S))
+    if fills:
+        memory = with_store(memory, tmp_path)
+    else:
+        assert shown(memory, tmp_path)["doubts"] == SOUND
+        asked(memory, tmp_path, "trajectory_summary", start=BEGIN / S, end=BEGIN / S + 10)
+    assert shown(memory, tmp_path)["doubts"].startswith("1 bag could not be read whole; data_time")
+    [note] = asked(memory, tmp_path, "data_time_range")["notes"]
+    assert note.startswith("rec/rec_0.mcap: damaged: ")
+    write_mcap(bag, driven)
+    memory.index.refresh()
+    assert shown(memory, tmp_path)["doubts"] == SOUND
 
 
 class TestWhatIsMissingIsNamedAndCounted:

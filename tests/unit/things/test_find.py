@@ -823,3 +823,22 @@ def test_a_thing_that_is_moved_without_a_routine_has_no_pattern(tmp_path: Path) 
     write_splits(tmp_path, messages, split_s=86_400.0)
     [mug] = ask(tmp_path, label="mug")["things"]
     assert mug["usually"] == "no pattern"
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
+    tmp_path: Path, every: int
+) -> None:
+    """All of them, or every other one, have lost their ends."""
+    messages = [one for at in range(30) for one in scene(at, (0, 0, 0), [("cup", 1, 0)])]
+    for nth in [nth for nth, one in enumerate(messages) if one.type == TYPE][::every]:
+        one = messages[nth]
+        messages[nth] = Msg(one.topic, one.type, one.log_time, one.payload[:-20])
+    write_splits(tmp_path, messages, 30, "rec")
+    memory = memory_of(tmp_path)
+    whole = {"start": BEGIN, "end": BEGIN + 15, "with_start": BEGIN + 14.5, "with_end": BEGIN + 29}
+    found = asked(memory, tmp_path, "find_things")
+    assert found["labels"] == ({"cup": 1} if every == 2 else {})
+    for reply in (found, asked(memory, tmp_path, "compare", **whole)):
+        assert "messages of /vision/scene/scene_objects could not be decoded, so" in str(reply)
+    assert "no things are known" not in str(found)
