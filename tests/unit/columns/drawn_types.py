@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 DTYPES: Final = {
     "bool": "bool",
-    "byte": "int8",
+    "byte": "uint8",
     "char": "uint8",
     "int8": "int8",
     "uint8": "uint8",
@@ -88,12 +88,15 @@ class DrawnTypes:
         return "".join(parts)
 
     def store(self) -> Typestore:
-        """A typestore of them."""
+        """A typestore of them; bytes are unsigned, as in ROS, which rosbags has signed."""
         store = Typestore()
         for name in ("Time", "Duration"):
             store.register(get_types_from_msg(_TIME_TEXT, f"builtin_interfaces/msg/{name}"))
         for name, fields in self.types:
-            store.register(get_types_from_msg(_msg(fields), f"drawn_msgs/msg/{name}"))
+            unsigned = [
+                replace(each, kind="uint8") if each.kind == "byte" else each for each in fields
+            ]
+            store.register(get_types_from_msg(_msg(unsigned), f"drawn_msgs/msg/{name}"))
         return store
 
     def message(self, store: Typestore, chance: random.Random, longest: int) -> object:
