@@ -4,7 +4,6 @@ import json
 import re
 import shlex
 import sys
-from bisect import bisect_right
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -25,7 +24,7 @@ from ros2_memory.config import Settings
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
-from ros2_memory.core.spans import Spans, united, without
+from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
@@ -230,17 +229,16 @@ def _write(
 def _messages(
     view: View, spans: Mapping[str, Spans], within: TimeWindow
 ) -> Iterator[StoredMessage]:
-    for first, last in united(span for topic_spans in spans.values() for span in topic_spans):
-        window = within.intersect(TimeWindow(first, last))
+    """Yields the messages of a window that lie in the spans of their topics."""
+    for start, stop in united(span for topic_spans in spans.values() for span in topic_spans):
+        window = within.intersect(TimeWindow(start, stop))
         topics = [
             topic
             for topic, topic_spans in spans.items()
-            if any(start < window.stop and window.start < stop for start, stop in topic_spans)
+            if overlaps_any(topic_spans, window.start, window.stop - 1)
         ]
         for stored in view.stream.messages(topics, window) if topics else ():
-            topic_spans = spans[stored.topic]
-            nth = bisect_right(topic_spans, (stored.time, MAX_NS)) - 1
-            if nth >= 0 and stored.time < topic_spans[nth][1]:
+            if lies_inside(spans[stored.topic], stored.time):
                 yield stored
 
 

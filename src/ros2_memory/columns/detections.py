@@ -26,7 +26,6 @@ from ros2_memory.columns.shown import (
     Nothing,
     UnknownShapeError,
     children,
-    placed,
 )
 from ros2_memory.columns.table import Table, Texts, joined_texts
 from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
@@ -383,13 +382,15 @@ def texts_of(values: Values, leaf: Leaf) -> Texts:
 
 
 def _detections_at(
-    values: Values, level: Level, name: Texts, positions: Ints, scores: Floats
+    values: Values, level: Level, names: Texts, positions: Ints, scores: Floats
 ) -> Detections:
-    """Returns detections at some places of a level, by their rows, without a place."""
-    _, rows = placed(values, level, positions, (), surely=True)
-    labels = Texts(name.codes[positions], name.words)
+    """Returns the detections at some positions of a level, by their rows, without a place."""
     return Detections(
-        rows, labels, scores[positions], _nowhere(positions.size), _no_frames(positions.size)
+        _owners_at(values, level, positions, ROWS),
+        Texts(names.codes[positions], names.words),
+        scores[positions],
+        _nowhere(positions.size),
+        _no_frames(positions.size),
     )
 
 
@@ -425,7 +426,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
         return
     counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
     positions = np.repeat(np.arange(len(texts)), counts)
-    _, rows = placed(values, source.leaf.level, positions, (), surely=True)
+    rows = _owners_at(values, source.leaf.level, positions, ROWS)
     outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
     yield Detections(
         rows,

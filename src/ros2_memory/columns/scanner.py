@@ -152,7 +152,7 @@ class Scanner:
     Args:
         store: the store; None where nothing is stored.
         bag_dir: the bag directory.
-        settings: what fragments depend on besides the bags, as a text.
+        reading: what identifies how bags are read, on which fragments depend besides the bags.
         large: the turn to hold much of a bag, which large columns need, too.
         caches: those of all scanners; None where it has some of its own.
 
@@ -164,7 +164,7 @@ class Scanner:
         self,
         store: ColumnStore | None,
         bag_dir: Path,
-        settings: str = "",
+        reading: str = "",
         large: LargeReads | None = None,
         caches: Caches | None = None,
     ) -> None:
@@ -172,12 +172,11 @@ class Scanner:
         self._large = large or LargeReads()
         self._covering = None if store is None else Covering(store, bag_dir)
         self.caches = Caches.of() if caches is None else caches.namespace()
-        self._settings = settings
-        self._fragments: dict[str, object] = {}
+        self._reading = reading
         self._damaged: dict[tuple[str, int, Ns], str] = {}
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
-        self._fragments[OUTLINE.name] = self._outlines
+        self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
 
     def met_damage(self, bag: BagFile, error: BagError) -> None:
         """Remembers why a part of a bag is lost, if it is: only who reads it finds that out."""
@@ -197,7 +196,7 @@ class Scanner:
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            fragments = Fragments(self.store, kind, self._settings, self.caches.read)
+            fragments = Fragments(self.store, kind, self._reading, self.caches.read)
             self._fragments.setdefault(kind.name, fragments)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
@@ -217,7 +216,7 @@ class Scanner:
 
     def fragments_of_others(self) -> list[Ns]:
         """Returns where slices begin that have fragments of other settings alone, newest first."""
-        return [] if self.store is None else self.store.fragments_of_others(self._settings)
+        return [] if self.store is None else self.store.fragments_of_others(self._reading)
 
     def write_fragments(self) -> None:
         """Stores the fragments that were made since."""

@@ -164,10 +164,10 @@ def rest_of_text_s(text: str) -> float:
     return max(10.0 ** -len(match[1] or "") - _END_S, 0.0) if match else 0.0
 
 
-def rest_of_end_s(text: str) -> float:
-    """Returns how long a window goes on after the time that ends it, as text (s).
+def rounded_off_s(text: str) -> float:
+    """Returns how much `local_text` may have rounded off a time as text (s).
 
-    It ends there, but a time with a weekday was rounded down by `local_text`: its message counts.
+    Only what it writes has a weekday; other times end where they say.
     """
     weekday, written = _without_weekday(text.strip())
     return rest_of_text_s(written) if weekday else 0.0
@@ -177,11 +177,11 @@ def window_end_s(text: str, end_s: float, start_s: float | None) -> float:
     """Returns the Unix seconds at which a window ends by a text that is the time `end_s`.
 
     A date alone is the end of its local day, and a minute its own end where the window starts with
-    it; see also `rest_of_end_s`.
+    it; see also `rounded_off_s`.
     """
     named_s = _named_span_s(_without_weekday(text.strip())[1])
     goes_on = named_s > _MINUTE_S or start_s == end_s
-    return end_s + (named_s if goes_on else 0.0) + rest_of_end_s(text)
+    return end_s + (named_s if goes_on else 0.0) + rounded_off_s(text)
 
 
 def _named_span_s(written: str) -> float:

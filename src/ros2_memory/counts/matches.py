@@ -31,7 +31,7 @@ from ros2_memory.history.held_values import held_at, held_until
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
-from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import only_messages_count, read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
@@ -76,11 +76,10 @@ def count_matches(
         QueryTimeoutError: the call's time runs out before any result.
     """
     span = TimeRange(start_s, end_s, last_s)
-    wall = memory.clock.now()
-    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    view, _, window = open_search(memory, call, span)
     sought = "any" if by == BY_LABEL and value == ANY_LABEL else value
     condition = condition_of(view, topic, condition_type, sought, field=field, min_score=min_score)
-    asked = clamped(view, search_window(span, memory.now(wall, view.snapshot.latest, call)))
+    asked = clamped(view, window)
     if by == BY_LABEL:
         window = reached(view.snapshot, asked)
         require_recorded(view, asked if window.empty else window)

@@ -258,23 +258,18 @@ class PieceNumbers:
     def _add_found(
         self, rows: Rows, held: Sequence[FieldNumbers], pieces: Iterable[tuple[int, int, int]]
     ) -> None:
+        """Adds the numbers of each field in some rows to pieces, which are as `_pieces` yields."""
+        outlines = [
+            self._ends(rows, field) if rows.index is None else None for field in range(len(held))
+        ]
         for piece, start, stop in pieces:
             is_whole = stop - start == len(rows)
             first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
-            for field, found in enumerate(held):
-                begin, end = np.searchsorted(found.rows, [start, stop]).tolist()
-                if begin == end:
-                    continue
-                total = float((found.numbers[begin:end] * SUM_SCALE).sum())
-                ends = [_extreme(rows, found, (begin, end), sign) for sign in (LEAST, GREATEST)]
-                known = self._ends(rows, field) if rows.index is None else None
-                if known is not None:
-                    # Those of the whole part are exact, where they lie here.
-                    ends = [
-                        whole if first <= whole.first <= whole.last <= last else own
-                        for own, whole in zip(ends, known.ends, strict=True)
-                    ]
-                self._parts[field, piece].append(Part(first, last, end - begin, total, *ends))
+            for field, (numbers_of_field, outline) in enumerate(zip(held, outlines, strict=True)):
+                begin, end = np.searchsorted(numbers_of_field.rows, [start, stop]).tolist()
+                if begin < end:
+                    part = _part(rows, numbers_of_field, (begin, end), (first, last), outline)
+                    self._parts[field, piece].append(part)
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
         """Yields the number of each piece of some rows, with its first row and the one after it."""
@@ -415,6 +410,26 @@ def _extreme(rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int)
     low, high = float((signed - off).min()), float((signed + off).min())
     may = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
     return Extreme(low, high, *rows.times[found.rows[may]].tolist())
+
+
+def _part(
+    rows: Rows,
+    found: FieldNumbers,
+    among: tuple[int, int],
+    span: tuple[Ns, Ns],
+    outline: _Known | None,
+) -> Part:
+    """Returns some of the numbers of a field, in messages of a span (ns, inclusive), as a part."""
+    (begin, end), (first, last) = among, span
+    total = float((found.numbers[begin:end] * SUM_SCALE).sum())
+    extremes = [_extreme(rows, found, among, sign) for sign in (LEAST, GREATEST)]
+    if outline is not None:
+        # Those of the whole table are exact, where they lie here.
+        extremes = [
+            whole if first <= whole.first <= whole.last <= last else own
+            for own, whole in zip(extremes, outline.ends, strict=True)
+        ]
+    return Part(first, last, end - begin, total, *extremes)
 
 
 def _of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:

@@ -305,6 +305,19 @@ def open_view(memory: Memory, call: Call, reach: Ns | None) -> View:
     return view
 
 
+def open_search(memory: Memory, call: Call, span: TimeRange) -> tuple[View, Ns, TimeWindow]:
+    """Returns the view for a search, the present, and the window that is asked for until then.
+
+    Raises:
+        InvalidArgumentsError: the bounds make no window.
+        NoDataError: the memory holds nothing.
+    """
+    wall = memory.clock.now()
+    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
+    now = memory.now(wall, view.snapshot.latest, call)
+    return view, now, search_window(span, now)
+
+
 def _open_now(memory: Memory, call: Call, ago: Ns) -> tuple[View, Ns]:
     """Returns the view for a moment before now, and now."""
     wall = memory.clock.now()

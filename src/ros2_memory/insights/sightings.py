@@ -39,7 +39,7 @@ from ros2_memory.history.reverse_search import (
 )
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
-from ros2_memory.history.view import TimeRange, View, clamped, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.episodes import (
     SaidMeanwhile,
     episode_times,
@@ -108,10 +108,7 @@ def find_matches(
         QueryTimeoutError: the call's time is over before anything was found.
     """
     span = TimeRange(start_s, end_s, last_s)
-    wall = memory.clock.now()
-    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    now = memory.now(wall, view.snapshot.latest, call)
-    asked = search_window(span, now)
+    view, now, asked = open_search(memory, call, span)
     require_recorded(view, asked)
     condition = condition_of(view, topic, condition_type, value, field=field, min_score=min_score)
     window = clamped(view, asked)

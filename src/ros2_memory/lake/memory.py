@@ -165,22 +165,22 @@ class LakeIndex:
         return self._snapshot
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns an index that is not older than it may be; what is not shipped yet is not in it.
+        """Returns an index at most `refresh_s` old; what is not shipped yet is not in it.
 
         Where `reach` is before the newest days, it is of the days up to that time.
 
         Raises:
             RefusedError: the lake cannot be read.
         """
-        newest = self._snapshot
-        if newest is None or self.clock.now() - newest.scanned_at > self.refresh_s * 1e9:
-            newest = self.refresh()
-        if reach is None or newest.older is None or reach > newest.older:
-            return newest
+        current = self._snapshot
+        if current is None or self.clock.now() - current.scanned_at > self.refresh_s * 1e9:
+            current = self.refresh()
+        if reach is None or current.older is None or reach > current.older:
+            return current
         with self._lock:
             # With the next day, in which what lies across midnight goes on.
             window = self._window(day_of(reach) + timedelta(days=1), _FEWEST_DAYS)
-        return replace(newest, timeline=window.timeline, older=window.older)
+        return replace(current, timeline=window.timeline, older=window.older)
 
     def refresh(self) -> Snapshot:
         """Looks into the lake now; what was just seen there for another robot is not old."""

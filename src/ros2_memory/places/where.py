@@ -11,6 +11,7 @@ from bisect import bisect_right
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -334,9 +335,9 @@ class Scope:
 
     def holds_until(self, time: Ns, end: Ns) -> Ns:
         """Returns until when matches count from a moment at which they do, at most until `end`."""
-        for start, stop in self._inside or ():
-            if start <= time < stop:
-                end = min(end, stop - 1)
+        if self._inside is not None:
+            nth = bisect_right(self._inside, time, key=itemgetter(1))
+            end = min(end, self._inside[nth][1] - 1)
         for state in self._states:
             end = state.holds_until(time, end)
         return end

@@ -19,7 +19,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.coverage import describe_misdated, note_unread
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, clamped, open_view, search_window
+from ros2_memory.history.view import TimeRange, clamped, open_search
 from ros2_memory.places.where import Where, parse_where, places_asked
 from ros2_memory.results import StillThere, Thing, Things, UsualPlace
 from ros2_memory.things.instances import (
@@ -80,10 +80,8 @@ def find_things(
     region = None if where is None else parse_where(limits, where)
     beside = None if near is None else parse_near(limits, near)
     span = TimeRange(start_s, end_s)
-    wall = memory.clock.now()
-    view = open_view(memory, call, min(search_window(span, wall).stop, wall))
-    now = memory.now(wall, view.snapshot.latest, call)
-    whole = asked_for = search_window(span, now)
+    view, now, whole = open_search(memory, call, span)
+    asked_for = whole
     if end_s is None and whole.asked()[0] < (ahead := view.snapshot.dating.ahead_from):
         asked_for = TimeWindow(whole.start, ahead)
     require_recorded(view, asked_for)

@@ -32,8 +32,8 @@ from ros2_memory.bag_dir.moment_file import fault_of_label
 from ros2_memory.core.text import abbreviate
 from ros2_memory.core.timebase import (
     require_no_date,
-    rest_of_end_s,
     rest_of_text_s,
+    rounded_off_s,
     unix_from_text,
     window_end_s,
 )
@@ -118,7 +118,7 @@ def _read_until(value: object, info: ValidationInfo[object]) -> object:
         return seconds
     name = info.field_name or ""
     if "end" not in name:  # before a time, or around one
-        return seconds + rest_of_end_s(value)
+        return seconds + rounded_off_s(value)
     return window_end_s(value, seconds, info.data.get(name.replace("end", "start")))
 
 

@@ -197,7 +197,7 @@ class SplitSearch:
         latched = record is not None and record.channel.latched
         if record is not None and latched:
             rules = tuple(rule for rule in rules if rule.condition is not None)
-            if _is_repeat(event, record, state):
+            if _receive(record, event.recording, state):
                 return
         value: JsonValue | UndecodableError = None
         if record is not None and any(rule.condition is not None for rule in rules):
@@ -280,38 +280,42 @@ class SplitSearch:
                 state.rules[rule].problem = problem
 
 
-def _is_repeat(event: _Event, record: Record, state: TriggerState) -> bool:
-    """Whether a latched message was received before, in another recording; remembers it if not.
-
-    Every recording receives those of a topic again. What it receives in its first seconds and was
-    published long before was so before, whether a recorder saw it or not. Where a format keeps no
-    publish time, the first message in a recording is a repeat if it is like the last one.
-    """
-    mark = state.latched.setdefault(event.topic, LatchedMark())
+def _receive(record: Record, recording: str, state: TriggerState) -> bool:
+    """Remembers a latched message; returns whether another recording received it before."""
+    mark = state.latched.setdefault(record.channel.topic, LatchedMark())
     payload = hashlib.blake2b(record.payload, digest_size=8).hexdigest()
-    # What was published later than now was so before the clock was set back: that is no repeat. Not
-    # so where the log clock is simulated.
-    latest = event.time + SILENCE_NS
-    is_dated = record.publish_time <= latest
-    published_elsewhere = [
-        published
-        for name, published in mark.published.items()
-        if name != event.recording and not (is_dated and published > latest)
-    ]
-    begun = mark.begun.setdefault(event.recording, event.time)
-    if record.publish_time in {0, record.log_time}:
-        is_repeat = event.recording not in mark.published and payload == mark.payload
-    else:
-        is_late = record.publish_time < record.log_time - SILENCE_NS
-        is_repeat = (
-            bool(published_elsewhere) and record.publish_time <= max(published_elsewhere)
-        ) or (is_late and event.time - begun < _BURST_NS)
-    latest_here = mark.published.pop(event.recording, record.publish_time)
-    mark.published[event.recording] = max(latest_here, record.publish_time)
+    mark.begun.setdefault(recording, record.log_time)
+    is_repeat = _is_repeat(record, recording, payload, mark)
+    if not is_repeat:
+        mark.payload = payload
+    # Put in again, so that the recordings used last come last.
+    latest = mark.published.pop(recording, record.publish_time)
+    mark.published[recording] = max(latest, record.publish_time)
     while len(mark.published) > _MARKED_RECORDINGS:
         oldest = next(iter(mark.published))
         del mark.published[oldest]
         mark.begun.pop(oldest, None)
-    if not is_repeat:
-        mark.payload = payload
     return is_repeat
+
+
+def _is_repeat(record: Record, recording: str, payload: str, mark: LatchedMark) -> bool:
+    """Returns whether a latched message was published before this recording received it.
+
+    Every recording receives those of a topic again. What it receives in its first seconds and was
+    published long before is one, whether a recorder saw it or not. Where a format keeps no publish
+    time, the first message in a recording is one if it is like the last one.
+    """
+    logged, published = record.log_time, record.publish_time
+    if published in {0, logged}:
+        return recording not in mark.published and payload == mark.payload
+    is_late = published < logged - SILENCE_NS
+    if is_late and logged - mark.begun[recording] < _BURST_NS:
+        return True
+    # Elsewhere, times later than now are from before the clock was set back: they prove nothing,
+    # unless this message has one, too, as under a simulated log clock.
+    latest = logged + SILENCE_NS
+    return any(
+        published <= elsewhere and (elsewhere <= latest or published > latest)
+        for other, elsewhere in mark.published.items()
+        if other != recording
+    )

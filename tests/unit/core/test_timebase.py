@@ -20,8 +20,8 @@ from ros2_memory.core.timebase import (
     iso_local,
     local_text,
     ns_from_unix,
-    rest_of_end_s,
     rest_of_text_s,
+    rounded_off_s,
     unix_from_ns,
     unix_from_text,
     unix_rounded_up,
@@ -140,7 +140,7 @@ def test_local_times_of_replies_are_read_as_they_were_written(moment: int) -> No
 def test_the_last_decimal_of_a_text_is_all_part_of_it(text: str, rest_s: float) -> None:
     assert rest_of_text_s(text) == pytest.approx(rest_s, abs=2e-6)
     was_rounded = text.startswith("Tue")
-    assert rest_of_end_s(text) == pytest.approx(rest_s if was_rounded else 0.0, abs=2e-6)
+    assert rounded_off_s(text) == pytest.approx(rest_s if was_rounded else 0.0, abs=2e-6)
 
 
 @pytest.mark.parametrize(

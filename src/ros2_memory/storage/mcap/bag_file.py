@@ -339,22 +339,20 @@ class McapBags:
 
         def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
-            # Of a chunk that cannot be read, only what is wanted by its index is lost.
             try:
                 with as_unreadable():
                     data = last_used(chunk)
             except UnreadableError as error:
+                # Only what is wanted by the chunk's index is lost.
                 lost = self._lost(file, chunk, wanted, window, str(error))
-                if lost is None:
-                    return None
-                at = lost.last if newest_first else lost.first
-                return RunRows([at], [0], lambda _place, _time: lost)
+                return None if lost is None else _lost_rows(lost, newest_first=newest_first)
             columns = self._chunk_columns(file, chunk, wanted, data)
             column = joined([indexed.between(window.start, window.stop) for indexed in columns])
             if not column.times.size:
                 return None
-            fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
-            if len(data) > _LARGE_BYTES:
+            if len(data) <= _LARGE_BYTES:
+                fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
+            else:
                 fetch = partial(fetch_large, chunk)
             return _rows(column, fetch, newest_first=newest_first)
 
@@ -649,6 +647,12 @@ def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
     for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
         if after.end < before.start:
             yield from (before, after)
+
+
+def _lost_rows(lost: LostError, *, newest_first: bool) -> RunRows[Record | LostError]:
+    """Returns a loss as the one message of its run."""
+    at = lost.last if newest_first else lost.first
+    return RunRows([at], [0], lambda _place, _time: lost)
 
 
 def _rows(
