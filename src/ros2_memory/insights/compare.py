@@ -270,7 +270,9 @@ def _places(
             lasted = passed.among((one.start, one.stop) for one in joined.inside(region, window))
             minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
         found.append(minutes)
-    return found
+    # Where it was in neither window, as far as is known, nothing differs.
+    been = {name for minutes in found for name, lasted in minutes.items() if lasted}
+    return [{name: lasted for name, lasted in minutes.items() if name in been} for minutes in found]
 
 
 def _errors(view: View, window: TimeWindow) -> Mapping[str, float]:
