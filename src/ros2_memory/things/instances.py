@@ -273,20 +273,20 @@ def estimate(
     and again; what it raises ends the estimate.
     """
     epoch = np.zeros(sights.slices, np.int64) if epochs is None else np.asarray(epochs, np.int64)
-    observed = _Observations(sights, epoch, min_score)
+    observed = _Observations(sights, epoch, min_score, go_on)
     names = _names(sights, labels)
     epoch_of = epoch[sights.spots[:, Spot.SLICE]]
     keys = with_synonyms(sights, observed.counts, epoch_of, labels, go_on)
     groups = _groups(observed, epoch, keys)
-    _find_places(groups, observed, go_on)
+    _find_places(groups, observed)
     for group in groups:
-        _find_stays(group, observed, go_on)
-    _remove_false_stays(groups, observed, keys, go_on)
+        _find_stays(group, observed)
+    _remove_false_stays(groups, observed, keys)
     instances: list[Instance] = []
     movers: list[Mover] = []
     evidence: dict[tuple[str, int, int], Evidence] = {}
     for group in groups:
-        linked = _link(group, observed, go_on)
+        linked = _link(group, observed)
         _add_poorly_localised(group, linked, observed)
         if not _are_of_mover(group, linked):
             instances += linked
@@ -351,10 +351,13 @@ class _Observations:
         groups: of each spot a number; those of one slice, topic and label have the same.
         fields_of_view: by topic the one that its detections show.
         side: of each spot, the mean of the unit vectors to it from where it was seen.
+        go_on: as of `estimate`.
     """
 
-    def __init__(self, sights: Sights, epoch: Ints, min_score: float) -> None:
-        spots, self.sights = sights.spots, sights
+    def __init__(
+        self, sights: Sights, epoch: Ints, min_score: float, go_on: Callable[[], None]
+    ) -> None:
+        spots, self.sights, self.go_on = sights.spots, sights, go_on
         self.counts = _counts_that_count(sights, min_score)
         self.poor, poor_looks = poorly_localised(sights)
         self.hits, self.hit_starts = _by_spot(_hits_that_count(sights, self.counts), sights)
@@ -451,14 +454,12 @@ def _groups(observed: _Observations, epoch: Ints, keys: Sequence[str]) -> list[_
     return groups
 
 
-def _find_places(
-    groups: Sequence[_Group], observed: _Observations, go_on: Callable[[], None]
-) -> None:
+def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
     """Finds the places of labels, each with one for every time that it was moved a little."""
     single: list[tuple[_Group, Ints]] = []
     for group in groups:
         if not moves_by_itself(group.key):
-            go_on()
+            observed.go_on()
             single += [(group, rows) for rows in _add_shared_places(group, observed)]
     steps = stays_in([observed.sightings(rows) for _, rows in single])
     for (group, rows), step in zip(single, steps, strict=True):
@@ -490,7 +491,7 @@ def _are_several(place: Ints, groups: Ints) -> Flags:
     return several
 
 
-def _find_stays(group: _Group, observed: _Observations, go_on: Callable[[], None]) -> None:
+def _find_stays(group: _Group, observed: _Observations) -> None:
     """Finds when a label was at its places."""
     if not group.places:
         return
@@ -512,7 +513,7 @@ def _find_stays(group: _Group, observed: _Observations, go_on: Callable[[], None
         unplaced=group.unplaced,
     )
     for number, stay in stays_at(observed.cells, group.evidence):
-        go_on()
+        observed.go_on()
         there = group.places[number]
         slices = spots[there, Spot.SLICE]
         during = there[(slices >= stay.first_slice) & (slices <= stay.last_slice)]
@@ -546,10 +547,7 @@ def _placed(observed: _Observations, place: int, stay: Stay, rows: Ints) -> Plac
 
 
 def _remove_false_stays(
-    groups: Sequence[_Group],
-    observed: _Observations,
-    keys: Sequence[str],
-    go_on: Callable[[], None],
+    groups: Sequence[_Group], observed: _Observations, keys: Sequence[str]
 ) -> None:
     """Removes stays that are other things under a wrong name, noise around one, or too rare.
 
@@ -558,7 +556,7 @@ def _remove_false_stays(
     stays = [(group, stay) for group in groups for stay in group.stays]
     hosts = _Hosts(stays, observed, keys)
     for number in sorted(range(len(stays)), key=lambda number: stays[number][1].count):
-        go_on()
+        observed.go_on()
         group, stay = stays[number]
         if (host := hosts.take(number)) is not None and host[0] is not group:
             host[1].also += spellings(observed.sights, observed.counts, stay.spots)
@@ -651,7 +649,7 @@ class _Hosts:
         return counts
 
 
-def _link(group: _Group, observed: _Observations, go_on: Callable[[], None]) -> list[Instance]:
+def _link(group: _Group, observed: _Observations) -> list[Instance]:
     """Links stays into as few things as explain them.
 
     A stay goes on where one had ended, that is, where its place was seen without it. Of a label
@@ -660,7 +658,7 @@ def _link(group: _Group, observed: _Observations, go_on: Callable[[], None]) -> 
     instances = _chained(group, group.stays, proven=True)
     if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
         unproven = _chained(group, group.stays, proven=False)
-        parts = _split_around_others(group.stays, observed, go_on)
+        parts = _split_around_others(group.stays, observed)
         instances = min(instances, unproven, _chained(group, parts, proven=False), key=len)
     for instance in instances:
         instance.stays = _without_overlap(instance.stays, observed)
@@ -704,13 +702,11 @@ def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
     return math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
 
 
-def _split_around_others(
-    stays: Sequence[PlacedStay], observed: _Observations, go_on: Callable[[], None]
-) -> list[PlacedStay]:
+def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -> list[PlacedStay]:
     """Splits stays that have another one of the same label between two sightings."""
     spots, parts = observed.sights.spots, []
     for stay in stays:
-        go_on()
+        observed.go_on()
         rows = stay.spots[np.argsort(spots[stay.spots, Spot.FIRST], kind="stable")]
         first, last = spots[rows, Spot.FIRST], spots[rows, Spot.LAST]
         cuts = set()
