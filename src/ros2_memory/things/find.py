@@ -173,7 +173,10 @@ class _FoundThing(NamedTuple):
 
 
 class Near(NamedTuple):
-    """What things are to be near: the middle of a circle or, of a label, other things."""
+    """What things are to be near: the middle of a circle or, of a label, other things.
+
+    Of a label only the circle's radius counts.
+    """
 
     circle: Circle
     label: str = ""
@@ -226,7 +229,13 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
 
 @dataclass(frozen=True, slots=True)
 class _Finder:
-    """Selects the things of a question, and describes them."""
+    """Selects the things of a question, and describes them.
+
+    Attributes:
+        where: the region they are to be in; None for all.
+        places: the named ones.
+        now: the time of the call (ns).
+    """
 
     known: KnownThings
     window: TimeWindow
@@ -330,7 +339,7 @@ class _Finder:
             place=place,
             spread_m=0.0,
             frame_id=frame,
-            inside=places_at(self.places, frame, place[0], place[1]),
+            inside=places_at(self.places, frame, *place[:2]),
             first=int(spots[:, Spot.FIRST].min()),
             last=int(spots[:, Spot.LAST].max()),
             count=int(self.known.estimate.counts[rows].sum()),

@@ -358,7 +358,7 @@ class _Observations:
         self, sights: Sights, epoch: Ints, min_score: float, go_on: Callable[[], None]
     ) -> None:
         spots, self.sights, self.go_on = sights.spots, sights, go_on
-        self.counts = _counts_that_count(sights, min_score)
+        self.counts = _detections_that_count(sights, min_score)
         self.poor, poor_looks = poorly_localised(sights)
         self.hits, self.hit_starts = _by_spot(_hits_that_count(sights, self.counts), sights)
         self.hits[np.append(poor_looks, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
@@ -374,7 +374,7 @@ class _Observations:
         self.side = _mean_directions(spot, np.radians(heading), n, len(spots))
 
     def firm(self, rows: Ints) -> Ints:
-        """Returns the spots that were seen while localisation was good; all if these are few."""
+        """Returns the spots that were seen while localisation was good; all if too few were."""
         good: Ints = rows[~self.poor[rows]]
         return good if self.counts[good].sum() >= _FEWEST else rows
 
@@ -386,7 +386,7 @@ class _Observations:
         return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
 
 
-def _counts_that_count(sights: Sights, min_score: float) -> Ints:
+def _detections_that_count(sights: Sights, min_score: float) -> Ints:
     """Returns how many detections of each spot have no score that is too low."""
     counts = sights.spots[:, Spot.N].copy()
     low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
@@ -558,8 +558,9 @@ def _remove_false_stays(
     for number in sorted(range(len(stays)), key=lambda number: stays[number][1].count):
         observed.go_on()
         group, stay = stays[number]
-        if (host := hosts.take(number)) is not None and host[0] is not group:
-            host[1].also += spellings(observed.sights, observed.counts, stay.spots)
+        host_group, host = hosts.take(number) or (None, None)
+        if host is not None and host_group is not group:
+            host.also += spellings(observed.sights, observed.counts, stay.spots)
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):

@@ -107,7 +107,7 @@ class KnownThings:
             end=int(spots[:, Spot.LAST].max()),
             place=place,
             count=int(self.estimate.counts[rows].sum()),
-            inside=places_at(places, frame, place[0], place[1]),
+            inside=places_at(places, frame, *place[:2]),
         )
 
 
@@ -183,6 +183,7 @@ class _Loader:
         described = tuple(sorted((name, tuple(others)) for name, others in spellings.items()))
         key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view
+        self._cache = view.memory.columns.caches.things
         self._min_score = min_score
         self._labels = Labels(spellings)
         self._ahead = ahead
@@ -224,10 +225,7 @@ class _Loader:
     @property
     def _cached(self) -> KnownThings | Ns | None:
         """The things that are known, or since when there are too many sightings."""
-        timeline, known = self._view.memory.columns.caches.things.get(self._things_key) or (
-            None,
-            None,
-        )
+        timeline, known = self._cache.get(self._things_key) or (None, None)
         if timeline is not self._view.timeline:
             return None
         return known if isinstance(known, KnownThings | int) else None
@@ -236,8 +234,7 @@ class _Loader:
         """Caches the answer, unless an open bag or a failure had a part in it."""
         if not self._view.call.used_active and self._view.notes.added == self._notes_before:
             size = known.estimate.memory_bytes if isinstance(known, KnownThings) else _KEPT_BYTES
-            entry = self._view.timeline, known
-            self._view.memory.columns.caches.things.put(self._things_key, entry, size)
+            self._cache.put(self._things_key, (self._view.timeline, known), size)
 
     def _estimated_in_time(self) -> KnownThings:
         """Returns the things by the newest sightings, of as many as can be compared in time."""
@@ -266,16 +263,18 @@ class _Loader:
     @property
     def _most_spots(self) -> int:
         """How many spots can be compared in time, as far as is known."""
-        _, most = self._view.memory.columns.caches.things.get(self._most_key) or (None, None)
+        _, most = self._cache.get(self._most_key) or (None, None)
         return most if isinstance(most, int) else _MOST_SPOTS
 
     def _put_most(self, most: int) -> None:
-        entry = self._view.timeline, most
-        self._view.memory.columns.caches.things.put(self._most_key, entry, _KEPT_BYTES)
+        self._cache.put(self._most_key, (self._view.timeline, most), _KEPT_BYTES)
 
     @cached_property
     def _gathered(self) -> tuple[list[list[Stretch]], bool]:
-        """The newest stretches, in order, and whether they have as many spots as are compared."""
+        """The newest stretches, in order, and whether they have as many spots as are compared.
+
+        Where reading older ones takes too long, `_read_from` is the start of the oldest.
+        """
         most = self._most_spots
         parts: list[list[Stretch]] = []
         reading = self._view.call.partial_after(READING_S)

@@ -90,9 +90,7 @@ def _singular(word: str) -> str:
         return _IRREGULAR[word]
     if len(word) > 4 and word.endswith("ies"):
         return word[:-3] + "y"
-    if word.endswith(_SIBILANTS):
-        return word[:-2]
-    if len(word) > 5 and word.endswith("oes"):
+    if word.endswith(_SIBILANTS) or (len(word) > 5 and word.endswith("oes")):
         return word[:-2]
     if len(word) > 3 and word.endswith("s") and not word.endswith(_NO_PLURALS):
         return word[:-1]

@@ -201,20 +201,29 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
     if not len(at):
         return
     old, new = _before_and_after(series, begins, at, variance)
-    normal = np.zeros((len(at), 4, 4))
-    normal[:, :3, :3] = (old + new)[:, :3, :3]
-    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
-    normal[:, 3, 3] = new[:, 0, 0]
-    right = np.concatenate(((old + new)[:, :3, 3:], new[:, :1, 3:]), axis=1)
-    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
-    moved = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
-    likely = np.where(moved >= LEAST_MM**2, moved / inverse[:, 3, 3], 0.0)
+    likely = _likelihoods(old, new)
     # Of each thing the likeliest, of equal ones the first.
     order = np.lexsort((at, -likely, series.thing[at]))
     things, first = np.unique(series.thing[at[order]], return_index=True)
     best = order[first]
     is_sure = likely[best] > _SIGMAS**2
     yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
+
+
+def _likelihoods(old: Floats, new: Floats) -> Floats:
+    """Returns for each step, by the squares before and after it, how many standard errors it is.
+
+    Squared; 0 of one that is too short to be any.
+    """
+    both = old + new
+    normal = np.zeros((len(both), 4, 4))
+    normal[:, :3, :3] = both[:, :3, :3]
+    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
+    normal[:, 3, 3] = new[:, 0, 0]
+    right = np.concatenate((both[:, :3, 3:], new[:, :1, 3:]), axis=1)
+    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
+    length_squared = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
+    return np.where(length_squared >= LEAST_MM**2, length_squared / inverse[:, 3, 3], 0.0)
 
 
 def _before_and_after(

@@ -81,19 +81,17 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
     for cell in range(len(mass)):
         if not is_free[cell]:
             continue
-        # Cells before it are claimed.
+        # The cells before it are claimed.
         peak = _settled(centre[cell:], mass[cell:], is_free[cell:])
         is_claimed = is_free & (_away_squared(centre, peak) <= _CLAIM_MM**2)
         is_claimed[cell] = True
         weight = float(mass[is_claimed].sum())
         is_free[is_claimed] = False
         heavy = peaks[:count][_with_noise_at(peak, weight, peaks[:count], masses[:count])]
-        if not len(heavy) or (
+        if all(
             weight >= _FEW
-            and all(
-                spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
-                for other in heavy
-            )
+            and spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
+            for other in heavy
         ):
             peaks[count], masses[count] = peak, weight
             count += 1
@@ -116,12 +114,12 @@ def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
     return peak
 
 
-def _with_noise_at(middle: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
+def _with_noise_at(peak: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
     """Returns which peaks are so heavy that one this light may be their noise."""
-    away = _away_squared(peaks, middle)
-    noise = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
-    scattered = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    may_be_noise: Flags = noise | scattered
+    away = _away_squared(peaks, peak)
+    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
+    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
+    may_be_noise: Flags = is_halo | is_scatter
     return may_be_noise
 
 

@@ -94,7 +94,7 @@ class Placer:
         self,
         window: TimeWindow,
         session: Session,
-        lending: Session,
+        lender: Session,
         topic_rows: Sequence[tuple[str, Rows]],
     ) -> SessionSights | None:
         """Returns the sights of some rows of a session; None where there are no messages.
@@ -102,7 +102,7 @@ class Placer:
         Args:
             window: the rows are of this time.
             session: the rows are of it.
-            lending: the one whose transforms hold for it; empty where none do.
+            lender: the one whose transforms hold for it; empty where none do.
             topic_rows: topics with rows of theirs.
 
         Raises:
@@ -112,7 +112,7 @@ class Placer:
         if not detected:
             return None
         poses = self._poses(session, window)
-        target, frames = self._frames(lending, window, poses)
+        target, frames = self._frames(lender, window, poses)
         sights = [
             sights_of(topic, _in_target(messages, poses, frames))
             for topic, messages in detected.items()
@@ -167,18 +167,18 @@ class Placer:
         codes, words = poses.frames.codes * 0, poses.frames.words[frame : frame + 1]
         return replace(poses, frames=poses.frames._replace(codes=codes, words=words))
 
-    def _frames(self, lending: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
+    def _frames(self, lender: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""
         pose_frame = poses.frames.words[0] if len(poses) else ""
         target = self._view.limits.map_frame or pose_frame
-        if not lending:
+        if not lender:
             target = pose_frame if len(poses) else target
             return target, FrameTree((), {}, target)
-        frames = frames_over(self._view, lending, window, target)
+        frames = frames_over(self._view, lender, window, target)
         is_map_reached = pose_frame and (pose_frame == target or frames.reaches(pose_frame))
         if not len(poses) or is_map_reached:
             return target, frames
-        return pose_frame, frames_over(self._view, lending, window, pose_frame)
+        return pose_frame, frames_over(self._view, lender, window, pose_frame)
 
     def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Ints:
         """Returns where odometry was in the map around detections, where that changes."""
@@ -288,16 +288,15 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
     robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
-    codes, words = detected.frames.codes, detected.frames.words
     of_detections = detected.found.frames
     usual = ""
     if len(of_detections):
         usual = of_detections.words[np.bincount(of_detections.codes).argmax()]
-    for code, name in enumerate(words):
-        carriers = frames.carriers(name or usual, pose_frame)
-        rows = np.flatnonzero(codes == code)
+    for code, frame in enumerate(detected.frames.words):
+        carriers = frames.carriers(frame or usual, pose_frame)
         if carriers is None:
             continue
+        rows = np.flatnonzero(detected.frames.codes == code)
         head, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
         if head is None or body is None:
             continue
@@ -305,7 +304,8 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         yaw = _yaw(body.rotation)
         posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
         robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
-        if carriers[0] != carriers[1]:
+        head_frame, body_frame = carriers
+        if head_frame != body_frame:
             is_known = head.valid & body.valid
             robot[rows, 3] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
     return robot

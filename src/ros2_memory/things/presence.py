@@ -105,12 +105,10 @@ class Cells:
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
         after, before = order[1:], order[:-1]
-        goes_on = self.cell[after] == self.cell[before]
-        goes_on &= self.slice[after] - self.slice[before] <= 1
-        self._goes_on = np.zeros(len(order), bool)
-        self._goes_on[after] = goes_on
-        self._before = np.zeros(len(order), np.int64)
-        self._before[after] = before
+        is_next = self.cell[after] == self.cell[before]
+        is_next &= self.slice[after] - self.slice[before] <= 1
+        self._previous = np.full(len(order), -1, np.int64)
+        self._previous[after] = np.where(is_next, before, -1)
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -120,11 +118,11 @@ class Cells:
 
     def looks_during(self, slices: Ints) -> Ints:
         """Returns all looks of some slices of places, by slice."""
-        first, last = (
+        start, stop = (
             np.searchsorted(self.slice, _number(slices), side) for side in ("left", "right")
         )
-        looks = in_ranges(first, last - first)
-        return _keys(np.repeat(_place(slices), last - first), looks)
+        looks = in_ranges(start, stop - start)
+        return _keys(np.repeat(_place(slices), stop - start), looks)
 
     def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
         """Returns how many detections without a place the slice and topic of each look have."""
@@ -152,11 +150,12 @@ class Cells:
 
         The one before, from the same cell, is no older than the slice before.
         """
-        again: Flags = (hits == 0) & self._goes_on[_number(looks)]
-        rows = np.flatnonzero(again)
-        before = _keys(_place(looks[rows]), self._before[_number(looks[rows])])
-        again[rows] = ~_are_in(looks[hits > 0], before)
-        return again
+        previous = self._previous[_number(looks)]
+        is_repeated: Flags = (hits == 0) & (previous >= 0)
+        rows = np.flatnonzero(is_repeated)
+        before = _keys(_place(looks[rows]), previous[rows])
+        is_repeated[rows] = ~_are_in(looks[hits > 0], before)
+        return is_repeated
 
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
@@ -181,14 +180,14 @@ class FieldOfView(NamedTuple):
 
 
 def field_of_view(distance: Floats, bearing: Floats, n: Ints) -> FieldOfView:
-    """Returns the field of view in which all but a few of the detections lie."""
+    """Returns the field of view in which nearly all detections lie: `n` at each (mm, degrees)."""
     [far] = _weighted_quantiles(distance, n, 1 - _VIEW_SHARE)
     low, high = _weighted_quantiles(bearing, n, _VIEW_SHARE, 1 - _VIEW_SHARE)
     return FieldOfView(far, low, high)
 
 
 def in_ranges(starts: Ints, sizes: Ints) -> Ints:
-    """Returns the numbers from each start on, so many of each, one range after another."""
+    """Returns the numbers of ranges, one range after another."""
     before = np.cumsum(sizes) - sizes
     numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
     return numbers

@@ -122,7 +122,7 @@ class _Lending(NamedTuple):
     """
 
     session: Session
-    lending: Session
+    lender: Session
     slices: tuple[int, ...] | None = None
 
 
@@ -243,8 +243,8 @@ class Watching:
                 for source, positions in rows.bag_rows()
                 if source.file == bag.file
             ]
-            lending = self._transforms_of(session, bag, window)
-            placed = self._placer.placed(window, session, lending, topic_rows)
+            lender = self._transforms_of(session, bag, window)
+            placed = self._placer.placed(window, session, lender, topic_rows)
             if placed is not None:
                 sights.append(placed)
         return sights
@@ -281,8 +281,8 @@ class Watching:
         for number in range(window.start // SLICE_NS, (window.stop - 1) // SLICE_NS + 1):
             middle = number * SLICE_NS + SLICE_NS // 2
             slices[self._sessions.lending_to(bag.recording, middle)].append(number)
-        for lending, numbers in slices.items():
-            yield _Lending(session, lending, tuple(numbers))
+        for lender, numbers in slices.items():
+            yield _Lending(session, lender, tuple(numbers))
 
     def _transforms_of(self, session: Session, bag: BagFile, window: TimeWindow) -> Session:
         """Returns the session whose transforms hold for a bag's; empty where none has any."""
@@ -323,19 +323,19 @@ class Watching:
         statics = [
             [
                 (static, static.log_time if window.contains(static.log_time) else 0)
-                for static in static_in(static_transforms(self._view, lending), window)
+                for static in static_in(static_transforms(self._view, lender), window)
             ]
-            for _, lending, _ in around.sessions
-            if lending
+            for _, lender, _ in around.sessions
+            if lender
         ]
         folders = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
         begin = window.start // SLICE_NS
         sessions = [
             (
-                [(folder in session, folder in lending) for folder in folders],
+                [(folder in session, folder in lender) for folder in folders],
                 [number - begin for number in slices or ()],
             )
-            for session, lending, slices in around.sessions
+            for session, lender, slices in around.sessions
         ]
         before, digest = self._digested
         # Mostly they are those of the stretch before, object by object.
@@ -361,14 +361,14 @@ class Watching:
             by_session[self._sessions.of(rows.recording)].append((topic, rows))
         head: list[tuple[int, str, int, list[tuple[tuple[str, ...], bool, int]]]] = []
         data: list[bytes] = []
-        for number, (session, lending, slices) in enumerate(around.sessions):
+        for number, (session, lender, slices) in enumerate(around.sessions):
             topic_rows = by_session[session]
             if slices is not None:
                 topic_rows = [
                     (topic, rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices))))
                     for topic, rows in topic_rows
                 ]
-            seen = self._placer.placed(around.window, session, lending, topic_rows)
+            seen = self._placer.placed(around.window, session, lender, topic_rows)
             if seen is not None:
                 tables = [*map(packed, seen.sights)]
                 spots = sum(len(sights.spots) for sights in seen.sights)

@@ -8,7 +8,7 @@ turn with both of them is joined with neither.
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import combinations
+from itertools import combinations, starmap
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -53,21 +53,20 @@ def with_synonyms(
             by_word[last_word(key)].append(key)
     has_key = {key: np.array([key == other for other in keys]) for key in set(keys)}
 
-    def are_two(pair: tuple[str, str]) -> bool:
-        one, other = pair
+    def are_two(one: str, other: str) -> bool:
         go_on()
-        return labels.are_apart(*pair) or _are_beside(sights, has_key[one], has_key[other])
+        return labels.are_apart(one, other) or _are_beside(sights, has_key[one], has_key[other])
 
     groups = {key: frozenset({key}) for key in keys}
-    for pair in (pair for alike in by_word.values() for pair in combinations(alike, 2)):
-        one, other = pair
+    pairs = [pair for alike in by_word.values() for pair in combinations(alike, 2)]
+    for one, other in pairs:
         masks = has_key[one], has_key[other]
-        if not are_two(pair) and _alternate(sights.spots, counts, epoch, *masks):
+        if not are_two(one, other) and _alternate(sights.spots, counts, epoch, *masks):
             group = groups[one] | groups[other]
             groups |= dict.fromkeys(group, group)
     # A name that is used for two things does not tell them apart.
     names = {
-        group: None if any(map(are_two, combinations(sorted(group), 2))) else min(group)
+        group: None if any(starmap(are_two, combinations(sorted(group), 2))) else min(group)
         for group in {*groups.values()}
     }
     return [names[groups[key]] or key for key in keys]
