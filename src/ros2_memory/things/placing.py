@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -95,7 +95,7 @@ class Placer:
         window: TimeWindow,
         session: Session,
         lender: Session,
-        topic_rows: Sequence[tuple[str, Rows]],
+        units: Iterable[Rows],
     ) -> SessionSights | None:
         """Returns the sights of some rows of a session; None where there are no messages.
 
@@ -103,12 +103,12 @@ class Placer:
             window: the rows are of this time.
             session: the rows are of it.
             lender: the one whose transforms hold for it; empty where none do.
-            topic_rows: topics with rows of theirs.
+            units: the rows, of some topics.
 
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        detected, detectors = self._detected(topic_rows)
+        detected, detectors = self._detected(units)
         if not detected:
             return None
         poses = self._poses(session, window)
@@ -123,22 +123,17 @@ class Placer:
             sights.append(replace(sights[0].only().with_fixes(fixes), topics=(), labels=()))
         return SessionSights(target, tuple(sights), frozenset(detectors))
 
-    def _detected(
-        self, topic_rows: Sequence[tuple[str, Rows]]
-    ) -> tuple[dict[str, Detected], set[str]]:
+    def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
         """Returns the messages by topic, and which topics are surely of detectors."""
         by_topic: dict[str, list[Rows]] = defaultdict(list)
         # However they are stored.
-        in_time = sorted(
-            topic_rows, key=lambda pair: (pair[1].first, pair[1].last, str(pair[1].recording))
-        )
-        for topic, rows in in_time:
-            by_topic[topic].append(rows)
+        for rows in sorted(units, key=lambda rows: (rows.first, rows.last, str(rows.recording))):
+            by_topic[rows.table.channel.topic].append(rows)
         detected: dict[str, Detected] = {}
         detectors: set[str] = set()
-        for topic, units in by_topic.items():
-            messages = joined_detected([self.rows.of(rows) for rows in units])
-            is_named = any(is_named_for_detections(rows.table.channel.type) for rows in units)
+        for topic, of_topic in by_topic.items():
+            messages = joined_detected([self.rows.of(rows) for rows in of_topic])
+            is_named = any(is_named_for_detections(rows.table.channel.type) for rows in of_topic)
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()

@@ -237,14 +237,14 @@ class Watching:
         sights: list[SessionSights] = []
         for number in _numbers_of(self._view, self._topics, bag):
             window = _window(number).intersect(TimeWindow(bag.start, bag.end + 1))
-            topic_rows = [
-                (topic, rows.some(positions))
-                for topic, rows in self._rows(window)
+            units = [
+                rows.some(positions)
+                for rows in self._rows(window)
                 for source, positions in rows.bag_rows()
                 if source.file == bag.file
             ]
             lender = self._transforms_of(session, bag, window)
-            placed = self._placer.placed(window, session, lender, topic_rows)
+            placed = self._placer.placed(window, session, lender, units)
             if placed is not None:
                 sights.append(placed)
         return sights
@@ -356,19 +356,19 @@ class Watching:
 
     def _read(self, around: _Surroundings) -> bytes:
         """Returns what was seen, as `_unpacked` reads it; empty where there are no messages."""
-        by_session: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
-        for topic, rows in self._rows(around.window):
-            by_session[self._sessions.of(rows.recording)].append((topic, rows))
+        by_session: dict[Session, list[Rows]] = defaultdict(list)
+        for rows in self._rows(around.window):
+            by_session[self._sessions.of(rows.recording)].append(rows)
         head: list[tuple[int, str, int, list[tuple[tuple[str, ...], bool, int]]]] = []
         data: list[bytes] = []
         for number, (session, lender, slices) in enumerate(around.sessions):
-            topic_rows = by_session[session]
+            units = by_session[session]
             if slices is not None:
-                topic_rows = [
-                    (topic, rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices))))
-                    for topic, rows in topic_rows
+                units = [
+                    rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices)))
+                    for rows in units
                 ]
-            seen = self._placer.placed(around.window, session, lender, topic_rows)
+            seen = self._placer.placed(around.window, session, lender, units)
             if seen is not None:
                 tables = [*map(packed, seen.sights)]
                 spots = sum(len(sights.spots) for sights in seen.sights)
@@ -381,11 +381,10 @@ class Watching:
         packed_head = json.dumps(head).encode()
         return b"".join((_SIZE.pack(len(packed_head)), packed_head, *data)) if head else b""
 
-    def _rows(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
+    def _rows(self, window: TimeWindow) -> Iterator[Rows]:
         """Yields the rows in a window that may have detections."""
         for topic in self._topics:
-            for rows in scan(self._view, topic, window, may_match=self._placer.rows.may_match):
-                yield topic, rows
+            yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
 
 
 def _unpacked(data: bytes, around: _Surroundings) -> Iterator[Stretch]:
