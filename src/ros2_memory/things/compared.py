@@ -34,13 +34,13 @@ _SAME_MOVER_M: Final = 1.0
 """What moves by itself, and was last seen so near to where it was before, is where it was."""
 
 
-class _Seen(NamedTuple):
-    """A thing as it was seen in a window: its last stay in it, and that part of the stay."""
+class _StayInWindow(NamedTuple):
+    """A thing's last stay in a window, and that part of the stay."""
 
     stay: PlacedStay
     part: ThingStay
 
-    def is_elsewhere(self, other: _Seen) -> bool:
+    def is_elsewhere(self, other: _StayInWindow) -> bool:
         """Whether a thing was moved between this and another: to and fro is no move."""
         away_m = math.dist(self.part.place[:2], other.part.place[:2])
         return self.stay.place != other.stay.place and away_m >= LEAST_MM / 1000
@@ -65,39 +65,41 @@ class ThingsBetween:
     def compared(self) -> ComparedThings:
         """Returns what differs, each list with those seen last first."""
         lists: dict[str, list[ComparedThing]] = {"moved": [], "appeared": [], "missed": []}
-        unknown: list[tuple[Instance, ComparedThing]] = []
+        not_looked_at: list[tuple[Instance, ComparedThing]] = []
         same = 0
         for instance in self.known.estimate.instances:
-            before = self._seen(instance, self.earlier, self.later.start)
-            after = self._seen(instance, self.later)
-            shared = self._seen(instance, self.earlier)
+            before = self._stay_in(instance, self.earlier, self.later.start)
+            after = self._stay_in(instance, self.later)
+            shared = self._stay_in(instance, self.earlier)
             if before is None and after and shared and shared.is_elsewhere(after):
                 before = shared  # in slices of both windows, but elsewhere
-            if not self._counts(instance, before, after):
+            if not self._is_there(instance, before, after):
                 continue
             if before and after and not before.is_elsewhere(after):
                 same += 1
                 continue
-            kind, thing = self._differs(instance, before, after)
+            kind, thing = self._difference(instance, before, after)
             if kind == "not_looked_at":
-                unknown.append((instance, thing))
+                not_looked_at.append((instance, thing))
             else:
                 lists[kind].append(thing)
-        lists["not_looked_at"], lists["not_comparable"] = _in_both(unknown)
-        ordered = {kind: tuple(sorted(each, key=_newest_first)) for kind, each in lists.items()}
+        lists["not_looked_at"], lists["not_comparable"] = _paired(not_looked_at)
+        ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers)
 
-    def _counts(self, instance: Instance, before: _Seen | None, after: _Seen | None) -> bool:
+    def _is_there(
+        self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
+    ) -> bool:
         """Whether a thing was seen there in either window."""
         frame = self.known.frames[instance.epoch]
-        places = [seen.part.place for seen in (before, after) if seen is not None]
+        places = [stay.part.place for stay in (before, after) if stay is not None]
         if self.where is None:
             return bool(places)
         return any(self.where.contains(frame, x, y) for x, y, _ in places)
 
-    def _differs(
-        self, instance: Instance, before: _Seen | None, after: _Seen | None
+    def _difference(
+        self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
     ) -> tuple[str, ComparedThing]:
         """Returns what became of a thing: kind and description."""
         thing = ComparedThing(
@@ -107,8 +109,7 @@ class ThingsBetween:
         )
         estimate = self.known.estimate
         if before is None and after is not None:
-            end = min(self.earlier.stop, self.later.start)
-            window = self.earlier.start, end
+            window = self.earlier.start, min(self.earlier.stop, self.later.start)
             _, crossed = estimate.missing(instance, after.stay, window)
             return "not_looked_at" if crossed is None else "appeared", thing
         if before is not None and after is None:
@@ -118,52 +119,56 @@ class ThingsBetween:
             return "missed", replace(thing, missed=crossed, looks=looks)
         return "moved", thing
 
-    def _last_there(self, instance: Instance, before: _Seen) -> PlacedStay:
+    def _last_there(self, instance: Instance, before: _StayInWindow) -> PlacedStay:
         """Returns a thing's last stay at its place of the earlier window, before the later one."""
-        stays = [each for each in instance.stays if each.place == before.stay.place]
-        return [each for each in stays if each.first < self.later.start][-1]
+        return [
+            stay
+            for stay in instance.stays
+            if stay.place == before.stay.place and stay.first < self.later.start
+        ][-1]
 
-    def _seen(self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS) -> _Seen | None:
+    def _stay_in(
+        self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS
+    ) -> _StayInWindow | None:
         estimate, frame = self.known.estimate, self.known.frames[instance.epoch]
         for stay in reversed(instance.stays):
             rows = estimate.seen_in(stay.spots, window, before)
             if len(rows):
                 place = estimate.place_of(stay, rows)
-                return _Seen(stay, self.known.stay(rows, place, frame, self.places))
+                return _StayInWindow(stay, self.known.stay(rows, place, frame, self.places))
         return None
 
     def _movers(self) -> Iterator[ComparedMover]:
         """Yields what moves by itself and was not seen alike in both windows."""
-        alone: dict[str, list[ComparedMover]] = {}
+        by_label: dict[str, tuple[list[MoverSeen], list[MoverSeen]]] = {}
         for mover in self.known.estimate.movers:
+            label = self.known.estimate.names[mover.key]
             before = self._mover_in(mover, self.earlier, self.later.start)
             after = self._mover_in(mover, self.later)
-            found = ComparedMover(self.known.estimate.names[mover.key], before, after)
             if before is not None and after is not None:
-                away = math.dist(before.place[:2], after.place[:2])
-                if before.at_once != after.at_once or away > _SAME_MOVER_M:
-                    yield found
-            elif before is not None or after is not None:
-                alone.setdefault(found.label, []).append(found)
-        for label, some in alone.items():
+                away_m = math.dist(before.place[:2], after.place[:2])
+                if before.at_once != after.at_once or away_m > _SAME_MOVER_M:
+                    yield ComparedMover(label, before, after)
+                continue
+            befores, afters = by_label.setdefault(label, ([], []))
+            befores += [before] if before is not None else []
+            afters += [after] if after is not None else []
+        for label, (befores, afters) in by_label.items():
             # In each run of odometry it is another mover: one of each window is one row.
-            before_ = [each.before for each in some if each.before is not None]
-            after_ = [each.after for each in some if each.after is not None]
-            for was, seen in zip_longest(before_, after_):
-                yield ComparedMover(label, was, seen)
+            for before, after in zip_longest(befores, afters):
+                yield ComparedMover(label, before, after)
 
     def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
         estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
         rows = self.known.seen_there(mover, window, self.where, before)
         if not len(rows):
             return None
-        seen = estimate.sights.spots[rows]
-        x, y, z, last = seen[seen[:, Spot.LAST].argmax()][
-            [Spot.X, Spot.Y, Spot.Z, Spot.LAST]
-        ].tolist()
+        spots = estimate.sights.spots[rows]
+        newest = spots[spots[:, Spot.LAST].argmax()]
+        x, y, z, last = newest[[Spot.X, Spot.Y, Spot.Z, Spot.LAST]].tolist()
         place = x / 1000, y / 1000, z / 1000
         return MoverSeen(
-            at_once=most_at_once(seen),
+            at_once=most_at_once(spots),
             count=int(estimate.counts[rows].sum()),
             place=place,
             inside=places_at(self.places, frame, *place[:2]),
@@ -171,35 +176,36 @@ class ThingsBetween:
         )
 
 
-def _in_both(
-    unknown: Sequence[tuple[Instance, ComparedThing]],
+def _paired(
+    things: Sequence[tuple[Instance, ComparedThing]],
 ) -> tuple[list[ComparedThing], list[ComparedThing]]:
     """Returns the things that were seen in one window alone, and those that were seen in both.
 
     A thing of the earlier window and one of the later with its label, in another odometry, are
     taken as one.
     """
-    waiting: dict[str, list[tuple[Instance, ComparedThing]]] = {}
-    for instance, thing in unknown:
+    later: dict[str, list[tuple[int, ComparedThing]]] = {}
+    for instance, thing in things:
         if thing.before is None:
-            waiting.setdefault(instance.key, []).append((instance, thing))
+            later.setdefault(instance.key, []).append((instance.epoch, thing))
     alone: list[ComparedThing] = []
     both: list[ComparedThing] = []
-    for instance, thing in unknown:
+    for instance, thing in things:
         if thing.before is None:
             continue
-        others = waiting.get(instance.key, [])
-        match = next((each for each in others if each[0].epoch != instance.epoch), None)
-        if match is None:
-            alone.append(thing)
+        candidates = later.get(instance.key, [])
+        for position, (epoch, candidate) in enumerate(candidates):
+            if epoch != instance.epoch:
+                del candidates[position]
+                both.append(replace(thing, after=candidate.after))
+                break
         else:
-            others.remove(match)
-            both.append(replace(thing, after=match[1].after))
-    return alone + [thing for some in waiting.values() for _, thing in some], both
+            alone.append(thing)
+    return alone + [thing for rest in later.values() for _, thing in rest], both
 
 
-def _newest_first(each: ComparedThing | ComparedMover) -> tuple[int, str]:
-    seen = each.after or each.before
+def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
+    seen = thing.after or thing.before
     if seen is None:
-        return 0, each.label
-    return -(seen.end if isinstance(seen, ThingStay) else seen.last), each.label
+        return 0, thing.label
+    return -(seen.end if isinstance(seen, ThingStay) else seen.last), thing.label

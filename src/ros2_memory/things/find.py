@@ -96,56 +96,47 @@ def find_things(
     known = known_things(view, lowest, limits.labels, window)
     view.notes.retract_outside(whole)
     note_other_frames(view, known, region)
-    asked = {known.labels.key(each): each for each in labels}
+    asked = {known.labels.key(label): label for label in labels}
     places = places_asked(limits, region, known.frames)
     finder = _Finder(known, window, region, places, now)
-    found = sorted(finder.find(asked), key=lambda each: (-each.last, each.label, each.place))
+    found = sorted(finder.find(asked), key=lambda thing: (-thing.last, thing.label, thing.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
         others = [*anywhere.find({known.labels.key(beside.label)})] if beside.label else []
-        found = [*beside.among(found, others)]
+        found = [*beside.those_near(found, others)]
         if beside.label and not others:
             view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
     note_unread(view, whole, nothing=not found, gaps=not found)
     if not found and asked_for != whole:
         view.notes.add(describe_misdated(view.snapshot.misdated))
-    things = tuple(
-        each.described()
-        if beside is None
-        else replace(
-            each.described(),
-            place=each.place,
-            inside=places_at(places, known.frames[each.thing.epoch], *each.place[:2]),
-            at_once=each.at_once,
-            near_m=each.near_m,
-        )
-        for each in found[:limit]
-    )
+    shown = tuple(thing.described() for thing in found[:limit])
+    if beside is not None:
+        shown = tuple(map(finder.at_place_near, found, shown))
     totals: Counter[str] = Counter()
-    for each in found:
-        totals[each.label] += each.at_once or 1
-    is_bounded = start_s is not None or end_s is not None
-    bounds = [*["window"] * is_bounded, *["region"] * (region is not None or beside is not None)]
+    for thing in found:
+        totals[thing.label] += thing.at_once or 1
+    bounds = []
+    if start_s is not None or end_s is not None:
+        bounds.append("window")
+    if region is not None or beside is not None:
+        bounds.append("region")
     question = Asked(
         labels=asked,
-        found=frozenset(key for each in found for key in each.keys),
-        vague=frozenset(each.label for each in found if each.is_vague),
+        found=frozenset(key for thing in found for key in thing.keys),
+        vague=frozenset(thing.label for thing in found if thing.is_vague),
         window=window,
         inside=f" in this {' and '.join(bounds)}" if bounds else "",
         min_score=f"min_score {lowest:g}" + " (data.min_score)" * (min_score is None),
         undecoded=undecoded,
     )
     return Things(
-        frame_id=_frame_of(known, things),
-        things=things,
+        frame_id=_frame_of(known, shown),
+        things=shown,
         total=totals.total(),
         labels=tuple(sorted(totals.items())),
         now=now,
         all_counted=known.reaches_back(window),
-        notes=(
-            *view.notes.sentences(),
-            *notes_on(view, known.by_all, question),
-        ),
+        notes=(*view.notes.sentences(), *notes_on(view, known.by_all, question)),
     )
 
 
@@ -156,8 +147,18 @@ def _frame_of(known: KnownThings, shown: Sequence[Thing]) -> str:
     return known.frames[0] if known.has_map else "".join(known.frames[1:][-1:])
 
 
-class _Found(NamedTuple):
-    """A thing of a question, which is described where it is shown: there may be thousands."""
+class _FoundThing(NamedTuple):
+    """A thing of a question, which is described where it is shown: there may be thousands.
+
+    Attributes:
+        label: to show; `keys` are those of all its names.
+        last: when it was seen last in the window.
+        place: where it was then (m, in the frame of its epoch).
+        at_once: how many are there; None where one is.
+        is_vague: whether localisation was poor then.
+        also_at: of what moves by itself, where others were in the slice that was seen last.
+        near_m: how far it is from what it was to be near.
+    """
 
     label: str
     keys: Collection[str]
@@ -168,36 +169,42 @@ class _Found(NamedTuple):
     described: Callable[[], Thing]
     thing: Instance | Mover
     also_at: tuple[tuple[float, float, float], ...] = ()
-    """Of what moves by itself: where others were in the slice that was seen last."""
     near_m: float | None = None
 
 
 class Near(NamedTuple):
-    """What things are to be near: the middle of a circle or, of a label, other things."""
+    """What things are to be near: the middle of a circle or, of a label, other things.
+
+    Of a label only the circle's radius counts.
+    """
 
     circle: Circle
     label: str = ""
 
-    def among(self, found: Iterable[_Found], others: Sequence[_Found]) -> Iterator[_Found]:
+    def those_near(
+        self, found: Iterable[_FoundThing], others: Sequence[_FoundThing]
+    ) -> Iterator[_FoundThing]:
         """Yields those near the circle's middle, or one of the others, each with its distance."""
-        for each in found:
+        for thing in found:
             points = [(self.circle.x, self.circle.y)]
             if self.label:
                 points = [
                     place[:2]
-                    for one in others
-                    if one.thing is not each.thing and one.thing.epoch == each.thing.epoch
-                    for place in (one.place, *one.also_at)
+                    for other in others
+                    if other.thing is not thing.thing and other.thing.epoch == thing.thing.epoch
+                    for place in (other.place, *other.also_at)
                 ]
-            away = [
+            distances = [
                 (min((math.dist(place[:2], point) for point in points), default=math.inf), place)
-                for place in (each.place, *each.also_at)
+                for place in (thing.place, *thing.also_at)
             ]
-            near = [one for one in away if one[0] <= self.circle.radius_m]
+            near = [
+                (away_m, place) for away_m, place in distances if away_m <= self.circle.radius_m
+            ]
             if near:
                 near_m, place = min(near)
-                at_once = min(each.at_once or 1, len(near)) if each.also_at else each.at_once
-                yield each._replace(near_m=near_m, place=place, at_once=at_once)
+                at_once = min(thing.at_once or 1, len(near)) if thing.also_at else thing.at_once
+                yield thing._replace(near_m=near_m, place=place, at_once=at_once)
 
 
 def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
@@ -210,7 +217,7 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
     label = given.get("label", "") if isinstance(given, dict) else None
     if isinstance(given, dict) and given.keys() <= {"label", "radius_m"}:
         label = label or None
-        given = {"x": 0, "y": 0, **{name: each for name, each in given.items() if name != "label"}}
+        given = {"x": 0, "y": 0, **{name: part for name, part in given.items() if name != "label"}}
     region = parse_where(limits, given, _NEAR_M, "near").region
     if not isinstance(region, Circle) or not isinstance(label, str):
         raise InvalidArgumentsError(
@@ -222,7 +229,13 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
 
 @dataclass(frozen=True, slots=True)
 class _Finder:
-    """Selects the things of a question, and describes them."""
+    """Selects the things of a question, and describes them.
+
+    Attributes:
+        where: the region they are to be in; None for all.
+        places: the named ones.
+        now: the time of the call (ns).
+    """
 
     known: KnownThings
     window: TimeWindow
@@ -230,37 +243,56 @@ class _Finder:
     places: tuple[Place, ...]
     now: Ns
 
-    def find(self, keys: Collection[str]) -> Iterator[_Found]:
+    def find(self, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields the things of these keys, or all where there are none."""
-        result = self.known.estimate
-        for instance in result.instances:
-            names = {self.known.labels.key(name) for name in instance.labels}
-            if not keys or not names.isdisjoint(keys):
-                yield from self._instance(instance, names)
-        for mover in result.movers:
-            names = {self.known.labels.key(name) for name in self._labels(mover.spots)}
-            if not keys or not names.isdisjoint(keys):
-                yield from self._mover(mover, names)
+        for instance in self.known.estimate.instances:
+            own_keys = {self.known.labels.key(name) for name in instance.labels}
+            if not keys or not own_keys.isdisjoint(keys):
+                yield from self._found_instance(instance, own_keys)
+        for mover in self.known.estimate.movers:
+            own_keys = {self.known.labels.key(name) for name in self._labels(mover.spots)}
+            if not keys or not own_keys.isdisjoint(keys):
+                yield from self._found_mover(mover, own_keys)
 
-    def _instance(self, instance: Instance, names: Collection[str]) -> Iterator[_Found]:
-        result = self.known.estimate
-        seen = ((stay, result.seen_in(stay.spots, self.window)) for stay in instance.stays)
+    def at_place_near(self, found: _FoundThing, shown: Thing) -> Thing:
+        """Returns a thing as shown, at that of its places which is near what was asked for."""
+        inside = places_at(self.places, self.known.frames[found.thing.epoch], *found.place[:2])
+        return replace(
+            shown,
+            place=found.place,
+            inside=inside,
+            at_once=found.at_once,
+            near_m=found.near_m,
+        )
+
+    def _found_instance(self, instance: Instance, keys: Collection[str]) -> Iterator[_FoundThing]:
+        """Yields a thing if it was seen in the window, and was inside the region at its end."""
+        estimate = self.known.estimate
+        seen = ((stay, estimate.seen_in(stay.spots, self.window)) for stay in instance.stays)
         parts = [(stay, rows) for stay, rows in seen if len(rows)]
         if not parts:
             return
-        last, newest = parts[-1]
-        place, frame = last.at, self.known.frames[instance.epoch]
-        if self.where is not None and not self.where.contains(frame, place[0], place[1]):
+        stay, newest = parts[-1]
+        frame = self.known.frames[instance.epoch]
+        if self.where is not None and not self.where.contains(frame, *stay.at[:2]):
             return
-        seen_last = max(int(result.sights.spots[rows, Spot.LAST].max()) for _, rows in parts)
+        rows = np.concatenate([rows for _, rows in parts])
         at_once = self._side_by_side(newest)
-        describe = partial(self._described, instance, parts, at_once)
-        is_vague = result.is_vague(np.concatenate([rows for _, rows in parts]))
-        yield _Found(instance.label, names, seen_last, place, at_once, is_vague, describe, instance)
+        yield _FoundThing(
+            label=instance.label,
+            keys=keys,
+            last=int(estimate.sights.spots[rows, Spot.LAST].max()),
+            place=stay.at,
+            at_once=at_once,
+            is_vague=estimate.is_vague(rows),
+            described=partial(self._described, instance, parts, at_once),
+            thing=instance,
+        )
 
     def _described(
         self, instance: Instance, parts: Sequence[tuple[PlacedStay, Ints]], at_once: int | None
     ) -> Thing:
+        """Returns a thing by its stays in the window, each with its spots."""
         last, newest = parts[-1]
         frame = self.known.frames[instance.epoch]
         # The stays at one place in a row, as one.
@@ -270,15 +302,16 @@ class _Finder:
             )
             for group in _by_place(parts)
         ]
-        every = np.concatenate([rows for _, rows in parts])
-        labels = self._labels(every)
-        result, rows = self.known.estimate, np.concatenate([stay.spots for stay in instance.stays])
-        written = spellings(result.sights, result.counts, rows)
+        rows = np.concatenate([rows for _, rows in parts])
+        labels = self._labels(rows)
+        estimate = self.known.estimate
+        rows_of_all = np.concatenate([stay.spots for stay in instance.stays])
+        written = spellings(estimate.sights, estimate.counts, rows_of_all)
         misread = Counter[str]()
         for stay in instance.stays:
             misread.update(stay.also)
         return replace(
-            self._thing(instance.label, frame, last.at, every, newest),
+            self._thing(instance.label, frame, last.at, rows, newest),
             labels=tuple(labels.items()) if len(labels) > 1 else (),
             also_seen_as=_commonest(written, instance.labels),
             misread_as=_commonest(misread, instance.labels),
@@ -286,7 +319,7 @@ class _Finder:
             still_there=self._still_there(instance, last, newest),
             moved=tuple(stays) if len(stays) > 1 else (),
             at_once=at_once,
-            usually=self._usually(frame, every) if len(stays) > 1 else None,
+            usually=self._usually(frame, rows) if len(stays) > 1 else None,
         )
 
     def _thing(
@@ -306,7 +339,7 @@ class _Finder:
             place=place,
             spread_m=0.0,
             frame_id=frame,
-            inside=places_at(self.places, frame, place[0], place[1]),
+            inside=places_at(self.places, frame, *place[:2]),
             first=int(spots[:, Spot.FIRST].min()),
             last=int(spots[:, Spot.LAST].max()),
             count=int(self.known.estimate.counts[rows].sum()),
@@ -318,9 +351,9 @@ class _Finder:
 
     def _labels(self, rows: Ints) -> dict[str, int]:
         """Returns how often each label has these spots, the commonest first."""
-        result = self.known.estimate
-        found = spellings(result.sights, result.counts, rows)
-        return named(found, self.known.labels, result.names)
+        estimate = self.known.estimate
+        written = spellings(estimate.sights, estimate.counts, rows)
+        return named(written, self.known.labels, estimate.names)
 
     def _side_by_side(self, rows: Ints) -> int | None:
         """Returns how many of a label are at one place, where messages have several at once.
@@ -329,57 +362,50 @@ class _Finder:
         A slice counts where each was seen at least half as often as the one seen most, three times
         or as often as a slow detector sees them.
         """
-        spots, counts = self.known.estimate.sights.spots[rows], self.known.estimate.counts[rows]
-        many = counts >= min(_FEWEST_BESIDE, int(counts.max()))
-        of = spots[many]
-        order = np.argsort(of[:, Spot.SLICE], kind="stable")
-        slices, together, often = (
-            of[order, Spot.SLICE],
-            of[order, Spot.TOGETHER],
-            counts[many][order],
-        )
-        begins = np.flatnonzero(np.diff(slices, prepend=-1))
+        counts = self.known.estimate.counts[rows]
+        is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))
+        rows, counts = rows[is_often], counts[is_often]
+        slices, together = self.known.estimate.sights.spots[rows][:, [Spot.SLICE, Spot.TOGETHER]].T
+        order = np.argsort(slices, kind="stable")
+        begins = np.flatnonzero(np.diff(slices[order], prepend=-1))
         numbers: list[int] = []
         if len(begins):
-            sizes = np.diff(begins, append=len(slices))
-            most = np.repeat(np.maximum.reduceat(often, begins), sizes)
-            beside = np.add.reduceat((2 * often >= most).astype(np.int64), begins)
-            at_once = np.maximum.reduceat(together, begins)
+            sizes = np.diff(begins, append=len(order))
+            most = np.repeat(np.maximum.reduceat(counts[order], begins), sizes)
+            beside = np.add.reduceat((2 * counts[order] >= most).astype(np.int64), begins)
+            at_once = np.maximum.reduceat(together[order], begins)
             numbers = np.minimum(beside, at_once).tolist()
         # What most slices have, so that no single one with a false detection counts.
-        numbers = numbers[-_NEWEST_BESIDE:]
-        number = sorted(numbers, reverse=True)[len(numbers) // 2] if numbers else 1
+        newest = sorted(numbers[-_NEWEST_BESIDE:], reverse=True)
+        number = newest[len(newest) // 2] if newest else 1
         return number if number > 1 else None
 
-    def _mover(self, mover: Mover, names: Collection[str]) -> Iterator[_Found]:
+    def _found_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields a mover: where it was last seen, inside the region if one is given."""
-        result, frame = self.known.estimate, self.known.frames[mover.epoch]
+        estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
         rows = self.known.seen_there(mover, self.window, self.where)
         if not len(rows):
             return
-        spots = result.sights.spots[rows]
+        spots = estimate.sights.spots[rows]
         newest = int(spots[:, Spot.LAST].argmax())
-        places = (spots[:, [Spot.X, Spot.Y, Spot.Z]] / _MM).tolist()
-        x, y, z = places[newest]
-        place = x, y, z
-        together = np.flatnonzero(spots[:, Spot.SLICE] == spots[newest, Spot.SLICE]).tolist()
-        others = [places[nth] for nth in together if nth != newest]
+        places = [(x, y, z) for x, y, z in (spots[:, [Spot.X, Spot.Y, Spot.Z]] / _MM).tolist()]
+        in_slice = np.flatnonzero(spots[:, Spot.SLICE] == spots[newest, Spot.SLICE]).tolist()
         thing = replace(
-            self._thing(result.names[mover.key], frame, place, rows, rows[[newest]]),
+            self._thing(estimate.names[mover.key], frame, places[newest], rows, rows[[newest]]),
             spread_m=int(spots[newest, Spot.DEV]) / _MM,
             at_once=most_at_once(spots),
             moves=True,
         )
-        yield _Found(
-            thing.label,
-            names,
-            thing.last,
-            place,
-            thing.at_once,
-            result.is_vague(rows),
-            lambda: replace(thing, usually=self._usually(frame, rows)),
-            mover,
-            tuple((x, y, z) for x, y, z in others),
+        yield _FoundThing(
+            label=thing.label,
+            keys=keys,
+            last=thing.last,
+            place=thing.place,
+            at_once=thing.at_once,
+            is_vague=estimate.is_vague(rows),
+            described=lambda: replace(thing, usually=self._usually(frame, rows)),
+            thing=mover,
+            also_at=tuple(places[number] for number in in_slice if number != newest),
         )
 
     def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
@@ -387,11 +413,12 @@ class _Finder:
         spots = self.known.estimate.sights.spots[rows]
         spots = spots[np.argsort(spots[:, Spot.LAST], kind="stable")]
         now = min(self.now, self.window.stop)
-        found = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
-        if found is None:
+        usual = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
+        if usual is None:
             return None
         return tuple(
-            replace(one, inside=places_at(self.places, frame, *one.place[:2])) for one in found
+            replace(place, inside=places_at(self.places, frame, *place.place[:2]))
+            for place in usual
         )
 
     def _scores(self, rows: Ints) -> tuple[float | None, float | None]:
@@ -413,8 +440,8 @@ class _Finder:
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
         highest = np.full(len(sights.spots), -1, np.int64)
         np.maximum.at(highest, scores[:, Score.SPOT], scores[:, Score.BIN])
-        known = sights.spots[highest == middle, Spot.BEST]
-        median = int(known.max()) / 1000 if len(known) else (middle + 0.5) / SCORE_BINS
+        in_bin = sights.spots[highest == middle, Spot.BEST]
+        median = int(in_bin.max()) / 1000 if len(in_bin) else (middle + 0.5) / SCORE_BINS
         return best / 1000, min(median, best / 1000)
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
@@ -423,10 +450,10 @@ class _Finder:
         last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
         if by_all is not self.known:
             newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
-            now = by_all.estimate.stay_with(spots[newest_first])
-            if now is None:
+            same = by_all.estimate.stay_with(spots[newest_first])
+            if same is None:
                 return None
-            instance, stay = now
+            instance, stay = same
         if stay.last > last:
             return StillThere("seen_since", stay.last)
         if stay is instance.stays[-1]:

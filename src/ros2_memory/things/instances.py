@@ -35,6 +35,7 @@ from ros2_memory.things.places import GATE_MM, places_of
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
+    FieldOfView,
     Stay,
     evidence_at,
     field_of_view,
@@ -160,16 +161,16 @@ class Estimate:
     """Of each spot, the first of `stays` that has it; -1 where none has."""
 
     def __post_init__(self) -> None:
-        self.stays = [(each, stay) for each in self.instances for stay in each.stays]
+        self.stays = [(instance, stay) for instance in self.instances for stay in instance.stays]
         self.stay_of = np.full(len(self.sights.spots), -1, np.int64)
-        for nth, (_, stay) in reversed([*enumerate(self.stays)]):
-            self.stay_of[stay.spots] = nth
+        for number, (_, stay) in reversed([*enumerate(self.stays)]):
+            self.stay_of[stay.spots] = number
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
         tables = sum(table.nbytes for table in (*self.sights.tables, self.hits))
-        looks = len(self.cells.slice) + sum(len(each.looks) for each in self.evidence.values())
+        looks = len(self.cells.slice) + sum(len(place.looks) for place in self.evidence.values())
         return tables + 100 * looks
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
@@ -179,8 +180,8 @@ class Estimate:
         """
         first, last = self.sights.spots[rows][:, [Spot.FIRST, Spot.LAST]].T
         inside = (first < window.stop) & (last >= window.start) & (last < before)
-        found: Ints = rows[inside & (self.counts[rows] > 0)]
-        return found
+        counting: Ints = rows[inside & (self.counts[rows] > 0)]
+        return counting
 
     def is_vague(self, rows: Ints) -> bool:
         """Whether the newest of some spots was seen while localisation was poor."""
@@ -205,11 +206,11 @@ class Estimate:
         if not len(hits):
             return None
         looks, n = hits[:, Hit.LOOK], hits[:, Hit.N]
-        cells, of = np.unique(self.cells.cell[looks], return_inverse=True)
-        seen, last = np.bincount(of, n), np.zeros(len(cells), np.int64)
-        np.maximum.at(last, of, self.cells.last[looks])
-        mine = of == np.lexsort((last, seen))[-1]
-        looks, n = looks[mine], n[mine]
+        cells, cell_of = np.unique(self.cells.cell[looks], return_inverse=True)
+        messages, last = np.bincount(cell_of, n), np.zeros(len(cells), np.int64)
+        np.maximum.at(last, cell_of, self.cells.last[looks])
+        is_in_best = cell_of == np.lexsort((last, messages))[-1]
+        looks, n = looks[is_in_best], n[is_in_best]
         x, y, yaw = (
             float((column[looks] * n).sum() / n.sum())
             for column in (self.cells.x, self.cells.y, self.cells.yaw)
@@ -225,15 +226,15 @@ class Estimate:
         window = window or (stay.last + 1, MAX_NS)
         return looks_without(self.cells, evidence, stay.stay, seen_to, window)
 
-    def stay_with(self, seen: Ints) -> tuple[Instance, PlacedStay] | None:
+    def stay_with(self, foreign: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
 
-        `seen` are rows of `Sights.spots` of another estimate (mm, ns), of some of the same bags.
+        `foreign` are rows of `Sights.spots` of another estimate (mm, ns), of some of the same bags.
         Returns None where no thing has any of them.
         """
         alike = [Spot.N, Spot.X, Spot.Y, Spot.LAST]
         spots = self.sights.spots
-        for spot in seen:
+        for spot in foreign:
             rows = np.flatnonzero(spots[:, Spot.FIRST] == spot[Spot.FIRST])
             rows = rows[(spots[rows][:, alike] == spot[alike]).all(axis=1)]
             stays = self.stay_of[rows]
@@ -272,48 +273,55 @@ def estimate(
     and again; what it raises ends the estimate.
     """
     epoch = np.zeros(sights.slices, np.int64) if epochs is None else np.asarray(epochs, np.int64)
-    seen = _Seen(sights, epoch, min_score)
+    observed = _Observations(sights, epoch, min_score, go_on)
     names = _names(sights, labels)
     epoch_of = epoch[sights.spots[:, Spot.SLICE]]
-    keys = with_synonyms(sights, seen.counts, epoch_of, labels, go_on)
-    groups = _groups(seen, epoch, keys)
-    _find_places(groups, seen, go_on)
+    keys = with_synonyms(sights, observed.counts, epoch_of, labels, go_on)
+    groups = _groups(observed, epoch, keys)
+    _find_places(groups, observed)
     for group in groups:
-        _find_stays(group, seen, go_on)
-    _fold(groups, seen, keys, go_on)
+        _find_stays(group, observed)
+    _remove_false_stays(groups, observed, keys)
     instances: list[Instance] = []
     movers: list[Mover] = []
     evidence: dict[tuple[str, int, int], Evidence] = {}
     for group in groups:
-        linked = _link(group, seen, go_on)
-        _add_poor(group, linked, seen)
-        if not _moves_by_itself(group, linked):
+        linked = _link(group, observed)
+        _add_poorly_localised(group, linked, observed)
+        if not _are_of_mover(group, linked):
             instances += linked
-            if group.evidence is not None:
-                # Most places are of false detections.
-                for place in {stay.place for each in linked for stay in each.stays}:
-                    evidence[group.key, group.epoch, place] = group.evidence.at(place)
-        elif _is_seen(group, seen):
+            evidence |= _evidence_of(group, linked)
+        elif _is_no_false_mover(group, observed):
             movers.append(Mover(group.key, group.epoch, group.rows))
-    for each in instances:
-        rows = np.concatenate([stay.spots for stay in each.stays])
-        each.labels = named(spellings(sights, seen.counts, rows), labels, names)
-    instances.sort(key=lambda each: (each.label, each.stays[0].first, each.stays[0].x))
-    found = Estimate(
+    for instance in instances:
+        rows = np.concatenate([stay.spots for stay in instance.stays])
+        instance.labels = named(spellings(sights, observed.counts, rows), labels, names)
+    instances.sort(key=lambda thing: (thing.label, thing.stays[0].first, thing.stays[0].x))
+    result = Estimate(
         sights=sights.only(Spot, Score, Unplaced).with_scores_from(_lowest_bin(min_score)),
         instances=instances,
         movers=movers,
-        counts=seen.counts,
-        poor=seen.poor,
-        hits=seen.hits,
-        hit_starts=seen.starts,
+        counts=observed.counts,
+        poor=observed.poor,
+        hits=observed.hits,
+        hit_starts=observed.hit_starts,
         names=names,
-        cells=seen.cells,
+        cells=observed.cells,
         evidence=evidence,
     )
-    for each in instances:
-        each.looks, each.missed_by = found.missing(each, each.stays[-1])
-    return found
+    for instance in instances:
+        instance.looks, instance.missed_by = result.missing(instance, instance.stays[-1])
+    return result
+
+
+def _evidence_of(
+    group: _Group, instances: Sequence[Instance]
+) -> dict[tuple[str, int, int], Evidence]:
+    """Returns the evidence for the places of things: most places are of false detections."""
+    if group.evidence is None:
+        return {}
+    places = {stay.place for instance in instances for stay in instance.stays}
+    return {(group.key, group.epoch, place): group.evidence.at(place) for place in places}
 
 
 def spellings(sights: Sights, counts: Ints, rows: Ints) -> Counter[str]:
@@ -324,60 +332,49 @@ def spellings(sights: Sights, counts: Ints, rows: Ints) -> Counter[str]:
     )
 
 
-def named(found: Mapping[str, int], labels: Labels, names: Mapping[str, str]) -> dict[str, int]:
+def named(seen: Mapping[str, int], labels: Labels, names: Mapping[str, str]) -> dict[str, int]:
     """Returns how often each name was seen, the commonest first; `names` has that of each key."""
     counts: Counter[str] = Counter()
-    for spelling, n in found.items():
+    for spelling, n in seen.items():
         counts[names[labels.key(spelling)]] += n
-    return dict(sorted(counts.items(), key=lambda each: (-each[1], each[0])))
+    return {name: counts[name] for name in sorted(counts, key=lambda name: (-counts[name], name))}
 
 
-class _Seen:
+class _Observations:
     """The sights of an estimate, and what is computed once for all labels.
 
     Attributes:
         counts: how many detections of each spot count.
         poor: which spots were seen while localisation was poor: these move nothing.
-        hits: the hits of these, by spot; `starts` is where each spot's begin.
+        hits: the hits of detections that count, by spot; `hit_starts` is where each spot's begin.
+            Without a look where localisation was poor.
         groups: of each spot a number; those of one slice, topic and label have the same.
-        view: by topic the field of view that its detections show.
+        fields_of_view: by topic the one that its detections show.
         side: of each spot, the mean of the unit vectors to it from where it was seen.
+        go_on: as of `estimate`.
     """
 
-    def __init__(self, sights: Sights, epoch: Ints, min_score: float) -> None:
-        self.sights = sights
-        self.counts = sights.spots[:, Spot.N].copy()
-        low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
-        np.subtract.at(self.counts, low[:, Score.SPOT], low[:, Score.N])
-        self.poor, poor = poorly_localised(sights)
-        # The hits of detections that count: in proportion, rounded up.
-        every, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
-        every[:, Hit.N] = -(-every[:, Hit.N] * self.counts[spot] // sights.spots[spot, Spot.N])
-        self.hits, self.starts = _by_spot(every[every[:, Hit.N] > 0], sights)
-        self.hits[np.append(poor, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
-        by = (Spot.SLICE, Spot.TOPIC, Spot.LABEL)
-        self.groups = distinct_rows([sights.spots[:, column] for column in by])[1]
-        self.cells = Cells(sights, epoch, poor)
+    def __init__(
+        self, sights: Sights, epoch: Ints, min_score: float, go_on: Callable[[], None]
+    ) -> None:
+        spots, self.sights, self.go_on = sights.spots, sights, go_on
+        self.counts = _detections_that_count(sights, min_score)
+        self.poor, poor_looks = poorly_localised(sights)
+        self.hits, self.hit_starts = _by_spot(_hits_that_count(sights, self.counts), sights)
+        self.hits[np.append(poor_looks, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
+        self.groups = distinct_rows(
+            [spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL]]
+        )[1]
+        self.cells = Cells(sights, epoch, poor_looks)
         hits = self.hits[self.hits[:, Hit.LOOK] >= 0]
-        away, bearing = self.cells.seen_at(
-            hits[:, Hit.LOOK], *(sights.spots[hits[:, Hit.SPOT]][:, [Spot.X, Spot.Y]].T)
-        )
-        topics = sights.spots[hits[:, Hit.SPOT], Spot.TOPIC]
-        self.view = {
-            topic: field_of_view(away[of], bearing[of], hits[of, Hit.N])
-            for topic in np.unique(topics).tolist()
-            for of in (topics == topic,)
-        }
-        ahead = self.cells.yaw + self.cells.pan
-        heading = np.radians(bearing + ahead[hits[:, Hit.LOOK]])
-        spot, n, size = hits[:, Hit.SPOT], hits[:, Hit.N], len(sights.spots)
-        sums = [np.bincount(spot, n * of(heading), size) for of in (np.cos, np.sin)]
-        self.side: Floats = (
-            np.stack(sums, axis=1) / np.maximum(np.bincount(spot, n, size), 1)[:, None]
-        )
+        spot, look, n = hits[:, Hit.SPOT], hits[:, Hit.LOOK], hits[:, Hit.N]
+        distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
+        self.fields_of_view = _fields_of_view(spots[spot, Spot.TOPIC], distance, bearing, n)
+        heading = bearing + (self.cells.yaw + self.cells.pan)[look]
+        self.side = _mean_directions(spot, np.radians(heading), n, len(spots))
 
     def firm(self, rows: Ints) -> Ints:
-        """Returns the spots that were seen while localisation was good, all if none was."""
+        """Returns the spots that were seen while localisation was good; all if too few were."""
         good: Ints = rows[~self.poor[rows]]
         return good if self.counts[good].sum() >= _FEWEST else rows
 
@@ -387,6 +384,40 @@ class _Seen:
         place = spots[:, [Spot.X, Spot.Y]].astype(np.float64)
         times = spots[:, Spot.FIRST], spots[:, Spot.LAST]
         return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
+
+
+def _detections_that_count(sights: Sights, min_score: float) -> Ints:
+    """Returns how many detections of each spot have no score that is too low."""
+    counts = sights.spots[:, Spot.N].copy()
+    low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
+    np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
+    return counts
+
+
+def _hits_that_count(sights: Sights, counts: Ints) -> Ints:
+    """Returns the hits of detections that count: in proportion, rounded up."""
+    hits, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
+    hits[:, Hit.N] = -(-hits[:, Hit.N] * counts[spot] // sights.spots[spot, Spot.N])
+    counting: Ints = hits[hits[:, Hit.N] > 0]
+    return counting
+
+
+def _fields_of_view(
+    topics: Ints, distance: Floats, bearing: Floats, n: Ints
+) -> dict[int, FieldOfView]:
+    """Returns by topic the field of view of hits (mm, degrees) of `n` messages each."""
+    fields: dict[int, FieldOfView] = {}
+    for topic in np.unique(topics).tolist():
+        rows = topics == topic
+        fields[topic] = field_of_view(distance[rows], bearing[rows], n[rows])
+    return fields
+
+
+def _mean_directions(spot: Ints, heading: Floats, n: Ints, spots: int) -> Floats:
+    """Returns for each of so many spots the mean unit vector of its hits (rad); 0 without any."""
+    sums = [np.bincount(spot, n * part, spots) for part in (np.cos(heading), np.sin(heading))]
+    means: Floats = np.stack(sums, axis=1) / np.maximum(np.bincount(spot, n, spots), 1)[:, None]
+    return means
 
 
 def _by_spot(table: Ints, sights: Sights) -> tuple[Ints, Ints]:
@@ -406,49 +437,50 @@ def _lowest_bin(min_score: float) -> int:
     return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 
-def _groups(seen: _Seen, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
+def _groups(observed: _Observations, epoch: Ints, keys: Sequence[str]) -> list[_Group]:
     """Returns the labels in each epoch that have detections that count."""
-    shown = [*dict.fromkeys(keys)]
-    number = np.array([shown.index(key) for key in keys], np.int64)
-    spots = seen.sights.spots
-    of = epoch[spots[:, Spot.SLICE]] * (len(shown) + 1) + number[spots[:, Spot.LABEL]]
-    of[seen.counts == 0] = -1
+    distinct = [*dict.fromkeys(keys)]
+    key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
+    spots, unplaced = observed.sights.spots, observed.sights.unplaced
+    width = len(distinct) + 1
+    group_of = epoch[spots[:, Spot.SLICE]] * width + key_of_label[spots[:, Spot.LABEL]]
+    group_of[observed.counts == 0] = -1
     groups = []
-    for each in np.unique(of[of >= 0]).tolist():
-        nth, key = divmod(each, len(shown) + 1)
-        unplaced = seen.sights.unplaced
-        unplaced = unplaced[number[unplaced[:, Unplaced.LABEL]] == key]
-        groups.append(_Group(shown[key], nth, np.flatnonzero(of == each), unplaced))
+    for number in np.unique(group_of[group_of >= 0]).tolist():
+        group_epoch, key = divmod(number, width)
+        without_place = unplaced[key_of_label[unplaced[:, Unplaced.LABEL]] == key]
+        rows = np.flatnonzero(group_of == number)
+        groups.append(_Group(distinct[key], group_epoch, rows, without_place))
     return groups
 
 
-def _find_places(groups: Sequence[_Group], seen: _Seen, go_on: Callable[[], None]) -> None:
+def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
     """Finds the places of labels, each with one for every time that it was moved a little."""
-    spots = seen.sights.spots
     single: list[tuple[_Group, Ints]] = []
     for group in groups:
-        if moves_by_itself(group.key):
-            continue
-        go_on()
-        rows = seen.firm(group.rows)
-        place = places_of(
-            spots[rows, Spot.X], spots[rows, Spot.Y], seen.counts[rows], spots[rows, Spot.SLICE]
-        )
-        rows, place = rows[place >= 0], place[place >= 0]
-        several, counts = (
-            _are_several(place, seen.groups[rows]),
-            np.bincount(place, seen.counts[rows]),
-        )
-        order = np.argsort(place, kind="stable")
-        ends = np.cumsum(np.bincount(place))
-        for nth, mine in enumerate(np.split(rows[order], ends[:-1])):
-            if several[nth]:
-                group.places.append(mine)
-            elif counts[nth] >= _FEWEST:
-                single.append((group, mine))
-    steps = stays_in([seen.sightings(rows) for _, rows in single])
+        if not moves_by_itself(group.key):
+            observed.go_on()
+            single += [(group, rows) for rows in _add_shared_places(group, observed)]
+    steps = stays_in([observed.sightings(rows) for _, rows in single])
     for (group, rows), step in zip(single, steps, strict=True):
-        group.places += [rows[step == each] for each in range(int(step.max()) + 1)]
+        group.places += [rows[step == number] for number in range(int(step.max()) + 1)]
+
+
+def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]:
+    """Adds the places of several things that stand together; yields the spots of the others."""
+    rows = observed.firm(group.rows)
+    x, y, slices = observed.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.SLICE]].T
+    place = places_of(x, y, observed.counts[rows], slices)
+    rows, place = rows[place >= 0], place[place >= 0]
+    several = _are_several(place, observed.groups[rows])
+    counts = np.bincount(place, observed.counts[rows])
+    ends = np.cumsum(np.bincount(place))
+    by_place = np.split(rows[np.argsort(place, kind="stable")], ends[:-1])
+    for number, rows_there in enumerate(by_place):
+        if several[number]:
+            group.places.append(rows_there)
+        elif counts[number] >= _FEWEST:
+            yield rows_there
 
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
@@ -459,35 +491,42 @@ def _are_several(place: Ints, groups: Ints) -> Flags:
     return several
 
 
-def _find_stays(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> None:
+def _find_stays(group: _Group, observed: _Observations) -> None:
     """Finds when a label was at its places."""
-    every = seen.sights.spots
     if not group.places:
         return
-    mine = np.concatenate(group.places)
-    of = np.repeat(np.arange(len(group.places)), [len(rows) for rows in group.places])
-    n = seen.counts[mine]
-    sums = [np.bincount(of, n * every[mine, column]) for column in (Spot.X, Spot.Y)]
-    places = np.stack(sums, axis=1) / np.bincount(of, n)[:, None]
-    rows = _rows_of(mine, seen.hits, seen.starts)
-    rows[:, Hit.SPOT] = every[rows[:, Hit.SPOT], Spot.SLICE]
-    of = np.repeat(of, seen.starts[mine + 1] - seen.starts[mine])
-    group.evidence = evidence_at(seen.cells, seen.view, places, rows, of, unplaced=group.unplaced)
-    for place, stay in stays_at(seen.cells, group.evidence):
-        go_on()
-        spots = group.places[place]
-        own = every[spots, Spot.SLICE]
-        inside = spots[(own >= stay.first_slice) & (own <= stay.last_slice)]
-        group.stays.append(_placed(seen, place, stay, inside))
+    spots = observed.sights.spots
+    rows = np.concatenate(group.places)
+    place = np.repeat(np.arange(len(group.places)), [len(place) for place in group.places])
+    n = observed.counts[rows]
+    sums = [np.bincount(place, n * spots[rows, column]) for column in (Spot.X, Spot.Y)]
+    centres = np.stack(sums, axis=1) / np.bincount(place, n)[:, None]
+    hits = _rows_of(rows, observed.hits, observed.hit_starts)
+    hits[:, Hit.SPOT] = spots[hits[:, Hit.SPOT], Spot.SLICE]  # as `evidence_at` takes them
+    place_of_hit = np.repeat(place, observed.hit_starts[rows + 1] - observed.hit_starts[rows])
+    group.evidence = evidence_at(
+        observed.cells,
+        observed.fields_of_view,
+        centres,
+        hits,
+        place_of_hit,
+        unplaced=group.unplaced,
+    )
+    for number, stay in stays_at(observed.cells, group.evidence):
+        observed.go_on()
+        there = group.places[number]
+        slices = spots[there, Spot.SLICE]
+        during = there[(slices >= stay.first_slice) & (slices <= stay.last_slice)]
+        group.stays.append(_placed(observed, number, stay, during))
 
 
-def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
-    spots, n = seen.sights.spots[rows], seen.counts[rows]
+def _placed(observed: _Observations, place: int, stay: Stay, rows: Ints) -> PlacedStay:
+    spots, n = observed.sights.spots[rows], observed.counts[rows]
     total = int(n.sum())
     x, y, z = (n @ spots[:, [Spot.X, Spot.Y, Spot.Z]] / total).tolist()
     squares = spots[:, Spot.DEV] ** 2 + (spots[:, Spot.X] - x) ** 2 + (spots[:, Spot.Y] - y) ** 2
-    firm = spots[:, Spot.SLICE]
-    firm = spots[(firm >= stay.firm_first) & (firm <= stay.firm_last)]
+    slices = spots[:, Spot.SLICE]
+    firm = spots[(slices >= stay.firm_first) & (slices <= stay.firm_last)]
     firm = firm if len(firm) and stay.firm_first >= 0 else spots
     return PlacedStay(
         x=x,
@@ -498,7 +537,7 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
         last=int(spots[:, Spot.LAST].max()),
         firm_first=int(firm[:, Spot.FIRST].min()),
         firm_last=int(firm[:, Spot.LAST].max()),
-        left=None if stay.left is None else seen.cells.looked_in(stay.left),
+        left=None if stay.left is None else observed.cells.looked_in(stay.left),
         count=total,
         spots=rows,
         place=place,
@@ -507,70 +546,80 @@ def _placed(seen: _Seen, place: int, stay: Stay, rows: Ints) -> PlacedStay:
     )
 
 
-def _fold(
-    groups: Sequence[_Group], seen: _Seen, keys: Sequence[str], go_on: Callable[[], None]
+def _remove_false_stays(
+    groups: Sequence[_Group], observed: _Observations, keys: Sequence[str]
 ) -> None:
-    """Removes stays that are other things under a wrong name, noise around one, or too rare."""
-    every = [(group, stay) for group in groups for stay in group.stays]
-    hosts = _Hosts(every, seen, keys)
-    gone: set[int] = set()
-    for nth in sorted(range(len(every)), key=lambda each: every[each][1].count):
-        go_on()
-        group, stay = every[nth]
-        best, most = None, 0
-        for other, hosted in hosts.of(nth):
-            host_group, host = every[other]
-            share = _HALO_SHARE if host_group is group else _SMALL_SHARE
-            few = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
-            few &= not (host_group is group and _is_beside(stay, hosted, seen))
-            if other not in gone and (few or stay.count <= hosted * share) and hosted > most:
-                best, most = other, hosted
-        if best is not None:
-            gone.add(nth)
-            host_group, host = every[best]
-            if host_group is not group:
-                host.also += spellings(seen.sights, seen.counts, stay.spots)
+    """Removes stays that are other things under a wrong name, noise around one, or too rare.
+
+    What a thing was called wrongly is counted in `PlacedStay.also`.
+    """
+    stays = [(group, stay) for group in groups for stay in group.stays]
+    hosts = _Hosts(stays, observed, keys)
+    for number in sorted(range(len(stays)), key=lambda number: stays[number][1].count):
+        observed.go_on()
+        group, stay = stays[number]
+        host_group, host = hosts.take(number) or (None, None)
+        if host is not None and host_group is not group:
+            host.also += spellings(observed.sights, observed.counts, stay.spots)
     for group in groups:
         group.stays = []
-    for nth, (group, stay) in enumerate(every):
-        if nth not in gone and not stay.weak:
+    for number, (group, stay) in enumerate(stays):
+        if number not in hosts.taken and not stay.weak:
             group.stays.append(stay)
 
 
-def _is_beside(stay: PlacedStay, hosted: int, seen: _Seen) -> bool:
+def _is_beside(stay: PlacedStay, hosted: int, observed: _Observations) -> bool:
     """Whether most messages that have one of a label also have this one, which is no noise then."""
-    together = seen.sights.spots[stay.spots, Spot.TOGETHER]
+    together = observed.sights.spots[stay.spots, Spot.TOGETHER]
     return 2 * stay.count > hosted and bool(np.median(together) > 1)
 
 
 class _Hosts:
-    """Finds the stays that one may be a wrong name of, or the noise around."""
+    """Finds the stays that others are a wrong name of, or the noise around.
+
+    Attributes:
+        taken: the numbers of stays that are part of another one.
+    """
 
     def __init__(
-        self, every: Sequence[tuple[_Group, PlacedStay]], seen: _Seen, keys: Sequence[str]
+        self,
+        stays: Sequence[tuple[_Group, PlacedStay]],
+        observed: _Observations,
+        keys: Sequence[str],
     ) -> None:
-        self._every, self._seen, self._keys = every, seen, keys
-        self._beside = _by_spot(seen.sights.beside, seen.sights)
-        columns = [
-            (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in every
+        self.taken: set[int] = set()
+        self._stays, self._observed, self._keys = stays, observed, keys
+        self._beside = _by_spot(observed.sights.beside, observed.sights)
+        rows = [
+            (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in stays
         ]
-        table = np.array(columns, np.float64).reshape(-1, 6)
+        table = np.array(rows, np.float64).reshape(-1, 6)
         self._order = np.argsort(table[:, 0], kind="stable")
         self._columns = table[self._order].T
 
-    def of(self, nth: int) -> Iterator[tuple[int, int]]:
-        """Yields their numbers, in order, and how often each was seen in the slices of the stay."""
-        group, stay = self._every[nth]
-        start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
-        x, y, first, last, epoch, weak = self._columns[:, start:stop]
-        away = np.hypot(x - stay.x, y - stay.y)
-        near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
-        near &= (epoch == group.epoch) & (weak == 0)
+    def take(self, number: int) -> tuple[_Group, PlacedStay] | None:
+        """Returns the host of a stay, which is taken then; None where it is none's part."""
+        group, stay = self._stays[number]
+        best, most = None, 0
+        for host_number, hosted in self._candidates(number):
+            host_group, host = self._stays[host_number]
+            share = _HALO_SHARE if host_group is group else _SMALL_SHARE
+            is_tiny = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
+            is_tiny &= not (host_group is group and _is_beside(stay, hosted, self._observed))
+            is_part = is_tiny or stay.count <= hosted * share
+            if host_number not in self.taken and is_part and hosted > most:
+                best, most = self._stays[host_number], hosted
+        if best is not None:
+            self.taken.add(number)
+        return best
+
+    def _candidates(self, number: int) -> Iterator[tuple[int, int]]:
+        """Yields the numbers of stays near one, in order, and how often each was seen meanwhile."""
+        group, stay = self._stays[number]
         beside: Counter[str] | None = None
-        found = zip(self._order[start:stop][near].tolist(), away[near].tolist(), strict=True)
-        for other, away_mm in sorted(found):
-            host_group, host = self._every[other]
-            if other == nth:
+        for other, away_mm in self._near(group, stay):
+            host_group, host = self._stays[other]
+            if other == number:
                 continue
             if host_group is not group:
                 if away_mm > _SAME_PLACE_MM:
@@ -578,11 +627,20 @@ class _Hosts:
                 beside = self._beside_of(stay) if beside is None else beside
                 if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
                     continue
-            rows = host.spots
-            slices = self._seen.sights.spots[rows, Spot.SLICE]
+            slices = self._observed.sights.spots[host.spots, Spot.SLICE]
             ends = stay.stay.first_slice, stay.stay.last_slice + 1
-            during = slice(*np.searchsorted(slices, ends))
-            yield other, int(self._seen.counts[rows[during]].sum())
+            meanwhile = host.spots[slice(*np.searchsorted(slices, ends))]
+            yield other, int(self._observed.counts[meanwhile].sum())
+
+    def _near(self, group: _Group, stay: PlacedStay) -> list[tuple[int, float]]:
+        """Returns the numbers of stays near one at that time, in order, and how far (mm)."""
+        start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
+        x, y, first, last, epoch, weak = self._columns[:, start:stop]
+        away = np.hypot(x - stay.x, y - stay.y)
+        is_near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
+        is_near &= (epoch == group.epoch) & (weak == 0)
+        numbers = self._order[start:stop][is_near].tolist()
+        return sorted(zip(numbers, away[is_near].tolist(), strict=True))
 
     def _beside_of(self, stay: PlacedStay) -> Counter[str]:
         """Returns how often its detections had other labels beside them, by the key of these."""
@@ -592,103 +650,117 @@ class _Hosts:
         return counts
 
 
-def _link(group: _Group, seen: _Seen, go_on: Callable[[], None]) -> list[Instance]:
+def _link(group: _Group, observed: _Observations) -> list[Instance]:
     """Links stays into as few things as explain them.
 
     A stay goes on where one had ended, that is, where its place was seen without it. Of a label
     that is known to be moved, a place that was not looked at may have been left, too.
     """
     instances = _chained(group, group.stays, proven=True)
-    if any(_is_far(each.stays[0], stay) for each in instances for stay in each.stays):
+    if any(_is_far(thing.stays[0], stay) for thing in instances for stay in thing.stays):
         unproven = _chained(group, group.stays, proven=False)
-        split = _chained(group, _split(group.stays, seen, go_on), proven=False)
-        instances = min(instances, unproven, split, key=len)
-    for each in instances:
-        each.stays = _without_overlap(each.stays, seen)
+        parts = _split_around_others(group.stays, observed)
+        instances = min(instances, unproven, _chained(group, parts, proven=False), key=len)
+    for instance in instances:
+        instance.stays = _without_overlap(instance.stays, observed)
     return instances
 
 
 def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> list[Instance]:
+    """Returns things whose stays go on one after another, at the same place if they can.
+
+    Args:
+        group: has the label.
+        stays: of it.
+        proven: whether a stay goes on only where one is known to have ended.
+    """
     instances: list[Instance] = []
-    for stay in sorted(stays, key=lambda each: each.firm_first):
+    for stay in sorted(stays, key=lambda stay: stay.firm_first):
         ended = [
-            (last.place == stay.place, is_left, last.last, -nth)
-            for nth, each in enumerate(instances)
-            for last in (each.stays[-1],)
-            for is_left in (last.left is not None or _was_moved_a_little(last, stay),)
-            if (is_left or not proven) and last.firm_last <= stay.firm_first
+            instance
+            for instance in instances
+            if instance.stays[-1].firm_last <= stay.firm_first
+            and (not proven or _has_ended(instance.stays[-1], stay))
         ]
         if ended:
-            instances[-max(ended)[-1]].stays.append(stay)
+            best = max(ended, key=lambda instance: _preference(instance.stays[-1], stay))
+            best.stays.append(stay)
         else:
             instances.append(Instance(group.key, group.epoch, [stay]))
     return instances
+
+
+def _preference(last: PlacedStay, stay: PlacedStay) -> tuple[bool, bool, Ns]:
+    return last.place == stay.place, _has_ended(last, stay), last.last
+
+
+def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:
+    """Whether a stay was seen to end, or the next is so near that two would be seen together."""
+    return last.left is not None or (last.last <= stay.first and not _is_far(last, stay))
 
 
 def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
     return math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
 
 
-def _was_moved_a_little(last: PlacedStay, stay: PlacedStay) -> bool:
-    """Whether one stay follows another so near that two things would have been seen together."""
-    return last.last <= stay.first and not _is_far(last, stay)
-
-
-def _split(stays: Sequence[PlacedStay], seen: _Seen, go_on: Callable[[], None]) -> list[PlacedStay]:
+def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -> list[PlacedStay]:
     """Splits stays that have another one of the same label between two sightings."""
-    spots, found = seen.sights.spots, []
+    spots, parts = observed.sights.spots, []
     for stay in stays:
-        go_on()
-        order = stay.spots[np.argsort(spots[stay.spots, Spot.FIRST], kind="stable")]
-        first, last = spots[order, Spot.FIRST], spots[order, Spot.LAST]
+        observed.go_on()
+        rows = stay.spots[np.argsort(spots[stay.spots, Spot.FIRST], kind="stable")]
+        first, last = spots[rows, Spot.FIRST], spots[rows, Spot.LAST]
         cuts = set()
-        for each in stays:
-            inside = stay.firm_first < each.firm_first and each.firm_last < stay.firm_last
-            if each.place != stay.place and inside:
-                before, after = last < each.firm_first, first > each.firm_last
+        for other in stays:
+            is_inside = stay.firm_first < other.firm_first and other.firm_last < stay.firm_last
+            if other.place != stay.place and is_inside:
+                before, after = last < other.firm_first, first > other.firm_last
                 # Nothing of the stay was seen during the other one.
                 if (before | after).all() and before.any() and after.any():
                     cuts.add(int(after.argmax()))
         whole = stay.stay._replace(firm_first=-1, firm_last=-1)
-        parts = np.split(order, sorted(cuts)) if cuts else ()
-        found += [_placed(seen, stay.place, whole, part) for part in parts] or [stay]
-    return found
+        split = np.split(rows, sorted(cuts)) if cuts else ()
+        parts += [_placed(observed, stay.place, whole, part) for part in split] or [stay]
+    return parts
 
 
-def _without_overlap(stays: list[PlacedStay], seen: _Seen) -> list[PlacedStay]:
+def _without_overlap(stays: list[PlacedStay], observed: _Observations) -> list[PlacedStay]:
     """Removes single sightings at places that a thing has left: they are false."""
-    spots, found = seen.sights.spots, []
-    for nth, stay in enumerate(stays):
+    spots, kept = observed.sights.spots, []
+    for number, stay in enumerate(stays):
         rows = stay.spots
-        if nth + 1 < len(stays):
-            rows = rows[spots[rows, Spot.LAST] <= max(stays[nth + 1].firm_first, stay.firm_last)]
-        if nth:
-            rows = rows[spots[rows, Spot.FIRST] >= min(stays[nth - 1].firm_last, stay.firm_first)]
-        if len(rows) == len(stay.spots):
-            found.append(stay)
-        else:
-            trimmed = _placed(seen, stay.place, stay.stay, rows)
+        if number + 1 < len(stays):
+            end = max(stays[number + 1].firm_first, stay.firm_last)
+            rows = rows[spots[rows, Spot.LAST] <= end]
+        if number:
+            begin = min(stays[number - 1].firm_last, stay.firm_first)
+            rows = rows[spots[rows, Spot.FIRST] >= begin]
+        if len(rows) < len(stay.spots):
+            trimmed = _placed(observed, stay.place, stay.stay, rows)
             trimmed.also, trimmed.left = stay.also, stay.left
-            found.append(trimmed)
-    return found
+            kept.append(trimmed)
+        else:
+            kept.append(stay)
+    return kept
 
 
-def _add_poor(group: _Group, instances: Sequence[Instance], seen: _Seen) -> None:
+def _add_poorly_localised(
+    group: _Group, instances: Sequence[Instance], observed: _Observations
+) -> None:
     """Adds what was seen while localisation was poor to the things that it may have been."""
-    for row in np.setdiff1d(group.rows, seen.firm(group.rows)).tolist():
-        spot = seen.sights.spots[row]
-        # Of each thing the last stay that had begun by then.
+    for row in np.setdiff1d(group.rows, observed.firm(group.rows)).tolist():
+        spot = observed.sights.spots[row]
         begun = [
-            stay
-            for each in instances
-            for stay in [stay for stay in each.stays if stay.first <= spot[Spot.LAST]][-1:]
+            [stay for stay in instance.stays if stay.first <= spot[Spot.LAST]]
+            for instance in instances
         ]
-        away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in begun]
+        newest = [stays[-1] for stays in begun if stays]
+        away_mm = [math.hypot(stay.x - spot[Spot.X], stay.y - spot[Spot.Y]) for stay in newest]
         if away_mm and min(away_mm) <= GATE_MM:
-            stay = begun[away_mm.index(min(away_mm))]
+            stay = newest[away_mm.index(min(away_mm))]
             stay.spots = np.sort(np.append(stay.spots, row))
             stay.last = max(stay.last, int(spot[Spot.LAST]))
-            stay.count += int(seen.counts[row])
+            stay.count += int(observed.counts[row])
 
 
 def most_at_once(spots: Ints) -> int:
@@ -697,32 +769,31 @@ def most_at_once(spots: Ints) -> int:
     `spots` are its rows of `Sights.spots`, at least one: of those in a region, no more than there
     are in a slice.
     """
-    nth = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
-    together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(nth)[nth]))
+    slices = np.unique(spots[:, Spot.SLICE], return_inverse=True)[1]
+    together = np.sort(np.minimum(spots[:, Spot.TOGETHER], np.bincount(slices)[slices]))
     return max(1, int(together[-max(1, len(together) // 100)]))
 
 
-def _moves_by_itself(group: _Group, linked: Sequence[Instance]) -> bool:
+def _are_of_mover(group: _Group, linked: Sequence[Instance]) -> bool:
+    """Whether what a label's stays were linked into moves by itself."""
     moves = len(group.stays) - len(linked)
     is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
     return is_restless or moves_by_itself(group.key)
 
 
-def _is_seen(group: _Group, seen: _Seen) -> bool:
+def _is_no_false_mover(group: _Group, observed: _Observations) -> bool:
     """Whether a mover has more detections than false ones would give."""
-    n = seen.counts[group.rows]
+    n = observed.counts[group.rows]
     return int(n[n >= _FEWEST].sum()) >= _FEWEST_OF_MOVERS
 
 
 def _names(sights: Sights, labels: Labels) -> dict[str, str]:
+    """Returns the name to show of each key, by how often each of its labels was detected."""
+    detections = np.zeros(len(sights.labels), np.int64)
+    np.add.at(detections, sights.spots[:, Spot.LABEL], sights.spots[:, Spot.N])
+    np.add.at(detections, sights.unplaced[:, Unplaced.LABEL], sights.unplaced[:, Unplaced.N])
     counts: dict[str, dict[str, int]] = {}
-    of_label = np.zeros(len(sights.labels), np.int64)
-    for table in (
-        sights.spots[:, [Spot.LABEL, Spot.N]],
-        sights.unplaced[:, [Unplaced.LABEL, Unplaced.N]],
-    ):
-        np.add.at(of_label, table[:, 0], table[:, 1])
-    for name, n in zip(sights.labels, of_label.tolist(), strict=True):
+    for label, n in zip(sights.labels, detections.tolist(), strict=True):
         if n:
-            counts.setdefault(labels.key(name), {})[name] = n
-    return {key: labels.name(key, each) for key, each in counts.items()}
+            counts.setdefault(labels.key(label), {})[label] = n
+    return {key: labels.name(key, by_label) for key, by_label in counts.items()}

@@ -107,7 +107,7 @@ class KnownThings:
             end=int(spots[:, Spot.LAST].max()),
             place=place,
             count=int(self.estimate.counts[rows].sum()),
-            inside=places_at(places, frame, place[0], place[1]),
+            inside=places_at(places, frame, *place[:2]),
         )
 
 
@@ -122,15 +122,15 @@ def known_things(
     latest = view.snapshot.latest
     until = -(-window.stop // SIGHTS_NS) * SIGHTS_NS
     ahead = view.snapshot.dating.ahead_from
-    every = _Loader(view, min_score, spellings, ahead if window.stop <= ahead else MAX_NS)
-    known = every.known() if every.reaches(window.start) else None
+    by_all = _Loader(view, min_score, spellings, ahead if window.stop <= ahead else MAX_NS)
+    known = by_all.known() if by_all.reaches(window.start) else None
     if (known is None or known.crowded or known.since is None) and until <= (latest or until):
         then = _Loader(view, min_score, spellings, MAX_NS, until).known()
         if known is not None and known.reaches_back(window):
             return replace(then, later=known) if then.reaches_back(window) else known
         known = then
     elif known is None:
-        known = every.known()
+        known = by_all.known()
     if known.crowded or known.until < MAX_NS:
         view.notes.complete &= known.reaches_back(window)
         others = "other" if known.until < MAX_NS else "older"
@@ -180,17 +180,18 @@ class _Loader:
         ahead: Ns,
         until: Ns = MAX_NS,
     ) -> None:
-        described = tuple(sorted((name, tuple(some)) for name, some in spellings.items()))
+        described = tuple(sorted((name, tuple(others)) for name, others in spellings.items()))
         key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view
+        self._cache = view.memory.columns.caches.things
         self._min_score = min_score
         self._labels = Labels(spellings)
         self._ahead = ahead
         self._until = until
-        self._own = ("things", until == MAX_NS, *key)
-        self._key = ("most spots", *key)
-        self._since: Ns | None = None
-        self._noted = view.notes.added
+        self._things_key = ("things", until == MAX_NS, *key)
+        self._most_key = ("most spots", *key)
+        self._read_from: Ns | None = None
+        self._notes_before = view.notes.added
 
     def reaches(self, moment: Ns) -> bool:
         """Returns whether there are not too many sightings after a moment to compare them.
@@ -198,13 +199,13 @@ class _Loader:
         Raises:
             QueryTimeoutError: as by `known`.
         """
-        before = self._remembered
-        if before is not None:
-            return isinstance(before, KnownThings) or before <= moment
+        cached = self._cached
+        if cached is not None:
+            return isinstance(cached, KnownThings) or cached <= moment
         parts, crowded = self._gathered
         since = parts[0][0].start if crowded else moment
         if since > moment:
-            self._remember(since)
+            self._put(since)
         return since <= moment
 
     def known(self) -> KnownThings:
@@ -213,148 +214,163 @@ class _Loader:
         Raises:
             QueryTimeoutError: the call's time is over before any bag was read.
         """
-        before = self._remembered
-        if isinstance(before, KnownThings) and before.until == self._until:
-            return before
-        found = self._made()
-        if found.since is None or found.crowded:
-            self._remember(found)
-        return found
+        cached = self._cached
+        if isinstance(cached, KnownThings) and cached.until == self._until:
+            return cached
+        known = self._estimated_in_time()
+        if known.since is None or known.crowded:
+            self._put(known)
+        return known
 
     @property
-    def _remembered(self) -> KnownThings | Ns | None:
+    def _cached(self) -> KnownThings | Ns | None:
         """The things that are known, or since when there are too many sightings."""
-        before = self._view.memory.columns.caches.things.get(self._own)
-        if before is None or before[0] is not self._view.timeline:
+        timeline, known = self._cache.get(self._things_key) or (None, None)
+        if timeline is not self._view.timeline:
             return None
-        return before[1] if isinstance(before[1], KnownThings | int) else None
+        return known if isinstance(known, KnownThings | int) else None
 
-    def _remember(self, found: KnownThings | Ns) -> None:
-        if not self._view.call.used_active and self._view.notes.added == self._noted:
-            size = found.estimate.memory_bytes if isinstance(found, KnownThings) else _KEPT_BYTES
-            kept = self._view.timeline, found
-            self._view.memory.columns.caches.things.put(self._own, kept, size)
+    def _put(self, known: KnownThings | Ns) -> None:
+        """Caches the answer, unless an open bag or a failure had a part in it."""
+        if not self._view.call.used_active and self._view.notes.added == self._notes_before:
+            size = known.estimate.memory_bytes if isinstance(known, KnownThings) else _KEPT_BYTES
+            self._cache.put(self._things_key, (self._view.timeline, known), size)
 
-    def _made(self) -> KnownThings:
+    def _estimated_in_time(self) -> KnownThings:
+        """Returns the things by the newest sightings, of as many as can be compared in time."""
         parts, crowded = self._gathered
         most = self._most_spots
-        if self._since is not None:
+        if self._read_from is not None:
             self._view.notes.complete = False
             self._view.notes.add(
-                f"things are known since {unix_text(self._since)} only: reading older bags takes "
-                f"too long; {self._view.bags.filling_progress()}ask again"
+                f"things are known since {unix_text(self._read_from)} only: reading older bags "
+                f"takes too long; {self._view.bags.filling_progress()}ask again"
             )
         while True:
             begun_s = time.monotonic()
             try:
-                found = self._known(parts, crowded=crowded)
+                known = self._things_in(parts, crowded=crowded)
             except _TakesTooLongError:
                 most = max(sum(map(_spots, parts)) // _FEWER, 1)
-                self._remember_most(most)
-                parts, crowded = _within(parts, most), True
+                self._put_most(most)
+                parts, crowded = _newest_within(parts, most), True
             else:
                 # It may have been the machine that was slow for a while.
                 if most < _MOST_SPOTS and time.monotonic() - begun_s < _ESTIMATING_S / _QUICK:
-                    self._remember_most(min(2 * most, _MOST_SPOTS))
-                return found
+                    self._put_most(min(2 * most, _MOST_SPOTS))
+                return known
 
     @property
     def _most_spots(self) -> int:
-        kept = self._view.memory.columns.caches.things.get(self._key)
-        return kept[1] if kept is not None and isinstance(kept[1], int) else _MOST_SPOTS
+        """How many spots can be compared in time, as far as is known."""
+        _, most = self._cache.get(self._most_key) or (None, None)
+        return most if isinstance(most, int) else _MOST_SPOTS
 
-    def _remember_most(self, most: int) -> None:
-        kept = self._view.timeline, most
-        self._view.memory.columns.caches.things.put(self._key, kept, _KEPT_BYTES)
+    def _put_most(self, most: int) -> None:
+        self._cache.put(self._most_key, (self._view.timeline, most), _KEPT_BYTES)
 
     @cached_property
     def _gathered(self) -> tuple[list[list[Stretch]], bool]:
-        """The newest stretches, in order, and whether they have as many spots as are compared."""
+        """The newest stretches, in order, and whether they have as many spots as are compared.
+
+        Where reading older ones takes too long, `_read_from` is the start of the oldest.
+        """
         most = self._most_spots
         parts: list[list[Stretch]] = []
-        until = self._view.call.partial_after(READING_S)
+        reading = self._view.call.partial_after(READING_S)
         spots = 0
         try:
             for part in Watching(self._view).newest_first(min(self._ahead, self._until)):
                 if spots >= most:
                     return parts[::-1], True
-                if parts and until.expired():
-                    self._since = parts[-1][0].start
+                if parts and reading.expired():
+                    self._read_from = parts[-1][0].start
                     break
                 parts.append(part)
                 spots += _spots(part)
         except QueryTimeoutError:
             if not parts:
                 raise
-            self._since = parts[-1][0].start
+            self._read_from = parts[-1][0].start
         return parts[::-1], False
 
-    def _known(self, parts: Sequence[Sequence[Stretch]], *, crowded: bool) -> KnownThings:
-        """Returns the things in some stretches.
+    def _things_in(self, parts: Sequence[Sequence[Stretch]], *, crowded: bool) -> KnownThings:
+        """Returns the things in some stretches; `crowded` if there are too many before these.
 
         Raises:
             _TakesTooLongError: that takes longer than an answer may, and fewer would do.
         """
         stretches = _of_detectors([stretch for part in parts for stretch in part])
-        epochs, names = self._epochs(stretches)
-        sessions = {one: nth for nth, one in enumerate(dict.fromkeys(s.session for s in stretches))}
-        until = self._view.call.partial_after(_ESTIMATING_S)
+        epochs, frames = self._epochs(stretches)
+        sessions = dict.fromkeys(stretch.session for stretch in stretches)
+        numbers = {session: number for number, session in enumerate(sessions)}
+        estimating = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
-            if self._since is None:  # else the call's time may be over, and this is its answer
+            if self._read_from is None:  # else the call's time may be over, and this is its answer
                 self._view.bags.check_deadline()
-            if len(parts) > 1 and until.expired():
+            if len(parts) > 1 and estimating.expired():
                 raise _TakesTooLongError
 
         self._view.memory.large.acquire()
-        sights, of_slice = joined(
-            [one.packed for stretch in stretches for one in stretch.sights],
-            [epoch for epoch, each in zip(epochs, stretches, strict=True) for _ in each.sights],
-            [sessions[each.session] for each in stretches for _ in each.sights],
+        sights, epoch_of_slice = joined(
+            [topic.packed for stretch in stretches for topic in stretch.sights],
+            [
+                epoch
+                for epoch, stretch in zip(epochs, stretches, strict=True)
+                for _ in stretch.sights
+            ],
+            [numbers[stretch.session] for stretch in stretches for _ in stretch.sights],
         )
-        found = estimate(sights, self._labels, of_slice, self._min_score, go_on)
-        since = self._since
+        things = estimate(sights, self._labels, epoch_of_slice, self._min_score, go_on)
+        since = self._read_from
         if crowded:
             since = max(parts[0][0].start, MIN_NS if since is None else since)
         has_map = bool(sights.topics) and 0 in epochs
-        return KnownThings(found, self._labels, names, since, has_map, crowded, self._until)
+        return KnownThings(
+            things, self._labels, frames, since, has_map, crowded=crowded, until=self._until
+        )
 
     def _epochs(self, stretches: Sequence[Stretch]) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each stretch, and the frame of each epoch.
 
         All that is in the map is of epoch 0. Odometry starts again in each session.
         """
-        in_map = self._view.limits.map_frame
-        known: dict[Hashable, int] = {(in_map, None): 0}
-        names = [in_map or ""]
+        map_frame = self._view.limits.map_frame
+        numbers: dict[Hashable, int] = {(map_frame, None): 0}
+        frames = [map_frame or ""]
         epochs = []
         for stretch in stretches:
-            key = stretch.frame_id, None if stretch.frame_id == in_map else stretch.session
-            if key not in known:
-                known[key] = len(known)
-                names.append(stretch.frame_id)
-            epochs.append(known[key])
-        return epochs, tuple(names)
+            odometry = stretch.frame_id, None if stretch.frame_id == map_frame else stretch.session
+            if odometry not in numbers:
+                numbers[odometry] = len(numbers)
+                frames.append(stretch.frame_id)
+            epochs.append(numbers[odometry])
+        return epochs, tuple(frames)
 
 
 def _of_detectors(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Returns stretches with the sights of topics that have detections in any of them."""
-    every = [one for stretch in stretches for one in stretch.sights]
-    detectors = {topic for one in every if one.detects for topic in one.topics}
-    kept = (
+    every_topic = [of_topic for stretch in stretches for of_topic in stretch.sights]
+    detectors = {topic for of_topic in every_topic if of_topic.detects for topic in of_topic.topics}
+    of_detectors = (
         stretch._replace(
-            sights=tuple(one for one in stretch.sights if detectors.issuperset(one.topics))
+            sights=tuple(
+                of_topic for of_topic in stretch.sights if detectors.issuperset(of_topic.topics)
+            )
         )
         for stretch in stretches
     )
-    return [stretch for stretch in kept if any(one.topics for one in stretch.sights)]
+    return [
+        stretch for stretch in of_detectors if any(of_topic.topics for of_topic in stretch.sights)
+    ]
 
 
 def _spots(part: Sequence[Stretch]) -> int:
     return sum(stretch.spots for stretch in part)
 
 
-def _within(parts: Sequence[list[Stretch]], most: int) -> list[list[Stretch]]:
+def _newest_within(parts: Sequence[list[Stretch]], most: int) -> list[list[Stretch]]:
     """Returns the newest parts that have at most so many spots, at least one."""
-    spots = accumulate(_spots(part) for part in reversed(parts))
-    return [*parts[-max(sum(count <= most for count in spots), 1) :]]
+    totals = accumulate(_spots(part) for part in reversed(parts))
+    return [*parts[-max(sum(total <= most for total in totals), 1) :]]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections import Counter
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
@@ -89,9 +90,7 @@ def _singular(word: str) -> str:
         return _IRREGULAR[word]
     if len(word) > 4 and word.endswith("ies"):
         return word[:-3] + "y"
-    if word.endswith(_SIBILANTS):
-        return word[:-2]
-    if len(word) > 5 and word.endswith("oes"):
+    if word.endswith(_SIBILANTS) or (len(word) > 5 and word.endswith("oes")):
         return word[:-2]
     if len(word) > 3 and word.endswith("s") and not word.endswith(_NO_PLURALS):
         return word[:-1]
@@ -111,13 +110,13 @@ class Labels:
         for name, variants in (spellings or {}).items():
             key = singular(name)
             self._shown[key] = name
-            for each in (name, *variants):
-                self._keys[singular(each)] = key
+            for spelling in (name, *variants):
+                self._keys[singular(spelling)] = key
 
     def key(self, label: str) -> str:
         """Returns the key of a label."""
-        own = singular(label)
-        return self._keys.get(own, own)
+        plain_key = singular(label)
+        return self._keys.get(plain_key, plain_key)
 
     def are_apart(self, one: str, other: str) -> bool:
         """Whether the owner declared two keys as different things."""
@@ -128,8 +127,8 @@ class Labels:
         declared = self._shown.get(key)
         if declared is not None or not counts:
             return declared or key
-        plains: dict[str, int] = {}
+        by_name = Counter[str]()
         for label, count in counts.items():
-            plains[plain(label)] = plains.get(plain(label), 0) + count
+            by_name[plain(label)] += count
         # A plural is not what one thing is called, unless no detector writes anything else.
-        return min(plains, key=lambda each: (each != key, -plains[each], each))
+        return min(by_name, key=lambda name: (name != key, -by_name[name], name))

@@ -73,14 +73,15 @@ def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     return np.concatenate(([0], np.cumsum(begins)))
 
 
-def stays_in(every: Sequence[Sightings]) -> list[Ints]:
+def stays_in(things: Sequence[Sightings]) -> list[Ints]:
     """Returns for the sightings of each thing the number of the stay of each, from 0."""
-    if not every:
+    if not things:
         return []
-    series = _Series.of(every)
+    series = _Series.of(things)
     begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
-    moves = np.cumsum(_moves(series, _variances(*_differences(series), len(every))))
-    return np.split(moves - moves[begins][series.thing], begins[1:])
+    variance = _visit_variances(*_differences(series), len(things))
+    stays = np.cumsum(_are_moved(series, variance))
+    return np.split(stays - stays[begins][series.thing], begins[1:])
 
 
 class _Series(NamedTuple):
@@ -95,10 +96,10 @@ class _Series(NamedTuple):
     thing: Ints
 
     @classmethod
-    def of(cls, every: Sequence[Sightings]) -> _Series:
-        sizes = np.array([len(seen.n) for seen in every])
-        thing, begins = np.repeat(np.arange(len(every)), sizes), np.cumsum(sizes) - sizes
-        xy, n, dev, side, first, last = map(np.concatenate, zip(*every, strict=True))
+    def of(cls, things: Sequence[Sightings]) -> _Series:
+        sizes = np.array([len(sightings.n) for sightings in things])
+        thing, begins = np.repeat(np.arange(len(things)), sizes), np.cumsum(sizes) - sizes
+        xy, n, dev, side, first, last = map(np.concatenate, zip(*things, strict=True))
         squares = n * dev**2 / 2
         looks = np.add.reduceat(n, begins) - sizes + _USUAL
         usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks
@@ -109,10 +110,9 @@ class _Series(NamedTuple):
 
 
 def _differences(series: _Series) -> tuple[Floats, Ints]:
-    """Returns what visits add to the variance, by each two of a thing that follow each other.
+    """Returns what visits add to the variance (mm²), by each two of a thing in a row; its number.
 
-    Not by the two that differ most: between these it may have been moved. With the thing of each;
-    ascending for each thing.
+    Not by the two that differ most: between these it may have been moved. Ascending for each thing.
     """
     starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
     sums, thing = np.add.reduceat(series.rows, starts), series.thing[starts]
@@ -122,29 +122,31 @@ def _differences(series: _Series) -> tuple[Floats, Ints]:
     fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR[:3]), normal[:, :3, 3:])
     off = means[:, 3:] - np.einsum("vi,vij->vj", means[:, :3], fit[thing])
     by_looks = 1 / sums[:-1, 0] + 1 / sums[1:, 0]
-    found = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
-    alike = thing[1:] == thing[:-1]
-    found, thing = found[alike], thing[1:][alike]
-    order = np.lexsort((found, thing))
-    found, thing = found[order], thing[order]
+    variance = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
+    is_of_one = thing[1:] == thing[:-1]
+    variance, thing = variance[is_of_one], thing[1:][is_of_one]
+    order = np.lexsort((variance, thing))
+    variance, thing = variance[order], thing[order]
     is_greatest = np.diff(thing, append=-1) != 0
-    return found[~is_greatest], thing[~is_greatest]
+    return variance[~is_greatest], thing[~is_greatest]
 
 
-def _variances(differences: Floats, thing: Ints, things: int) -> Floats:
-    """Returns what visits add to the variance of each thing."""
+def _visit_variances(differences: Floats, thing: Ints, things: int) -> Floats:
+    """Returns what visits add to the variance (mm²) of each thing."""
     median = float(np.median(differences)) if len(differences) else 0.0
-    usual = _variance(len(differences), median, _VISIT_MM**2)
+    usual = _shrunk(len(differences), median, _VISIT_MM**2)
     sizes = np.bincount(thing, minlength=things)
     begins = np.cumsum(sizes) - sizes
-    some = np.flatnonzero(sizes)
+    visited = np.flatnonzero(sizes)
     medians = np.zeros(things)
-    low, high = begins[some] + (sizes[some] - 1) // 2, begins[some] + sizes[some] // 2
-    medians[some] = (differences[low] + differences[high]) / 2
-    return _variance(sizes, medians, usual)
+    low = begins[visited] + (sizes[visited] - 1) // 2
+    high = begins[visited] + sizes[visited] // 2
+    medians[visited] = (differences[low] + differences[high]) / 2
+    return _shrunk(sizes, medians, usual)
 
 
-def _variance(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:
+def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:
+    """Returns the median of `n` variances, drawn to what is usual the more the fewer they are."""
     return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
 
 
@@ -163,24 +165,25 @@ def _squares(sums: Floats, visit: Floats | float) -> Floats:
     return squares
 
 
-def _moves(series: _Series, variance: Floats) -> Flags:
+def _are_moved(series: _Series, variance: Floats) -> Flags:
     """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
     moved = np.zeros(len(series.n), np.bool_)
     begins = np.flatnonzero(np.diff(series.thing, prepend=-1)).tolist()
     waiting = [*pairwise([*begins, len(moved)])]
     while waiting:
-        parts, rows = [], 0
-        while waiting and rows < _AT_ONCE:
-            parts.append(waiting.pop())
-            rows += parts[-1][1] - parts[-1][0]
-        of = np.concatenate([np.arange(*part) for part in parts])
-        part = np.repeat(np.arange(len(parts)), [stop - start for start, stop in parts])
-        some = _Series(series.rows[of], series.n[of], series.visit[of], part)
-        for nth, step in _steps(some, variance[series.thing[of]]):
-            start, stop = parts[nth]
-            at = int(of[step])
-            moved[at] = True
-            waiting += [(start, at), (at, stop)]
+        spans, size = [], 0
+        while waiting and size < _AT_ONCE:
+            start, stop = waiting.pop()
+            spans.append((start, stop))
+            size += stop - start
+        rows = np.concatenate([np.arange(*span) for span in spans])
+        number = np.repeat(np.arange(len(spans)), [stop - start for start, stop in spans])
+        batch = _Series(series.rows[rows], series.n[rows], series.visit[rows], number)
+        for span, row in _steps(batch, variance[series.thing[rows]]):
+            start, stop = spans[span]
+            step = int(rows[row])
+            moved[step] = True
+            waiting += [(start, step), (step, stop)]
     return moved
 
 
@@ -191,27 +194,36 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
     """
     begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
     looks = np.cumsum(series.n)
-    before, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
-    old_looks = looks - before[series.thing]
+    of_others, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
+    old_looks = looks - of_others[series.thing]
     new_looks = total[series.thing] - old_looks
     at = np.flatnonzero((old_looks >= _FEWEST) & (new_looks >= _FEWEST)) + 1
     if not len(at):
         return
     old, new = _before_and_after(series, begins, at, variance)
-    normal = np.zeros((len(at), 4, 4))
-    normal[:, :3, :3] = (old + new)[:, :3, :3]
-    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
-    normal[:, 3, 3] = new[:, 0, 0]
-    right = np.concatenate(((old + new)[:, :3, 3:], new[:, :1, 3:]), axis=1)
-    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
-    moved = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
-    likely = np.where(moved >= LEAST_MM**2, moved / inverse[:, 3, 3], 0.0)
+    likely = _likelihoods(old, new)
     # Of each thing the likeliest, of equal ones the first.
     order = np.lexsort((at, -likely, series.thing[at]))
     things, first = np.unique(series.thing[at[order]], return_index=True)
     best = order[first]
     is_sure = likely[best] > _SIGMAS**2
     yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
+
+
+def _likelihoods(old: Floats, new: Floats) -> Floats:
+    """Returns for each step, by the squares before and after it, how many standard errors it is.
+
+    Squared; 0 of one that is too short to be any.
+    """
+    both = old + new
+    normal = np.zeros((len(both), 4, 4))
+    normal[:, :3, :3] = both[:, :3, :3]
+    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
+    normal[:, 3, 3] = new[:, 0, 0]
+    right = np.concatenate((both[:, :3, 3:], new[:, :1, 3:]), axis=1)
+    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
+    length_squared = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
+    return np.where(length_squared >= LEAST_MM**2, length_squared / inverse[:, 3, 3], 0.0)
 
 
 def _before_and_after(
@@ -230,7 +242,7 @@ def _before_and_after(
     until = np.concatenate((np.zeros((1, 5, 5)), np.cumsum(squares, axis=0)))
     first = np.searchsorted(starts, begins)
     stop = np.append(first[1:], len(starts))
-    of, thing, variance = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
-    old = until[of] - until[first[thing]] + _squares(sums[at] - sums[ends[of]], variance)
-    new = until[stop[thing]] - until[of + 1] + _squares(sums[ends[of + 1]] - sums[at], variance)
+    visit, thing, own = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
+    old = until[visit] - until[first[thing]] + _squares(sums[at] - sums[ends[visit]], own)
+    new = until[stop[thing]] - until[visit + 1] + _squares(sums[ends[visit + 1]] - sums[at], own)
     return old, new

@@ -7,6 +7,7 @@ far detections overlaps.
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -43,14 +44,14 @@ def places_of(x: Ints, y: Ints, n: Ints, slices: Ints) -> Ints:
     weight = np.minimum(n, _FULL_WEIGHT).astype(np.float64)
     cells, cell_of = distinct_rows((x // _CELL_MM, y // _CELL_MM))
     mass = np.bincount(cell_of, weight).astype(np.float64)
-    centre = np.stack([np.bincount(cell_of, weight * each) / mass for each in (x, y)], axis=1)
+    centre = np.stack([np.bincount(cell_of, weight * axis) / mass for axis in (x, y)], axis=1)
     order = np.argsort(-_density(cells, mass), kind="stable")
     spots = _Spots(np.argsort(order, kind="stable")[cell_of], weight, slices)
     peaks = _peaks(centre[order], mass[order], spots)
     if not len(peaks):
         return np.full(len(x), -1, np.int64)
-    place, away = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
-    place[away > GATE_MM**2] = -1
+    place, away_squared = _nearest(np.stack((x, y), axis=1).astype(np.float64), peaks)
+    place[away_squared > GATE_MM**2] = -1
     return place
 
 
@@ -61,12 +62,12 @@ class _Spots(NamedTuple):
     weight: Floats
     slice: Ints
 
-    def share(self, one: Flags, other: Flags) -> float:
+    def share(self, cells: Flags, others: Flags) -> float:
         """Returns the weight of some cells by that of others, while most of it is seen."""
-        mine = one[self.cell]
-        first, last = np.percentile(self.slice[mine], _MIDDLE)
+        is_inside = cells[self.cell]
+        first, last = np.percentile(self.slice[is_inside], _MIDDLE)
         weight = self.weight * ((self.slice >= first) & (self.slice <= last))
-        return float(weight[mine].sum() / max(weight[other[self.cell]].sum(), 1.0))
+        return float(weight[is_inside].sum() / max(weight[others[self.cell]].sum(), 1.0))
 
 
 def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
@@ -74,48 +75,52 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
 
     `centre` and `mass` are of cells, the densest first.
     """
-    free = np.ones(len(mass), bool)
+    is_free = np.ones(len(mass), bool)
     peaks, masses = np.empty((_MAX_PLACES, 2)), np.empty(_MAX_PLACES)
     count = 0
-    for at in range(len(mass)):
-        if not free[at]:
+    for cell in range(len(mass)):
+        if not is_free[cell]:
             continue
-        middle, left, rest = centre[at], free[at:], centre[at:]
-        for _ in range(3):
-            near = at + np.flatnonzero(left & (_away_squared(rest, middle) <= _PEAK_MM**2))
-            if not len(near):
-                break
-            # As `numpy.average`, which takes ten times as long for few rows.
-            before, middle = middle, mass[near] @ centre[near] / mass[near].sum()
-            if (before == middle).all():
-                break
-        claimed = left & (_away_squared(rest, middle) <= _CLAIM_MM**2)
-        claimed[0] = True
-        weight = float(mass[at:][claimed].sum())
-        left[claimed] = False
-        mine = np.append(np.zeros(at, bool), claimed)
-        heavy = peaks[:count][_with_noise_at(middle, weight, peaks[:count], masses[:count])]
-        if not len(heavy) or (
+        # The cells before it are claimed.
+        peak = _settled(centre[cell:], mass[cell:], is_free[cell:])
+        is_claimed = is_free & (_away_squared(centre, peak) <= _CLAIM_MM**2)
+        is_claimed[cell] = True
+        weight = float(mass[is_claimed].sum())
+        is_free[is_claimed] = False
+        heavy = peaks[:count][_with_noise_at(peak, weight, peaks[:count], masses[:count])]
+        if all(
             weight >= _FEW
-            and all(
-                spots.share(mine, _away_squared(centre, peak) <= _CLAIM_MM**2) > _OWN_SHARE
-                for peak in heavy
-            )
+            and spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
+            for other in heavy
         ):
-            peaks[count], masses[count] = middle, weight
+            peaks[count], masses[count] = peak, weight
             count += 1
         if count == _MAX_PLACES:
             break
     return peaks[:count]
 
 
-def _with_noise_at(middle: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
+def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
+    """Returns where the peak is that the first of some cells lies at: the mean of those near it."""
+    peak: Floats = centre[0]
+    for _ in range(3):
+        near = np.flatnonzero(is_free & (_away_squared(centre, peak) <= _PEAK_MM**2))
+        if not len(near):
+            break
+        # As `numpy.average`, which takes ten times as long for few rows.
+        before, peak = peak, mass[near] @ centre[near] / mass[near].sum()
+        if (before == peak).all():
+            break
+    return peak
+
+
+def _with_noise_at(peak: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
     """Returns which peaks are so heavy that one this light may be their noise."""
-    away = _away_squared(peaks, middle)
-    noise = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
-    scattered = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    found: Flags = noise | scattered
-    return found
+    away = _away_squared(peaks, peak)
+    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
+    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
+    may_be_noise: Flags = is_halo | is_scatter
+    return may_be_noise
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:
@@ -127,13 +132,12 @@ def _density(cells: Ints, mass: Floats) -> Floats:
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     density = np.zeros(len(cells))
-    for da in range(-reach, reach + 1):
-        for db in range(-reach, reach + 1):
-            if da * da + db * db <= reach * reach:
-                near = keys + da * width + db
-                at = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
-                # Whole numbers, whose sums do not depend on their order.
-                density += np.where(ordered[at] == near, mass[order[at]], 0.0)
+    for dx, dy in product(range(-reach, reach + 1), repeat=2):
+        if dx * dx + dy * dy <= reach * reach:
+            near = keys + dx * width + dy
+            row = np.minimum(np.searchsorted(ordered, near), len(ordered) - 1)
+            # Whole numbers, whose sums do not depend on their order.
+            density += np.where(ordered[row] == near, mass[order[row]], 0.0)
     return density
 
 
@@ -147,9 +151,9 @@ def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
     """Returns the nearest peak of each point, and its squared distance (mm²)."""
     nearest = np.zeros(len(points), np.int64)
     least = np.full(len(points), np.inf)
-    for nth, peak in enumerate(peaks):
+    for number, peak in enumerate(peaks):
         away = _away_squared(points, peak)
-        closer = away < least
-        nearest[closer] = nth
-        least[closer] = away[closer]
+        is_closer = away < least
+        nearest[is_closer] = number
+        least[is_closer] = away[is_closer]
     return nearest, least

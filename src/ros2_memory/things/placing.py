@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -91,57 +91,66 @@ class Placer:
         self.rows = DetectionRows(view)
 
     def placed(
-        self, window: TimeWindow, own: Session, among: Session, found: Sequence[tuple[str, Rows]]
+        self,
+        window: TimeWindow,
+        session: Session,
+        lender: Session,
+        units: Iterable[Rows],
     ) -> SessionSights | None:
         """Returns the sights of some rows of a session; None where there are no messages.
 
         Args:
             window: the rows are of this time.
-            own: the session.
-            among: the one whose transforms hold for it; empty where none do.
-            found: rows with their topics.
+            session: the rows are of it.
+            lender: the one whose transforms hold for it; empty where none do.
+            units: the rows, of some topics.
 
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        by_topic: dict[str, list[Rows]] = defaultdict(list)
-        # However they are stored.
-        order = sorted(
-            found, key=lambda each: (each[1].first, each[1].last, str(each[1].recording))
-        )
-        for topic, rows in order:
-            by_topic[topic].append(rows)
-        detected: dict[str, Detected] = {}
-        detectors: set[str] = set()
-        for topic, some in by_topic.items():
-            all_of = joined_detected([self.rows.of(rows) for rows in some])
-            named = any(is_named_for_detections(rows.table.channel.type) for rows in some)
-            if all_of.log_times.size:
-                detected[topic] = all_of
-                detectors |= {topic} if named or all_of.found.rows.size else set()
+        detected, detectors = self._detected(units)
         if not detected:
             return None
-        poses = self._poses(own, window)
-        target, frames = self._frames(among, window, poses)
-        sights = [sights_of(topic, _seen(each, poses, frames)) for topic, each in detected.items()]
+        poses = self._poses(session, window)
+        target, frames = self._frames(lender, window, poses)
+        sights = [
+            sights_of(topic, _in_target(messages, poses, frames))
+            for topic, messages in detected.items()
+        ]
         if target == self._view.limits.map_frame and len(poses):
-            times = np.concatenate([each.log_times for each in detected.values()])
-            fixes = self._fixes(own, poses.frames.words[0], frames, times)
+            times = np.concatenate([messages.log_times for messages in detected.values()])
+            fixes = self._fixes(session, poses.frames.words[0], frames, times)
             sights.append(replace(sights[0].only().with_fixes(fixes), topics=(), labels=()))
         return SessionSights(target, tuple(sights), frozenset(detectors))
 
-    def _poses(self, own: Session, window: TimeWindow) -> Poses:
+    def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
+        """Returns the messages by topic, and which topics are surely of detectors."""
+        by_topic: dict[str, list[Rows]] = defaultdict(list)
+        # However they are stored.
+        for rows in sorted(units, key=lambda rows: (rows.first, rows.last, str(rows.recording))):
+            by_topic[rows.table.channel.topic].append(rows)
+        detected: dict[str, Detected] = {}
+        detectors: set[str] = set()
+        for topic, of_topic in by_topic.items():
+            messages = joined_detected([self.rows.of(rows) for rows in of_topic])
+            is_named = any(is_named_for_detections(rows.table.channel.type) for rows in of_topic)
+            if messages.log_times.size:
+                detected[topic] = messages
+                detectors |= {topic} if is_named or messages.found.rows.size else set()
+        return detected, detectors
+
+    def _poses(self, session: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
         failures: list[UndecodableError] = []
-        found = pose_rows(
+        units = pose_rows(
             self._view,
             self._view.pose_topic,
             window.widened(2 * _NEAR_NS),
             failures,
-            among=lambda recording: self._sessions.of(recording) == own,
+            among=lambda recording: self._sessions.of(recording) == session,
         )
         try:
-            poses = joined_poses([each.poses for each in found])
+            poses = joined_poses([unit.poses for unit in units])
         except InvalidArgumentsError:  # the topic is of no poses
             return NO_POSES
         if not len(poses):
@@ -149,62 +158,64 @@ class Placer:
         # Poses of one topic nearly always have one frame: those of others are left out.
         frame = int(np.bincount(poses.frames.codes).argmax())
         is_place = (np.abs(poses.positions) < FARTHEST_M).all(axis=1)
-        is_one = (poses.frames.codes == frame) & is_place
-        poses = poses.rows(np.flatnonzero(is_one))
-        words = poses.frames.words[frame : frame + 1]
-        return replace(
-            poses, frames=poses.frames._replace(codes=poses.frames.codes * 0, words=words)
-        )
+        poses = poses.rows(np.flatnonzero((poses.frames.codes == frame) & is_place))
+        codes, words = poses.frames.codes * 0, poses.frames.words[frame : frame + 1]
+        return replace(poses, frames=poses.frames._replace(codes=codes, words=words))
 
-    def _frames(self, among: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
+    def _frames(self, lender: Session, window: TimeWindow, poses: Poses) -> tuple[str, FrameTree]:
         """Returns the frame to place all in (the map if transforms lead there), and the frames."""
-        own = poses.frames.words[0] if len(poses) else ""
-        target = self._view.limits.map_frame or own
-        if not among:
-            target = own if len(poses) else target
+        pose_frame = poses.frames.words[0] if len(poses) else ""
+        target = self._view.limits.map_frame or pose_frame
+        if not lender:
+            target = pose_frame if len(poses) else target
             return target, FrameTree((), {}, target)
-        frames = frames_over(self._view, among, window, target)
-        if not len(poses) or (own and (own == target or frames.reaches(own))):
+        frames = frames_over(self._view, lender, window, target)
+        is_map_reached = pose_frame and (pose_frame == target or frames.reaches(pose_frame))
+        if not len(poses) or is_map_reached:
             return target, frames
-        return own, frames_over(self._view, among, window, own)
+        return pose_frame, frames_over(self._view, lender, window, pose_frame)
 
-    def _fixes(self, own: Session, frame: str, frames: FrameTree, seen: Ints) -> Ints:
+    def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Ints:
         """Returns where odometry was in the map around detections, where that changes."""
-        first, last = int(seen.min()), int(seen.max()) + _AHEAD_NS
+        first, last = int(detected.min()), int(detected.max()) + _AHEAD_NS
         step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS
         most = MAX_NS // step
         begin, end = max(first // step - 1, -most), min(last // step + 2, most)
         times = np.arange(begin, end) * step
-        around = TimeWindow(int(seen.min()), int(seen.max())).widened(AROUND_NS)
-        said, sigma = self._localised(own, around)
-        found = frames.poses(frame, times) if frame != frames.target else None
+        around = TimeWindow(first, int(detected.max())).widened(AROUND_NS)
+        said_at, said = self._localised(session, around)
+        poses = frames.poses(odometry, times) if odometry != frames.target else None
         pose = np.zeros((len(times), 3))
-        if found is not None:
-            x, y, _ = found.translation
-            pose = np.stack((x, y, _yaw(found.rotation)), axis=1)[found.valid]
-            times = times[found.valid]
+        if poses is not None:
+            x, y, _ = poses.translation
+            pose = np.stack((x, y, _yaw(poses.rotation)), axis=1)[poses.valid]
+            times = times[poses.valid]
         elif not len(said):
-            return fixes_of(times[:0], pose[:0], sigma[:0])
-        known = np.append(sigma, [math.nan])[np.searchsorted(said, times, side="right") - 1]
-        changed = np.abs(np.diff(pose, axis=0)).max(axis=1, initial=0.0) > _SAME_M
-        changed |= np.abs(np.diff(np.nan_to_num(known, nan=-1.0))) > _SAME_M
+            return fixes_of(times[:0], pose[:0], said)
+        sigma = np.append(said, [math.nan])[np.searchsorted(said_at, times, side="right") - 1]
+        is_changed = np.abs(np.diff(pose, axis=0)).max(axis=1, initial=0.0) > _SAME_M
+        is_changed |= np.abs(np.diff(np.nan_to_num(sigma, nan=-1.0))) > _SAME_M
         # One in each slice of the clock besides, however little changes.
-        kept = times // SLICE_NS != (times - step) // SLICE_NS
-        kept[1:] |= changed
-        kept[:-1] |= changed
-        kept &= (times >= first - step) & (times <= last)
-        return fixes_of(times[kept], pose[kept], known[kept])
+        is_kept = times // SLICE_NS != (times - step) // SLICE_NS
+        is_kept[1:] |= is_changed
+        is_kept[:-1] |= is_changed
+        is_kept &= (times >= first - step) & (times <= last)
+        return fixes_of(times[is_kept], pose[is_kept], sigma[is_kept])
 
-    def _localised(self, own: Session, window: TimeWindow) -> tuple[Ints, Floats]:
+    def _localised(self, session: Session, window: TimeWindow) -> tuple[Ints, Floats]:
         """Returns what the localiser said: when, and its standard deviation (m)."""
         timeline = self._view.timeline
-        topics = [topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)]
-        found = sorted(each for topic in topics for each in self._deviations(topic, own, window))
-        times = np.array([time for time, _ in found], np.int64)
-        return times, np.array([sigma for _, sigma in found], np.float64)
+        said = sorted(
+            deviation
+            for topic in timeline.topics()
+            if LOCALISER in timeline.types_of(topic)
+            for deviation in self._deviations(topic, session, window)
+        )
+        times = np.array([time for time, _ in said], np.int64)
+        return times, np.array([sigma for _, sigma in said], np.float64)
 
     def _deviations(
-        self, topic: str, own: Session, window: TimeWindow
+        self, topic: str, session: Session, window: TimeWindow
     ) -> Iterator[tuple[Ns, float]]:
         """Yields a localiser's standard deviation (m) with its log time, once in `_SAID_NS`.
 
@@ -212,18 +223,18 @@ class Placer:
         """
         memory = self._view.memory
         for rows in scan(self._view, topic, window):
-            if self._sessions.of(rows.recording) != own:
+            if self._sessions.of(rows.recording) != session:
                 continue
             slices = rows.times // _SAID_NS
             firsts = np.flatnonzero(np.diff(slices, prepend=slices[:1] - 1))
-            for found in messages_of(self._view, rows.some(firsts)):
-                message = self._view.bags.decode(found)
+            for stored in messages_of(self._view, rows.some(firsts)):
+                message = self._view.bags.decode(stored)
                 if message is None:
                     continue
                 frame = memory.extractor.frame(message).lstrip("/")
                 sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))
                 if sigma is not None and frame == memory.limits.map_frame:
-                    yield found.time, sigma
+                    yield stored.time, sigma
 
 
 def is_named_for_detections(type_name: str) -> bool:
@@ -232,23 +243,35 @@ def is_named_for_detections(type_name: str) -> bool:
     return any(word in name for word in _OF_DETECTORS)
 
 
-def _seen(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
+def _in_target(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
     """Returns messages with the robot's poses and the detections placed in the target frame."""
-    found = detected.found
-    places = np.full(found.places.shape, math.nan)
-    has_place = ~np.isnan(found.places).any(axis=1)
-    for code, frame in enumerate(found.frames.words):
-        some = np.flatnonzero(has_place & (found.frames.codes == code))
-        known = (
-            frames.poses(frame, detected.times[found.rows[some]]) if frame and len(some) else None
-        )
-        if known is not None:
-            x, y, z = found.places[some].T
-            placed = np.stack(known.points((x, y, z)), axis=1)
-            places[some] = np.where(known.valid[:, None], placed, math.nan)
-    robot = _robot_at(poses, detected, frames)
-    labels = found.labels.codes.astype(np.int64), found.labels.words
-    return DetectorMessages(detected.log_times, robot, found.rows, *labels, places, found.scores)
+    detections = detected.found
+    return DetectorMessages(
+        times=detected.log_times,
+        robot=_robot_at(poses, detected, frames),
+        rows=detections.rows,
+        labels=detections.labels.codes.astype(np.int64),
+        names=detections.labels.words,
+        places=_places_in_target(detected, frames),
+        scores=detections.scores,
+    )
+
+
+def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:
+    """Returns the places (N x 3, m) of detections in the target; NaN where no transform leads."""
+    detections = detected.found
+    places = np.full(detections.places.shape, math.nan)
+    has_place = ~np.isnan(detections.places).any(axis=1)
+    for code, frame in enumerate(detections.frames.words):
+        rows = np.flatnonzero(has_place & (detections.frames.codes == code))
+        if not frame or not len(rows):
+            continue
+        poses = frames.poses(frame, detected.times[detections.rows[rows]])
+        if poses is not None:
+            x, y, z = detections.places[rows].T
+            placed = np.stack(poses.points((x, y, z)), axis=1)
+            places[rows] = np.where(poses.valid[:, None], placed, math.nan)
+    return places
 
 
 def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
@@ -260,24 +283,26 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
     robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
-    codes, words = detected.frames.codes, detected.frames.words
-    seen_in = detected.found.frames
-    usual = seen_in.words[np.bincount(seen_in.codes).argmax()] if len(seen_in) else ""
-    for code, name in enumerate(words):
-        carriers = frames.carriers(name or usual, pose_frame)
-        rows = np.flatnonzero(codes == code)
+    of_detections = detected.found.frames
+    usual = ""
+    if len(of_detections):
+        usual = of_detections.words[np.bincount(of_detections.codes).argmax()]
+    for code, frame in enumerate(detected.frames.words):
+        carriers = frames.carriers(frame or usual, pose_frame)
         if carriers is None:
             continue
-        turned, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
-        if turned is None or body is None:
+        rows = np.flatnonzero(detected.frames.codes == code)
+        head, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
+        if head is None or body is None:
             continue
         x, y, _ = body.translation
         yaw = _yaw(body.rotation)
         posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
         robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
-        if carriers[0] != carriers[1]:
-            is_known = turned.valid & body.valid
-            robot[rows, 3] = np.where(is_known, _yaw(turned.rotation) - yaw, math.nan)
+        head_frame, body_frame = carriers
+        if head_frame != body_frame:
+            is_known = head.valid & body.valid
+            robot[rows, 3] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
     return robot
 
 
@@ -297,8 +322,8 @@ def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     ratio = np.clip((times - start) / np.maximum(stop - start, 1), 0.0, 1.0)
     is_known = np.minimum(np.abs(times - start), np.abs(stop - times)) <= _NEAR_NS
     is_known &= (stop - start <= 2 * _NEAR_NS) & placed.valid
-    a, b = poses.positions[before], poses.positions[after]
-    x, y, z = (a + (b - a) * ratio[:, None]).T
+    begin, end = poses.positions[before], poses.positions[after]
+    x, y, z = (begin + (end - begin) * ratio[:, None]).T
     heading = headings(poses.turns)
     turn = np.remainder(heading[after] - heading[before] + np.pi, 2 * np.pi) - np.pi
     half = (heading[before] + turn * ratio) / 2
@@ -317,6 +342,6 @@ def _sigma_ahead(covariance: object) -> float | None:
     """Returns the standard deviation (m) of a point `AHEAD_MM` before a pose; None if unknown."""
     if not isinstance(covariance, Sequence | np.ndarray) or len(covariance) != _COVARIANCE:
         return None
-    x, y, yaw = (float(covariance[nth]) for nth in (0, 7, 35))
+    x, y, yaw = (float(covariance[index]) for index in (0, 7, 35))
     variance = max(x, y) + yaw * (AHEAD_MM / 1000) ** 2
     return math.sqrt(variance) if variance >= 0 and math.isfinite(variance) else None

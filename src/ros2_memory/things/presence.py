@@ -83,8 +83,8 @@ class Cells:
         looks = sights.looks
         # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.slice, self.n, self.first, self.last, self.topic = (
-            np.ascontiguousarray(looks[:, each])
-            for each in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
+            np.ascontiguousarray(looks[:, column])
+            for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
@@ -105,12 +105,10 @@ class Cells:
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
         after, before = order[1:], order[:-1]
-        goes_on = self.cell[after] == self.cell[before]
-        goes_on &= self.slice[after] - self.slice[before] <= 1
-        self._goes_on = np.zeros(len(order), bool)
-        self._goes_on[after] = goes_on
-        self._before = np.zeros(len(order), np.int64)
-        self._before[after] = before
+        is_next = self.cell[after] == self.cell[before]
+        is_next &= self.slice[after] - self.slice[before] <= 1
+        self._previous = np.full(len(order), -1, np.int64)
+        self._previous[after] = np.where(is_next, before, -1)
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -120,11 +118,11 @@ class Cells:
 
     def looks_during(self, slices: Ints) -> Ints:
         """Returns all looks of some slices of places, by slice."""
-        first, last = (
+        start, stop = (
             np.searchsorted(self.slice, _number(slices), side) for side in ("left", "right")
         )
-        looks = in_ranges(first, last - first)
-        return _keys(np.repeat(_place(slices), last - first), looks)
+        looks = in_ranges(start, stop - start)
+        return _keys(np.repeat(_place(slices), stop - start), looks)
 
     def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
         """Returns how many detections without a place the slice and topic of each look have."""
@@ -133,15 +131,15 @@ class Cells:
             unplaced[:, Unplaced.SLICE] * topics + unplaced[:, Unplaced.TOPIC],
             unplaced[:, Unplaced.N],
         )
-        own = self.slice[looks] * topics + self.topic[looks]
-        at = np.searchsorted(keys, own)
-        found: Ints = np.where(_are_in(keys, own), np.append(n, 0)[at], 0)
-        return found
+        look_keys = self.slice[looks] * topics + self.topic[looks]
+        rows = np.searchsorted(keys, look_keys)
+        totals: Ints = np.where(_are_in(keys, look_keys), np.append(n, 0)[rows], 0)
+        return totals
 
     def looked_in(self, number: int) -> Ns | None:
         """Returns when the first look of a slice ended; None without any."""
-        first, last = np.searchsorted(self.slice, (number, number + 1))
-        return int(self.last[first:last].min()) if first < last else None
+        start, stop = np.searchsorted(self.slice, (number, number + 1))
+        return int(self.last[start:stop].min()) if start < stop else None
 
     def cells_of(self, looks: Ints) -> Ints:
         """Returns the cells of looks of places."""
@@ -152,11 +150,12 @@ class Cells:
 
         The one before, from the same cell, is no older than the slice before.
         """
-        again: Flags = (hits == 0) & self._goes_on[_number(looks)]
-        rows = np.flatnonzero(again)
-        before = _keys(_place(looks[rows]), self._before[_number(looks[rows])])
-        again[rows] = ~_are_in(looks[hits > 0], before)
-        return again
+        previous = self._previous[_number(looks)]
+        is_repeated: Flags = (hits == 0) & (previous >= 0)
+        rows = np.flatnonzero(is_repeated)
+        before = _keys(_place(looks[rows]), previous[rows])
+        is_repeated[rows] = ~_are_in(looks[hits > 0], before)
+        return is_repeated
 
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
@@ -173,16 +172,22 @@ class FieldOfView(NamedTuple):
     least_deg: float
     most_deg: float
 
+    def contains(self, distance: Floats, bearing: Floats) -> Flags:
+        """Returns which distances (mm) and directions (degrees) lie in it."""
+        is_ahead = (bearing >= self.least_deg) & (bearing <= self.most_deg)
+        inside: Flags = is_ahead & (distance <= self.most_mm)
+        return inside
 
-def field_of_view(away: Floats, bearing: Floats, n: Ints) -> FieldOfView:
-    """Returns the field of view in which all but a few of the detections lie."""
-    [far] = _weighted_quantiles(away, n, 1 - _VIEW_SHARE)
+
+def field_of_view(distance: Floats, bearing: Floats, n: Ints) -> FieldOfView:
+    """Returns the field of view in which nearly all detections lie: `n` at each (mm, degrees)."""
+    [far] = _weighted_quantiles(distance, n, 1 - _VIEW_SHARE)
     low, high = _weighted_quantiles(bearing, n, _VIEW_SHARE, 1 - _VIEW_SHARE)
     return FieldOfView(far, low, high)
 
 
 def in_ranges(starts: Ints, sizes: Ints) -> Ints:
-    """Returns the numbers from each start on, so many of each, one range after another."""
+    """Returns the numbers of ranges, one range after another."""
     before = np.cumsum(sizes) - sizes
     numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
     return numbers
@@ -191,8 +196,8 @@ def in_ranges(starts: Ints, sizes: Ints) -> Ints:
 def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
     order = np.argsort(values, kind="stable")
     running = np.cumsum(n[order])
-    at = [int(np.searchsorted(running, share * running[-1])) for share in shares]
-    return [float(values[order[min(each, len(order) - 1)]]) for each in at]
+    ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
+    return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
 
 
 class Evidence(NamedTuple):
@@ -223,7 +228,7 @@ class Evidence(NamedTuple):
 
     def at(self, place: int) -> Evidence:
         """Returns that for one place."""
-        ends = _keys(np.array([place, place + 1]), np.zeros(2, np.int64))
+        ends = np.array([place, place + 1]) << _BITS
         looks, blind = (
             np.arange(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind)
         )
@@ -257,7 +262,7 @@ class Stay(NamedTuple):
 
 def evidence_at(
     cells: Cells,
-    view: dict[int, FieldOfView],
+    fields_of_view: dict[int, FieldOfView],
     places: Floats,
     rows: Ints,
     place: Ints,
@@ -266,33 +271,41 @@ def evidence_at(
 ) -> Evidence:
     """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
 
-    `place` has the number of the place of each row; `unplaced` are the rows of the label.
+    `fields_of_view` are by topic; `place` has the number of the place of each row; `unplaced` are
+    the rows of the label.
     """
-    placed, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
-    blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~placed], n[~placed])
-    hit, hits_of = _totals(_keys(place, rows[:, Hit.LOOK])[placed], n[placed])
-    looked = cells.n[_number(hit)]
-    np.minimum(hits_of, looked, out=hits_of)
-    known, cell_of = np.unique(cells.cells_of(hit), return_inverse=True)
-    sees = _sees(cells, known, cell_of, looked, hits_of)
+    has_look, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
+    blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~has_look], n[~has_look])
+    hit_looks, hits_of = _totals(_keys(place, rows[:, Hit.LOOK])[has_look], n[has_look])
+    messages = cells.n[_number(hit_looks)]
+    np.minimum(hits_of, messages, out=hits_of)
+    hit_cells, cell_of = np.unique(cells.cells_of(hit_looks), return_inverse=True)
+    sees = _sees(cells, hit_cells, cell_of, messages, hits_of)
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
-    hit_slices = _keys(_place(hit), cells.slice[_number(hit)])
+    hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
-    beside = beside[_are_in(known, cells.cells_of(beside))]
-    looks = _distinct(np.concatenate((beside, cells.looks_from(known[sees]))))
-    cell = np.searchsorted(known, cells.cells_of(looks))
+    beside = beside[_are_in(hit_cells, cells.cells_of(beside))]
+    looks = _distinct(np.concatenate((beside, cells.looks_from(hit_cells[sees]))))
+    cell = np.searchsorted(hit_cells, cells.cells_of(looks))
     hits = np.zeros(len(looks), np.int64)
-    hits[np.searchsorted(looks, hit)] = hits_of
+    hits[np.searchsorted(looks, hit_looks)] = hits_of
     fair = sees[cell]
-    seeing, of = _number(looks[fair]), _place(looks[fair])
-    away, bearing = cells.seen_at(seeing, places[of, 0], places[of, 1])
-    covered = np.zeros(len(seeing), bool)
-    for topic, each in view.items():
-        inside = (bearing >= each.least_deg) & (bearing <= each.most_deg) & (away <= each.most_mm)
-        covered |= inside & (cells.topic[seeing] == topic)
-    fair[fair] = covered
-    n = np.maximum(cells.n[_number(looks)] - cells.totals_in(_number(looks), unplaced), hits)
+    fair[fair] = _are_in_view(cells, fields_of_view, places, looks[fair])
+    numbers = _number(looks)
+    n = np.maximum(cells.n[numbers] - cells.totals_in(numbers, unplaced), hits)
     return Evidence(looks, cell, n, hits, blind, times, fair)
+
+
+def _are_in_view(
+    cells: Cells, fields_of_view: dict[int, FieldOfView], places: Floats, looks: Ints
+) -> Flags:
+    """Returns which looks have their place (mm) in the field of view of their topic."""
+    numbers, at = _number(looks), places[_place(looks)]
+    distance, bearing = cells.seen_at(numbers, at[:, 0], at[:, 1])
+    are_in_view = np.zeros(len(looks), bool)
+    for topic, field in fields_of_view.items():
+        are_in_view |= field.contains(distance, bearing) & (cells.topic[numbers] == topic)
+    return are_in_view
 
 
 _BITS: Final = 32
@@ -315,88 +328,115 @@ def _number(keys: Ints) -> Ints:
 def _distinct(keys: Ints) -> Ints:
     """Returns the distinct ones of keys that are mostly in order: `numpy.unique` takes longer."""
     ordered = np.sort(keys, kind="stable")
-    found: Ints = ordered[np.diff(ordered, prepend=-1) > 0]
-    return found
+    distinct: Ints = ordered[np.diff(ordered, prepend=-1) > 0]
+    return distinct
 
 
 def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
     """Returns the distinct keys in order, and the sum of each."""
-    distinct, which = np.unique(keys, return_inverse=True)
-    return distinct, np.bincount(which, n, len(distinct)).astype(np.int64)
+    distinct, row_of = np.unique(keys, return_inverse=True)
+    return distinct, np.bincount(row_of, n, len(distinct)).astype(np.int64)
 
 
-def _are_in(some: Ints, keys: Ints) -> Flags:
+def _are_in(ordered: Ints, keys: Ints) -> Flags:
     """Returns which keys are among some that are in order."""
-    if not len(some):
+    if not len(ordered):
         return np.zeros(len(keys), bool)
-    found: Flags = some[np.minimum(np.searchsorted(some, keys), len(some) - 1)] == keys
-    return found
+    rows = np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)
+    are_in: Flags = ordered[rows] == keys
+    return are_in
 
 
-def _sees(cells: Cells, known: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
+def _sees(cells: Cells, hit_cells: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
     """Returns which cells see a place, not only report it falsely once in a while.
 
     `cell` has the number among these of each look that saw it, `n` its messages. From a dock that
     faces a wall, ten thousands of messages have some false detections behind it.
     """
-    place, number = _place(known), _number(known)
-    seen, of = np.bincount(cell, hits, len(known)), cells.messages_in[number]
-    looks, hit_looks = cells.looks_in[number], np.bincount(cell, minlength=len(known))
-    enough = (seen >= _FEWEST_HITS) | (of <= _RARE_OF * seen)
-    dense = seen >= _LEAST_RATE * np.bincount(cell, n, len(known))
+    place, number = _place(hit_cells), _number(hit_cells)
+    hits_in, messages = np.bincount(cell, hits, len(hit_cells)), cells.messages_in[number]
+    looks, hit_looks = cells.looks_in[number], np.bincount(cell, minlength=len(hit_cells))
+    is_frequent = (hits_in >= _FEWEST_HITS) | (messages <= _RARE_OF * hits_in)
+    is_dense = hits_in >= _LEAST_RATE * np.bincount(cell, n, len(hit_cells))
     # What other cells see most of the time, a cell that sees it does not miss nearly always.
     share, weight = hit_looks / looks, np.minimum(looks, _MANY_LOOKS)
     others = np.bincount(place, weight)[place] - weight
     pooled = np.bincount(place, share * weight)[place] - share * weight
-    blocked = looks >= _MANY_LOOKS
-    blocked &= share < _BLOCKED_SHARE * (pooled / np.maximum(others, 1))
-    sees: Flags = enough & dense & ~blocked
+    is_blocked = looks >= _MANY_LOOKS
+    is_blocked &= share < _BLOCKED_SHARE * (pooled / np.maximum(others, 1))
+    sees: Flags = is_frequent & is_dense & ~is_blocked
     return sees
+
+
+class _Series(NamedTuple):
+    """The evidence for the places of a label, by slices of places.
+
+    Attributes:
+        slices: the places and slices, as keys in order.
+        odds: the natural logarithm of the odds that it was there, by each alone.
+        hits: how often it was seen.
+        messages: of the looks that saw it.
+    """
+
+    slices: Ints
+    odds: Floats
+    hits: Ints | Floats
+    messages: Ints | Floats
 
 
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
-    looks, cell = _number(evidence.looks), evidence.cell
-    n, blind, times = evidence.n, evidence.blind, evidence.times
-    hit = np.flatnonzero(evidence.hits)  # few of them all
-    hits = evidence.hits[hit]
-    own = _keys(_place(evidence.looks), cells.slice[looks])
-    slices = _distinct(np.concatenate((own, blind)))
-    at, blind = np.searchsorted(slices, own), np.searchsorted(slices, blind)
-    seen = np.bincount(at[hit], hits, len(slices))
-    seen[blind] += times
-    there = np.flatnonzero((seen > 0)[at])
-    # For each cell, how often it sees the thing while that is there.
-    of = np.bincount(cell[there], n[there], int(cell.max(initial=-1)) + 1)
-    rate = (np.bincount(cell[hit], hits, len(of)) + _PRIOR) / (of + 2 * _PRIOR)
-    rate = rate.clip(2 * _FALSE_RATE, 0.98)
-    for_hit, for_miss = np.log(rate / _FALSE_RATE), np.log((1 - rate) / (1 - _FALSE_RATE))
-    odds = np.where(evidence.fair, n * for_miss[cell], 0.0)
-    own = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
-    odds[hit] = np.where(evidence.fair[hit], own, own.clip(_LEAST_BLIND))
-    again = cells.repeated_misses(evidence.looks, evidence.hits)
-    np.multiply(odds, _STANDING, out=odds, where=again)
-    by_slice = np.bincount(at, odds, len(slices)).astype(np.float64)
-    messages = np.bincount(at[hit], n[hit], len(slices))
-    by_slice[blind] += _UNPLACED_HIT * times
-    messages[blind] += times
-    by_slice = by_slice.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE)
-    for place, start, stop, end in _present(by_slice, _place(slices)):
-        inside = np.flatnonzero(seen[start:stop]) + start
-        clear = inside[by_slice[inside] >= _CLEAR]
-        if not len(inside):
+    slices, odds, hits, messages = _by_slice(cells, evidence)
+    for place, start, stop, end in _present(odds, _place(slices)):
+        seen = np.flatnonzero(hits[start:stop]) + start
+        if not len(seen):
             continue
         # A false detection or two beside a stay are no part of it.
-        inside = clear if len(clear) else inside
-        first, last = int(inside[0]), int(inside[-1])
-        firm = inside[by_slice[inside] >= _FIRM]
-        firm = firm if len(firm) else inside
-        gone = np.cumsum(by_slice[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
+        clear = seen[odds[seen] >= _CLEAR]
+        seen = clear if len(clear) else seen
+        first, last = int(seen[0]), int(seen[-1])
+        firm = seen[odds[seen] >= _FIRM]
+        firm = firm if len(firm) else seen
+        gone = np.cumsum(odds[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
         left = int(_number(slices[firm[-1] + 1 + gone.argmax()])) if gone.any() else None
         ends = slices[[first, last, firm[0], firm[-1]]]
         first_slice, last_slice, firm_first, firm_last = _number(ends).tolist()
-        hit_count, count = (int(each[first : last + 1].sum()) for each in (seen, messages))
-        yield place, Stay(first_slice, last_slice, firm_first, firm_last, hit_count, count, left)
+        n, n_messages = (int(counts[first : last + 1].sum()) for counts in (hits, messages))
+        yield place, Stay(first_slice, last_slice, firm_first, firm_last, n, n_messages, left)
+
+
+def _by_slice(cells: Cells, evidence: Evidence) -> _Series:
+    looks = _keys(_place(evidence.looks), cells.slice[_number(evidence.looks)])
+    slices = _distinct(np.concatenate((looks, evidence.blind)))
+    slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
+    hit = np.flatnonzero(evidence.hits)  # few of them all
+    hits = np.bincount(slice_of[hit], evidence.hits[hit], len(slices))
+    messages = np.bincount(slice_of[hit], evidence.n[hit], len(slices))
+    hits[blind] += evidence.times
+    messages[blind] += evidence.times
+    by_look = _odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
+    odds = np.bincount(slice_of, by_look, len(slices)).astype(np.float64)
+    odds[blind] += _UNPLACED_HIT * evidence.times
+    return _Series(slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, messages)
+
+
+def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
+    """Returns the natural logarithm of the odds for a thing by each look.
+
+    `hit` are the looks that saw it, `there` those of slices in which it was seen: these tell how
+    often each cell sees it while it is there.
+    """
+    cell, n, hits = evidence.cell, evidence.n, evidence.hits[hit]
+    messages = np.bincount(cell[there], n[there], int(cell.max(initial=-1)) + 1)
+    rate = (np.bincount(cell[hit], hits, len(messages)) + _PRIOR) / (messages + 2 * _PRIOR)
+    rate = rate.clip(2 * _FALSE_RATE, 0.98)
+    for_hit, for_miss = np.log(rate / _FALSE_RATE), np.log((1 - rate) / (1 - _FALSE_RATE))
+    odds: Floats = np.where(evidence.fair, n * for_miss[cell], 0.0)
+    of_hits = hits * for_hit[cell[hit]] + (n[hit] - hits) * for_miss[cell[hit]]
+    odds[hit] = np.where(evidence.fair[hit], of_hits, of_hits.clip(_LEAST_BLIND))
+    is_repeated = cells.repeated_misses(evidence.looks, evidence.hits)
+    np.multiply(odds, _STANDING, out=odds, where=is_repeated)
+    return odds
 
 
 def looks_without(
@@ -411,42 +451,34 @@ def looks_without(
     By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
-    looks, hits, cell = _number(evidence.looks), evidence.hits, evidence.cell
-    own, last = cells.slice[looks], cells.last[looks]
-    during = (own >= stay.first_slice) & (own <= stay.last_slice)
-    during &= (last <= seen_to) | (hits > 0)
-    after = (cells.first[looks] >= window[0]) & (last < window[1]) & evidence.fair & ~during
-    known: dict[int, list[float]] = {}
-    for each, n, hit in zip(
-        cell[during].tolist(), evidence.n[during].tolist(), hits[during].tolist(), strict=True
-    ):
-        entry = known.setdefault(each, [1.0, 1.0])
-        entry[0] += hit
-        entry[1] += n - hit
+    looks, is_hit = _number(evidence.looks), evidence.hits > 0
+    slices, first, last = cells.slice[looks], cells.first[looks], cells.last[looks]
+    during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
+    during &= (last <= seen_to) | is_hit
+    start, stop = window
+    misses = (first >= start) & (last < stop) & evidence.fair & ~during & ~is_hit
+    distinct, cell_of = np.unique(evidence.cell, return_inverse=True)
+    cell, hits, n = cell_of[during], evidence.hits[during], evidence.n[during]
+    seen = (1.0 + np.bincount(cell, hits, len(distinct))).tolist()
+    missed = (1.0 + np.bincount(cell, n - hits, len(distinct))).tolist()
     chance, messages = 0.0, 0
     crossed: Ns | None = None
-    for each, n, hit, ended in zip(
-        cell[after].tolist(),
-        evidence.n[after].tolist(),
-        hits[after].tolist(),
-        last[after].tolist(),
-        strict=True,
-    ):
-        entry = known.get(each, [0.0, 0.0])
-        if entry[0] <= 1.0 or hit:
+    for look in np.flatnonzero(misses).tolist():
+        number, n_missed = int(cell_of[look]), int(evidence.n[look])
+        alpha, beta = seen[number], missed[number]
+        if alpha <= 1.0:
             continue
-        seen, missed = entry
-        # The chance of n misses in a row, by a beta distribution of the rate.
+        # The chance of so many misses in a row, by a beta distribution of the rate.
         chance += (
-            math.lgamma(missed + n)
-            - math.lgamma(missed)
-            + math.lgamma(seen + missed)
-            - math.lgamma(seen + missed + n)
+            math.lgamma(beta + n_missed)
+            - math.lgamma(beta)
+            + math.lgamma(alpha + beta)
+            - math.lgamma(alpha + beta + n_missed)
         )
-        entry[1] += n
-        messages += n
+        missed[number] += n_missed
+        messages += n_missed
         if crossed is None and chance < math.log(_MISSED_BY_CHANCE):
-            crossed = ended
+            crossed = int(last[look])
     return messages, crossed
 
 
@@ -466,10 +498,10 @@ def _present(by_slice: Floats, place: Ints) -> Iterator[tuple[int, int, int, int
     for end in ends:
         stop = bisect_left(starts, end)
         runs = zip(_states(sums[begin:stop]), pairwise([*starts[begin:stop], end]), strict=True)
-        for is_there, some in groupby(runs, itemgetter(0)):
+        for is_there, same in groupby(runs, itemgetter(0)):
             if is_there:
-                spans = [span for _, span in some]
-                yield int(place[end - 1]), spans[0][0], spans[-1][1], end
+                begins, stops = zip(*(span for _, span in same), strict=True)
+                yield int(place[end - 1]), begins[0], stops[-1], end
         begin = stop
 
 

@@ -44,15 +44,21 @@ _LEAST_SHARE: Final = 0.05
 _MOST_PLACES: Final = 4
 
 
-class _Known(NamedTuple):
-    """The last sighting in each hour: its local hours since the epoch, and its place of `size`."""
+class _HourlyPlaces(NamedTuple):
+    """The last sighting in each hour.
+
+    Attributes:
+        hours: of local time since the epoch, ascending.
+        places: the number of the place of each, of `size`.
+    """
 
     hours: Floats
     places: Ints
     size: int
 
-    def before(self, nth: int) -> _Known:
-        return _Known(self.hours[:nth], self.places[:nth], self.size)
+    def before(self, row: int) -> _HourlyPlaces:
+        """Returns those before a row."""
+        return _HourlyPlaces(self.hours[:row], self.places[:row], self.size)
 
     def shares(self) -> Floats:
         """Returns how often it was at each place; none is impossible."""
@@ -67,9 +73,9 @@ class _Known(NamedTuple):
     def still_there(self, age_h: float) -> float:
         """Returns how likely it is where it was seen so long ago."""
         ages = np.digitize(np.diff(self.hours), _AGES_H)
-        alike = ages == np.digitize(age_h, _AGES_H)
-        same = np.diff(self.places)[alike] == 0
-        return (float(same.sum()) + 1.0) / (len(same) + 2.0)
+        is_as_old = ages == np.digitize(age_h, _AGES_H)
+        stayed = np.diff(self.places)[is_as_old] == 0
+        return (float(stayed.sum()) + 1.0) / (len(stayed) + 2.0)
 
     def likely(self, hour: float, *, by_hours: bool = True) -> Floats:
         """Returns how likely each place is at a later hour."""
@@ -82,9 +88,9 @@ class _Known(NamedTuple):
 
 
 def _normalised(weights: ArrayLike) -> Floats:
-    found = np.asarray(weights, np.float64)
-    found /= found.sum()
-    return found
+    shares: Floats = np.asarray(weights, np.float64)
+    shares /= shares.sum()
+    return shares
 
 
 def usual_places(
@@ -103,18 +109,18 @@ def usual_places(
     last = np.flatnonzero(np.diff(times // _HOUR_NS, append=-1) != 0)
     hours = np.array([_local_hour(at, offset) for at in times[last].tolist()])
     places, centres = _places(xy_mm[last])
-    known = _Known(hours, places, len(centres))
+    hourly = _HourlyPlaces(hours, places, len(centres))
     days = hours // _DAY_H
     learned = int(np.searchsorted(days, days[0] + _LEARNED_DAYS))
-    if known.size < 2 or len(days) - learned < _FEWEST_HOURS or days[-1] - days[0] < _FEWEST_DAYS:
+    if hourly.size < 2 or len(days) - learned < _FEWEST_HOURS or days[-1] - days[0] < _FEWEST_DAYS:
         return None
-    if not _has_routine(known, learned):
+    if not _has_routine(hourly, learned):
         return ()
-    likely = known.likely(max(_local_hour(now, offset), float(hours[-1])))
-    shares = np.bincount(places, minlength=known.size) / len(places)
-    by_hour = np.array([known.around(at + 0.5) for at in range(_DAY_H)])
-    seen_at = np.isin(np.arange(_DAY_H), hours % _DAY_H // 1)
-    best = np.where(seen_at, by_hour.argmax(axis=1), -1)
+    likely = hourly.likely(max(_local_hour(now, offset), float(hours[-1])))
+    shares = np.bincount(places, minlength=hourly.size) / len(places)
+    by_hour = np.array([hourly.around(hour + 0.5) for hour in range(_DAY_H)])
+    is_known = np.isin(np.arange(_DAY_H), hours % _DAY_H // 1)
+    best = np.where(is_known, by_hour.argmax(axis=1), -1)
     order = [place for place in np.argsort(-likely).tolist() if shares[place] >= _LEAST_SHARE]
     return tuple(
         UsualPlace(
@@ -144,35 +150,36 @@ def _places(xy_mm: Ints) -> tuple[Ints, Floats]:
     """Returns the number of the place of each position, and the mean of each place."""
     numbers = np.zeros(len(xy_mm), np.int64)
     sums: list[Floats] = []
-    for nth, position in enumerate(xy_mm):
-        apart = [math.dist(one[:2] / one[2], position) for one in sums]
+    for row, position in enumerate(xy_mm):
+        apart = [math.dist(xyn[:2] / xyn[2], position) for xyn in sums]
         place = int(np.argmin(apart)) if apart and min(apart) <= _ONE_PLACE_MM else len(sums)
         if place == len(sums):
             sums.append(np.zeros(3))
         sums[place] += (*position, 1.0)
-        numbers[nth] = place
-    every = np.array(sums)
-    return numbers, every[:, :2] / every[:, 2:]
+        numbers[row] = place
+    totals = np.array(sums)
+    return numbers, totals[:, :2] / totals[:, 2:]
 
 
-def _has_routine(known: _Known, learned: int) -> bool:
+def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
     """Returns whether the hours say more of where it was than the last place, and than shares.
 
     Of the first sightings, so many are `learned` from only.
     """
     gains = []
-    for nth in range(learned, len(known.hours)):
-        before, hour, place = known.before(nth), float(known.hours[nth]), int(known.places[nth])
+    for row in range(learned, len(hourly.hours)):
+        before, hour, place = hourly.before(row), float(hourly.hours[row]), int(hourly.places[row])
         stayed = 0.0 if place == before.places[-1] else 2.0
         score = _brier(before.likely(hour), place)
-        unhoured = _brier(before.likely(hour, by_hours=False), place)
-        gains.append((stayed - score, unhoured - score))
+        without_hours = _brier(before.likely(hour, by_hours=False), place)
+        gains.append((stayed - score, without_hours - score))
     mean = np.mean(gains, axis=0)
     error = np.std(gains, axis=0) / math.sqrt(len(gains))
     return bool((mean > _SIGMAS * error).all())
 
 
 def _brier(likely: Floats, place: int) -> float:
+    """Returns the squared error of how likely each place is, of something at one of them."""
     off = likely.copy()
     off[place] -= 1.0
     return float((off**2).sum())

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from collections import defaultdict
 from hashlib import blake2b
-from itertools import accumulate, chain, pairwise
+from itertools import chain
 from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -114,19 +114,19 @@ SIGHTS: Final[FragmentKind[SeenBytes]] = FragmentKind("sights", (SeenBytes,))
 """What detectors saw in a stretch."""
 
 
-class _Placing(NamedTuple):
+class _Lending(NamedTuple):
     """A session, and the one whose transforms hold for it: empty where none do.
 
     Attributes:
         slices: in which slices of the clock they hold; None: in all.
     """
 
-    own: Session
-    among: Session
+    session: Session
+    lender: Session
     slices: tuple[int, ...] | None = None
 
 
-class _Around(NamedTuple):
+class _Surroundings(NamedTuple):
     """What the sights of a stretch follow from.
 
     Attributes:
@@ -140,7 +140,7 @@ class _Around(NamedTuple):
     window: TimeWindow
     bags: Sequence[BagFile]
     parts: tuple[int, ...] | None
-    sessions: Sequence[_Placing]
+    sessions: Sequence[_Lending]
 
 
 def may_have_detections(type_name: str) -> bool:
@@ -159,7 +159,7 @@ class Watching:
         self._view = view
         self._placer = Placer(view)
         self._sessions = sessions_of(view)
-        self._of: dict[Path, Session] = {}
+        self._session_of: dict[Path, Session] = {}
         timeline = view.timeline
         self._topics = [
             topic
@@ -173,8 +173,8 @@ class Watching:
             *limits.tf_topics,
             *(topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)),
         )
-        self._lasts = not view.stream.may_be_relatched(self._topics)
-        self._followed: tuple[object, str] = None, ""
+        self._may_be_kept = not view.stream.may_be_relatched(self._topics)
+        self._digested: tuple[object, str] = None, ""
 
     def newest_first(self, until: Ns = MAX_NS) -> Iterator[list[Stretch]]:
         """Yields the sights of all sessions in each stretch with some that begins before a time.
@@ -183,24 +183,9 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         for around in self._stretches_in(TimeWindow(MIN_NS, until)):
-            data = self._known(around)
-            if not data:
-                continue
-            [size] = _SIZE.unpack_from(data)
-            at = _SIZE.size + size
-            found = []
-            for nth, frame, spots, described in json.loads(data[_SIZE.size : at]):
-                ends = [*accumulate((length for *_, length in described), initial=at)]
-                parts = tuple(
-                    TopicSights(tuple(topics), detects, data[begin:end])
-                    for (topics, detects, _), (begin, end) in zip(
-                        described, pairwise(ends), strict=True
-                    )
-                )
-                at = ends[-1]
-                own = around.sessions[nth].own
-                found.append(Stretch(around.window.start, frame, own, spots, parts))
-            yield found
+            data = self._sights(around)
+            if data:
+                yield [*_unpacked(data, around)]
 
     def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the sights that follow from the parts of a window; those of others are left out.
@@ -212,17 +197,17 @@ class Watching:
         """
         for around in self._stretches_in(window.widened(SIGHTS_NS)):
             if around.parts is not None:
-                self._known(around)
+                self._sights(around)
             yield around.window.start
 
-    def _stretches_in(self, window: TimeWindow) -> Iterator[_Around]:
+    def _stretches_in(self, window: TimeWindow) -> Iterator[_Surroundings]:
         """Yields the stretches of a window in which there may be messages, the newest first."""
         if not self._topics:
             return
         whole = window.widened(AROUND_NS)
         parts = _Parts.of(self._view, self._needed, whole)
-        every = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
-        for number in sorted({*chain.from_iterable(every)}, reverse=True):
+        by_bag = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
+        for number in sorted({*chain.from_iterable(by_bag)}, reverse=True):
             stretch = _window(number)
             if not stretch.intersect(window).empty:
                 self._view.bags.check_deadline()
@@ -248,70 +233,72 @@ class Watching:
         Raises:
             QueryTimeoutError: the deadline has passed.
         """
-        own = self._session(bag)
-        found: list[SessionSights] = []
+        session = self._session(bag)
+        sights: list[SessionSights] = []
         for number in _numbers_of(self._view, self._topics, bag):
             window = _window(number).intersect(TimeWindow(bag.start, bag.end + 1))
-            rows = [
-                (topic, some.some(positions))
-                for topic, some in self._found(window)
-                for each, positions in some.bag_rows()
-                if each.file == bag.file
+            units = [
+                rows.some(positions)
+                for rows in self._rows(window)
+                for source, positions in rows.bag_rows()
+                if source.file == bag.file
             ]
-            among = self._transforms_of(own, bag, window)
-            placed = self._placer.placed(window, own, among, rows)
-            found += [] if placed is None else [placed]
-        return found
+            lender = self._transforms_of(session, bag, window)
+            placed = self._placer.placed(window, session, lender, units)
+            if placed is not None:
+                sights.append(placed)
+        return sights
 
     def _session(self, bag: BagFile) -> Session:
-        if bag.recording not in self._of:
-            self._of[bag.recording] = self._sessions.of(bag.recording)
-        return self._of[bag.recording]
+        if bag.recording not in self._session_of:
+            self._session_of[bag.recording] = self._sessions.of(bag.recording)
+        return self._session_of[bag.recording]
 
     def _around(
         self, window: TimeWindow, bags: Sequence[BagFile], parts: tuple[int, ...] | None
-    ) -> _Around:
-        first: dict[Session, BagFile] = {}
+    ) -> _Surroundings:
+        first_bags: dict[Session, BagFile] = {}
         for bag in bags:
-            first.setdefault(self._session(bag), bag)
+            first_bags.setdefault(self._session(bag), bag)
+        is_alone = len(first_bags) == 1
         sessions = [
-            one
-            for own, bag in first.items()
-            for one in self._placings(own, bag, window, len(first))
+            lending
+            for session, bag in first_bags.items()
+            for lending in self._lendings(session, bag, window, is_alone=is_alone)
         ]
-        if len(first) > 1:
-            sessions.sort(key=lambda one: (min(one.own), one.slices or ()))
-        return _Around(window, bags, parts, sessions)
+        if not is_alone:
+            sessions.sort(key=lambda lending: (min(lending.session), lending.slices or ()))
+        return _Surroundings(window, bags, parts, sessions)
 
-    def _placings(
-        self, own: Session, bag: BagFile, window: TimeWindow, sessions: int
-    ) -> Iterator[_Placing]:
-        """Yields whose transforms hold for a session, of which a bag is, among so many sessions."""
-        if sessions == 1 or self._sessions.has_all_kinds(own):
-            yield _Placing(own, self._transforms_of(own, bag, window))
+    def _lendings(
+        self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
+    ) -> Iterator[_Lending]:
+        """Yields whose transforms hold for a session, of which a bag is; it may be alone there."""
+        if is_alone or self._sessions.has_all_kinds(session):
+            yield _Lending(session, self._transforms_of(session, bag, window))
             return
         slices: dict[Session, list[int]] = defaultdict(list)
         for number in range(window.start // SLICE_NS, (window.stop - 1) // SLICE_NS + 1):
             middle = number * SLICE_NS + SLICE_NS // 2
             slices[self._sessions.lending_to(bag.recording, middle)].append(number)
-        for among, some in slices.items():
-            yield _Placing(own, among, tuple(some))
+        for lender, numbers in slices.items():
+            yield _Lending(session, lender, tuple(numbers))
 
-    def _transforms_of(self, own: Session, bag: BagFile, window: TimeWindow) -> Session:
+    def _transforms_of(self, session: Session, bag: BagFile, window: TimeWindow) -> Session:
         """Returns the session whose transforms hold for a bag's; empty where none has any."""
-        if self._sessions.has_all_kinds(own):
-            return own
+        if self._sessions.has_all_kinds(session):
+            return session
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _known(self, around: _Around) -> bytes:
+    def _sights(self, around: _Surroundings) -> bytes:
         """Returns what was seen in a stretch, in bytes; from memory where that is known."""
         scanner = self._view.memory.columns
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
-        if is_open or not self._lasts:
+        if is_open or not self._may_be_kept:
             return self._read(around)
-        followed = self._follows_from(around)
+        digest = self._digest(around)
         if around.parts is not None:
-            part_key = FragmentKey(around.window.start, followed, around.parts)
+            part_key = FragmentKey(around.window.start, digest, around.parts)
             return remembered(
                 self._view,
                 SIGHTS,
@@ -321,7 +308,7 @@ class Watching:
             ).data
         # Parts, as these, are of certain recordings.
         bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
-        key = (around.window.start, followed, tuple(bags))
+        key = (around.window.start, digest, tuple(bags))
         data = scanner.caches.sights.get(key)
         if data is None:
             before = self._view.notes.added
@@ -330,70 +317,91 @@ class Watching:
                 scanner.caches.sights.put(key, data, 200 + len(data) + 100 * len(bags))
         return data
 
-    def _follows_from(self, around: _Around) -> str:
+    def _digest(self, around: _Surroundings) -> str:
         """Returns what tells apart the sights of other settings, static transforms or sessions."""
         window = around.window
         statics = [
             [
-                (one, one.log_time if window.contains(one.log_time) else 0)
-                for one in static_in(static_transforms(self._view, among), window)
+                (static, static.log_time if window.contains(static.log_time) else 0)
+                for static in static_in(static_transforms(self._view, lender), window)
             ]
-            for _, among, _ in around.sessions
-            if among
+            for _, lender, _ in around.sessions
+            if lender
         ]
-        near = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
+        folders = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
         begin = window.start // SLICE_NS
-        of = [
-            ([(one in own, one in among) for one in near], [nth - begin for nth in slices or ()])
-            for own, among, slices in around.sessions
+        sessions = [
+            (
+                [(folder in session, folder in lender) for folder in folders],
+                [number - begin for number in slices or ()],
+            )
+            for session, lender, slices in around.sessions
         ]
+        before, digest = self._digested
         # Mostly they are those of the stretch before, object by object.
-        if self._followed[0] != (statics, of):
+        if before != (statics, sessions):
             limits = self._view.limits
-            every = [
-                [(one.parent, one.child, one.transform, time) for one, time in some]
-                for some in statics
+            transforms = [
+                [
+                    (static.parent, static.child, static.transform, time)
+                    for static, time in of_session
+                ]
+                for of_session in statics
             ]
             settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
-            digest = blake2b(repr((VERSION, settings, every, of)).encode(), digest_size=12)
-            self._followed = (statics, of), digest.hexdigest()
-        return self._followed[1]
+            text = repr((VERSION, settings, transforms, sessions))
+            digest = blake2b(text.encode(), digest_size=12).hexdigest()
+            self._digested = (statics, sessions), digest
+        return digest
 
-    def _read(self, around: _Around) -> bytes:
-        """Returns what was seen: of each session what there is, as JSON, then the sights.
-
-        With each comes which of the sessions around it is. Empty where there are no messages.
-        """
-        every: dict[Session, list[tuple[str, Rows]]] = defaultdict(list)
-        for topic, rows in self._found(around.window):
-            every[self._sessions.of(rows.recording)].append((topic, rows))
+    def _read(self, around: _Surroundings) -> bytes:
+        """Returns what was seen, as `_unpacked` reads it; empty where there are no messages."""
+        by_session: dict[Session, list[Rows]] = defaultdict(list)
+        for rows in self._rows(around.window):
+            by_session[self._sessions.of(rows.recording)].append(rows)
         head: list[tuple[int, str, int, list[tuple[tuple[str, ...], bool, int]]]] = []
         data: list[bytes] = []
-        for nth, (own, among, slices) in enumerate(around.sessions):
-            found = every[own]
+        for number, (session, lender, slices) in enumerate(around.sessions):
+            units = by_session[session]
             if slices is not None:
-                found = [
-                    (topic, rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices))))
-                    for topic, rows in found
+                units = [
+                    rows.some(np.flatnonzero(np.isin(rows.times // SLICE_NS, slices)))
+                    for rows in units
                 ]
-            seen = self._placer.placed(around.window, own, among, found)
+            seen = self._placer.placed(around.window, session, lender, units)
             if seen is not None:
-                some = [*map(packed, seen.sights)]
+                tables = [*map(packed, seen.sights)]
                 spots = sum(len(sights.spots) for sights in seen.sights)
-                described = [
-                    (sights.topics, not seen.detectors.isdisjoint(sights.topics), len(each))
-                    for sights, each in zip(seen.sights, some, strict=True)
+                topics = [
+                    (sights.topics, not seen.detectors.isdisjoint(sights.topics), len(table))
+                    for sights, table in zip(seen.sights, tables, strict=True)
                 ]
-                head.append((nth, seen.frame_id, spots, described))
-                data += some
+                head.append((number, seen.frame_id, spots, topics))
+                data += tables
         packed_head = json.dumps(head).encode()
         return b"".join((_SIZE.pack(len(packed_head)), packed_head, *data)) if head else b""
 
-    def _found(self, window: TimeWindow) -> Iterator[tuple[str, Rows]]:
+    def _rows(self, window: TimeWindow) -> Iterator[Rows]:
         """Yields the rows in a window that may have detections."""
         for topic in self._topics:
-            for rows in scan(self._view, topic, window, may_match=self._placer.rows.may_match):
-                yield topic, rows
+            yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
+
+
+def _unpacked(data: bytes, around: _Surroundings) -> Iterator[Stretch]:
+    """Yields the sights of each session of a stretch: a head as JSON, then those of each topic.
+
+    The head has which of the sessions around it is, the frame, how many spots there are, and of
+    each topic its name, whether it is surely of a detector, and how many bytes its sights take.
+    """
+    [size] = _SIZE.unpack_from(data)
+    begin = _SIZE.size + size
+    for number, frame_id, spots, topics in json.loads(data[_SIZE.size : begin]):
+        sights = []
+        for names, detects, length in topics:
+            sights.append(TopicSights(tuple(names), detects, data[begin : begin + length]))
+            begin += length
+        session = around.sessions[number].session
+        yield Stretch(around.window.start, frame_id, session, spots, tuple(sights))
 
 
 class _Parts(NamedTuple):
@@ -477,6 +485,6 @@ def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Iterable[int
         return numbers
     # Its times are odd: centuries may lie between two messages.
     window = TimeWindow(bag.start, bag.end).widened(1)
-    every = [rows.times // SIGHTS_NS for topic in topics for rows in scan(view, topic, window)]
-    found: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *every])).tolist()
-    return found
+    by_unit = [rows.times // SIGHTS_NS for topic in topics for rows in scan(view, topic, window)]
+    distinct: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *by_unit])).tolist()
+    return distinct

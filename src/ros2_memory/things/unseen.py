@@ -77,6 +77,11 @@ class _Detected(NamedTuple):
     placed: Ns
     together: int
 
+    @property
+    def total(self) -> int:
+        """How often it was detected in all."""
+        return self.counted + self.low + self.unplaced
+
 
 def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     """Notes topics that may have detections, and of which messages in a window cannot be decoded.
@@ -91,9 +96,9 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
             with suppress(NotInLakeError):
                 newest = view.stream.newest(topic, window)
                 first = None if newest is None else view.stream.first([topic], window)
-                for found in filter(None, (newest, first)):
-                    view.bags.decode(found, failures)
-    reasons = {each.topic: each.reason for each in failures}
+                for stored in filter(None, (newest, first)):
+                    view.bags.decode(stored, failures)
+    reasons = {failure.topic: failure.reason for failure in failures}
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
     return frozenset(reasons)
@@ -140,8 +145,8 @@ def vague_notes(
         for label in np.unique(spots[during, Spot.LABEL]).tolist():
             key = known.labels.key(estimate.sights.labels[label])
             if not keys or key in keys:
-                mine = during[spots[during, Spot.LABEL] == label]
-                labels |= {estimate.names[key]} if estimate.is_vague(mine) else set()
+                of_label = during[spots[during, Spot.LABEL] == label]
+                labels |= {estimate.names[key]} if estimate.is_vague(of_label) else set()
     if labels:
         yield repeating(
             "localisation was poor when these were detected last, which moves nothing, so that "
@@ -196,71 +201,79 @@ def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
 
 
 def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
-    found: Ints = np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
-    return found
+    """Returns the rows of a table that reach into a window, by their `first` and `last` column."""
+    return np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
 
 
 def _detected(known: KnownThings, key: str, window: TimeWindow) -> _Detected:
     """Returns how often a label was detected in a window."""
     estimate, sights = known.estimate, known.estimate.sights
-    mine = np.array([known.labels.key(each) == key for each in sights.labels], np.bool_)
+    has_key = np.array([known.labels.key(label) == key for label in sights.labels], np.bool_)
     rows = _during(window, sights.spots, Spot.FIRST, Spot.LAST)
-    rows = rows[mine[sights.spots[rows, Spot.LABEL]]]
+    rows = rows[has_key[sights.spots[rows, Spot.LABEL]]]
+    spots = sights.spots[rows]
     lost = sights.unplaced[_during(window, sights.unplaced, Unplaced.FIRST, Unplaced.LAST)]
-    lost = lost[mine[lost[:, Unplaced.LABEL]]]
+    lost = lost[has_key[lost[:, Unplaced.LABEL]]]
     count = int(estimate.counts[rows].sum())
     return _Detected(
-        estimate.names[key],
-        count,
-        int(sights.spots[rows, Spot.N].sum()) - count,
-        int(lost[:, Unplaced.N].sum()),
-        int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
-        int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
-        int(sights.spots[rows, Spot.LAST].max(initial=MIN_NS)),
-        int(sights.spots[rows, Spot.TOGETHER].max(initial=0)),
+        name=estimate.names[key],
+        counted=count,
+        low=int(spots[:, Spot.N].sum()) - count,
+        unplaced=int(lost[:, Unplaced.N].sum()),
+        first=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
+        last=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
+        placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
+        together=int(spots[:, Spot.TOGETHER].max(initial=0)),
     )
 
 
 def _too_low(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
     """Yields which labels were detected, and do not count."""
     low = [
-        f"{each.name} ({counted(each.low, 'time')})"
-        for each in detected
-        if each.low and not each.counted
+        f"{label.name} ({counted(label.low, 'time')})"
+        for label in detected
+        if label.low and not label.counted
     ]
     if low:
         text = f"detected only below {asked.min_score}: {listed(low, at_most=_MOST_NAMED)}"
-        yield repeating(text, [each.name for each in detected])
+        yield repeating(text, [label.name for label in detected])
 
 
 def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
     """Yields notes on a label that was asked for."""
-    names = sorted({*known.estimate.names.values()})
     if key not in known.estimate.names:
-        close = [each for each in names if key in each or each in key]
-        close += difflib.get_close_matches(key, names, 3)
-        shown = [*dict.fromkeys(close)] or names
-        meant = f"; did you mean {close[0]}?" if close else ""
-        label = abbreviate(asked.labels[key])
-        if names:
-            text = f"no detector reported {label}{known.reach}; there are: {listed(shown)}{meant}"
-            yield repeating(text, shown)
+        yield from _never_reported(known, key, asked.labels[key])
         return
-    _, count, low, unplaced, *_ = _detected(known, key, asked.window)
-    if unplaced:
+    detected = _detected(known, key, asked.window)
+    if unplaced := detected.unplaced:
         lost = counted(unplaced, "detection")
         yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
     if key in asked.found:
         return
-    if low:
-        times = counted(low, "time")
+    if detected.low:
+        times = counted(detected.low, "time")
         yield f"it was detected {times} below {asked.min_score}, which does not count"
-    if count:
+    if detected.counted:
         yield (
-            f"it was detected {counted(count, 'time')} in this time, but does not count "
+            f"it was detected {counted(detected.counted, 'time')} in this time, but does not count "
             f"as a thing{asked.inside}: find_matches lists single detections"
         )
-    if not count + low + unplaced and known.reaches_back(asked.window):
-        every = sum(_detected(known, key, TimeWindow.everything())[1:4])
+    if not detected.total and known.reaches_back(asked.window):
+        total = _detected(known, key, TimeWindow.everything()).total
         when = known.reach or " in all"
-        yield f"it was detected {counted(every, 'time')}{when}, and not once in this window"
+        yield f"it was detected {counted(total, 'time')}{when}, and not once in this window"
+
+
+def _never_reported(known: KnownThings, key: str, label: str) -> Iterator[str]:
+    """Yields which labels there are, those like it first, where there are any."""
+    names = sorted({*known.estimate.names.values()})
+    close = [name for name in names if key in name or name in key]
+    close += difflib.get_close_matches(key, names, 3)
+    shown = [*dict.fromkeys(close)] or names
+    meant = f"; did you mean {close[0]}?" if close else ""
+    if names:
+        yield repeating(
+            f"no detector reported {abbreviate(label)}{known.reach}; "
+            f"there are: {listed(shown)}{meant}",
+            shown,
+        )
