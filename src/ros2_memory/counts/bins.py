@@ -164,8 +164,7 @@ def _piece_starts(window: TimeWindow, unit_s: int, offset: Offset) -> list[Ns]:
     last_s = (window.stop - 1) // NS_PER_S
     edge_s = _next_edge(window.start // NS_PER_S, unit_s, offset)
     while edge_s <= last_s:
-        if edge_s * NS_PER_S > window.start:
-            starts.append(edge_s * NS_PER_S)
+        starts.append(edge_s * NS_PER_S)
         edge_s = _next_edge(edge_s, unit_s, offset)
     return starts
 
@@ -487,14 +486,12 @@ class BinnedWindow:
         note_edges(self.view, self.asked)
         columns = zip(recorded.tolist(), *self._values, strict=True)
         rows = [*zip(self.bins.names, columns, strict=True)]
-        empty = [not any(values) for _, values in rows]
         if self._since is not None:
             is_late = self.bins.edges[1:] > self._since
-            counted: list[bool] = np.any(self.bins.member[is_late], axis=0).tolist()
-            rows, empty = [*compress(rows, counted)], [*compress(empty, counted)]
+            rows = [*compress(rows, np.any(self.bins.member[is_late], axis=0))]
         if self._by != "place":
-            self._note_empty(empty, [name for name, _ in rows])
-            rows = [row for row, is_empty in zip(rows, empty, strict=True) if not is_empty]
+            self._note_empty(rows)
+            rows = [(name, values) for name, values in rows if any(values)]
         return Bins(
             by=self._by,
             about=self._topics,
@@ -508,12 +505,12 @@ class BinnedWindow:
             notes=self.view.notes.sentences(),
         )
 
-    def _note_empty(self, empty: Sequence[bool], names: Sequence[str]) -> None:
+    def _note_empty(self, rows: Sequence[tuple[str, Values]]) -> None:
         """Notes the bins in which nothing was recorded: several in a row by the first and last."""
         spans: list[str] = []
-        for is_empty, group in groupby(zip(empty, names, strict=True), lambda row: row[0]):
-            first, *later = (name for _, name in group)
-            if is_empty:
+        for has_values, group in groupby(rows, lambda row: any(row[1])):
+            first, *later = (name for name, _ in group)
+            if not has_values:
                 spans.append(f"{first} to {later[-1]}" if later else first)
         if spans:
             more = len(spans) - _MOST_SPANS

@@ -309,12 +309,11 @@ def count_values(
     start, end = asked.asked()
     first, last = recorded_reach(view.snapshot, asked) or (start, end)
     start, stop = max(start, first), min(end, last) + 1
-    values_held: list[Held] = []
     try:
-        values_held += values.during(start, stop)
+        values_held = values.during(start, stop)
     except QueryTimeoutError as error:
         # What is newer is known all the same.
-        values_held += values.known[::-1]
+        values_held = values.known[::-1]
         if not values_held:
             raise
         start = values.reached

@@ -94,15 +94,15 @@ def count_matches(
     binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
     held, since, unknown = None, None, []
+    is_one_topic = where is None and not during and len(topics) == 1
     # Events have labels without scores.
-    by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
-    alone = where is None and not during and len(topics) == 1
-    if alone and by_events:
+    can_be_event = isinstance(condition.test, Contains | Equals) and not condition.min_score
+    if is_one_topic and can_be_event:
         held, since = _held_by_events(binned, topics[0], condition, value)
     if held is None:
         scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
-        lasting = [*_held_at_begin(binned, topics, condition, scope)]
+        lasting = _held_at_begin(binned, topics, condition, scope)
         held = TrueIntervals.of([*lasting, *((first, last, True) for first, last in spans)])
         unknown = scope.unknown
     binned.count_since(since)

@@ -485,17 +485,21 @@ def numbers_in(value: JsonValue) -> Iterator[float]:
             yield leaf
 
 
-def _least_with_row(field_numbers: FieldNumbers, among: IntArray, sign: int) -> tuple[float, int]:
+def _least_with_row(
+    field_numbers: FieldNumbers, positions: IntArray, sign: int
+) -> tuple[float, int]:
     """Returns the least exact number, times the sign, and its first row."""
-    values = field_numbers.numbers[among]
+    values = field_numbers.numbers[positions]
     if field_numbers.error and field_numbers.exactly is not None:
-        off = field_numbers.error if field_numbers.errors is None else field_numbers.errors[among]
+        off = (
+            field_numbers.error if field_numbers.errors is None else field_numbers.errors[positions]
+        )
         candidates = np.flatnonzero(sign * values - off <= (sign * values + off).min())
-        among = among[candidates]
-        values = field_numbers.exactly(among)
+        positions = positions[candidates]
+        values = field_numbers.exactly(positions)
     nth = int(values.argmin() if sign == LEAST else values.argmax())
     number: float = values[nth].item()
-    return sign * number, int(field_numbers.rows[among[nth]])
+    return sign * number, int(field_numbers.rows[positions[nth]])
 
 
 _CELL: Final[tuple[tuple[str, BinColumn], ...]] = (

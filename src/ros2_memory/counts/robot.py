@@ -194,9 +194,7 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
     entries = [sum(stay.entered for stay in stays) for stays in stays_of_places]
     exits = [sum(stay.left for stay in stays) for stays in stays_of_places]
     between = binned.elapsed.between
-    lengths = [
-        sum(between(start, stop) for start, stop in _stay_spans(stays)) for stays in stays_of_places
-    ]
+    lengths = [sum(between(stay.start, stay.stop) for stay in stays) for stays in stays_of_places]
     binned.add("entries", "count", [*entries, *rest], sum(entries))
     binned.add("exits", "count", [*exits, *rest], sum(exits))
     binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))

@@ -54,8 +54,7 @@ def at_each(
         if not isinstance(moment, AtTime) or not moment.each:
             return query(memory, call, *args, **kwargs)
         reach = max(ns_argument("timestamps", single.end_s) for single in moment.each)
-        index = OneSnapshot(memory.index, memory.index.snapshot(reach))
-        fixed = replace(memory, index=index)
+        fixed = replace(memory, index=OneSnapshot(memory.index, memory.index.snapshot(reach)))
         answers: list[MomentAnswer | NothingAt] = []
         failures: list[NoDataError] = []
         for single in moment.each:

@@ -120,15 +120,15 @@ class ChangesBefore:
         What changed up to `slack` after it counts as at the moment. `without` is how sentences
         begin that are left out: those of the boolean that toggled.
         """
-        nearest = {}
+        changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
         end = bisect_left(self._changes, (at + slack + 1,))
         for first, last, text in self._changes[begin:end]:
             # A report that goes on is repeated within seconds, if not at the moment itself.
             since = max(0, at - last)
             if since <= length and not (without and text.startswith(without)):
-                nearest[first, text] = PastChange(text, since)
-        return tuple(sorted(nearest.values(), key=lambda change: change.before))
+                changes[first, text] = PastChange(text, since)
+        return tuple(sorted(changes.values(), key=lambda change: change.before))
 
 
 def is_routine(change: PastChange) -> bool:
@@ -147,14 +147,14 @@ def topics_with_changes(view: View) -> list[str]:
 
 
 def changes_in(
-    view: View, window: TimeWindow, earlier_answers: Mapping[str, TopicEvents | None]
+    view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents | None]
 ) -> ChangesBefore:
     """Returns what changed in a window, and in the seconds before it.
 
     Args:
         view: of the call.
         window: of the changes.
-        earlier_answers: the events in the window of topics that were asked before.
+        earlier: the events in the window of topics that were asked before.
     """
     timeline = view.timeline
     events_of_topics: dict[str, TopicEvents] = {}
@@ -162,10 +162,7 @@ def changes_in(
     command = _command_topic(view)
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
-        if topic in earlier_answers:
-            inside = earlier_answers[topic]
-        else:
-            inside = events_in(view, topic, window)
+        inside = earlier[topic] if topic in earlier else events_in(view, topic, window)
         events = _with_lead(view, topic, window, inside, types)
         if events is not None:
             events_of_topics[topic] = events
@@ -359,14 +356,14 @@ def before(
     view = open_view(memory, call, max(at, min(at + _AFTER_NS, memory.clock.now())))
     window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
     changes = changes_in(view, window, {})
-    nearest = changes.before(at, length, slack=SLACK_NS)
+    past = changes.before(at, length, slack=SLACK_NS)
     later = changes_in(view, TimeWindow(window.stop, min(at + _AFTER_NS + 1, MAX_NS)), {})
     robot, speed_mps = _pose_and_speed(view, at, frame_id)
     if not view.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
     elif not changes.looked_at:
         view.notes.add("no topic that would show a change is recorded at this time")
-    elif not nearest:
+    elif not past:
         view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
     for topic, events in changes.events.items():
         note_left_out(view, topic, events)
@@ -375,8 +372,8 @@ def before(
     return Before(
         at,
         length,
-        nearest[:_MOST_CHANGES],
-        len(nearest[_MOST_CHANGES:]),
+        past[:_MOST_CHANGES],
+        len(past[_MOST_CHANGES:]),
         changes.looked_at,
         sum(_is_recorded(view, topic, window) for topic in view.timeline.topics()),
         robot,

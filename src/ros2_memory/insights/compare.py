@@ -142,11 +142,11 @@ def _compare_things(
     )
     for window in windows:
         note_undecoded(view, window)
-    known = known_things(view, limits.min_score, limits.labels, both)
-    note_other_frames(view, known, where)
+    things = known_things(view, limits.min_score, limits.labels, both)
+    note_other_frames(view, things, where)
     first, second = sorted(windows, key=lambda window: (window.start, window.stop))
     frame = next(
-        (known.frames[instance.epoch] for instance in known.estimate.instances), known.frames[0]
+        (things.frames[instance.epoch] for instance in things.estimate.instances), things.frames[0]
     )
     if any(gap_around(view, window) is not None for window in windows):
         view.notes.add("things are not compared: there is nothing to compare them with")
@@ -159,19 +159,19 @@ def _compare_things(
             f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "
             "times ends within the other"
         )
-    runs = {instance.epoch for instance in known.estimate.instances}
+    runs = {instance.epoch for instance in things.estimate.instances}
     if (
         len(runs) > 1
-        and not known.has_map
+        and not things.has_map
         and not is_one_run(view, resolve_path_topic(view), windows)
     ):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    view.notes.add(*vague_notes(known, windows), *unplaced_notes(known, (first, second)))
-    places = places_asked(limits, where, known.frames)
-    return frame, ThingsBetween(known, first, second, where, places).compared()
+    view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, (first, second)))
+    places = places_asked(limits, where, things.frames)
+    return frame, ThingsBetween(things, first, second, where, places).compared()
 
 
 def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:

@@ -49,7 +49,7 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.history.view import View
 
@@ -62,6 +62,11 @@ class Stop(NamedTuple):
 
     standstill: Standstill
     goes_on: bool
+
+    @property
+    def length(self) -> Ns:
+        """How long it lasts in the window."""
+        return self.standstill.end - self.standstill.start
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,11 +96,7 @@ class Drive:
         other one at least lists it, and none lists the last moment of one before it.
         """
         least = min(SHORTEST_NS // 2, length)
-        return tuple(
-            stop
-            for stop in self.standstills
-            if stop.standstill.end - stop.standstill.start >= least
-        )
+        return tuple(stop for stop in self.standstills if stop.length >= least)
 
     def stood(self, length: Ns) -> Ns | None:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
@@ -158,22 +159,11 @@ def _standstills_in(
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
     """
-    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     slices = _stands_of_slices(view, topic, window.widened(CONTEXT_NS))
     stands = [stand for _, stand in slices][::-1]
     standing = standstills_of(joined_blocks([stand.blocks for stand in stands]))
-    last = max((stand.last for stand in stands), default=MIN_NS)
     starts = [standstill.start for standstill in standing]
-    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
-    was_recorded_later = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
-    standstills = tuple(
-        Stop(
-            standstill._replace(start=max(standstill.start, start), end=min(standstill.end, end)),
-            standstill.end > end or (standstill.end == last and not was_recorded_later),
-        )
-        for standstill in standing
-        if standstill.start < end and standstill.end > start
-    )
+    start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     drops = tuple(
         drop
         for stand in stands
@@ -181,14 +171,31 @@ def _standstills_in(
         if start <= drop.time <= end
         and bisect_left(starts, drop.time - SLOT_NS) == bisect_left(starts, drop.time + _BRAKING_NS)
     )
-    return standstills, drops
+    last = max((stand.last for stand in stands), default=MIN_NS)
+    return tuple(_stops_between(view, standing, start, end, last)), drops
+
+
+def _stops_between(
+    view: View, standing: Sequence[Standstill], start: Ns, end: Ns, last: Ns
+) -> Iterator[Stop]:
+    """Yields standstills as far as they are between two times; `last` is that of the last pose."""
+    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
+    was_recorded_later = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
+    for standstill in standing:
+        if standstill.start < end and standstill.end > start:
+            yield Stop(
+                standstill._replace(
+                    start=max(standstill.start, start), end=min(standstill.end, end)
+                ),
+                standstill.end > end or (standstill.end == last and not was_recorded_later),
+            )
 
 
 def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:
     """Yields what shows where the robot stood; see `slices_by_poses`."""
 
-    def make(poses_of_slice: PoseSlice) -> Stands:
-        return stands_of(poses_of_slice.poses, poses_of_slice.start, poses_of_slice.stop)
+    def make(part: PoseSlice) -> Stands:
+        return stands_of(part.poses, part.start, part.stop)
 
     return slices_by_poses(view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS)
 

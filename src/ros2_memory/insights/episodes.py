@@ -143,10 +143,10 @@ def episode_times(
     """Returns when all episodes of a scope held, oldest first, as `read_sightings` does.
 
     Raises:
-        QueryTimeoutError: the call's time is over before one was found.
+        QueryTimeoutError: the call's time is over before one was result.
     """
-    found = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
-    return [(episode.first, episode.until) for episode in found.episodes], found.since
+    result = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
+    return [(episode.first, episode.until) for episode in result.episodes], result.since
 
 
 def spell_of(held: Held) -> Spell:

@@ -154,9 +154,7 @@ def recap(
             for stop in stops
             if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
         )
-    longest = nsmallest(
-        most_events, stops, key=lambda stop: stop.standstill.start - stop.standstill.end
-    )
+    longest = nsmallest(most_events, stops, key=lambda stop: -stop.length)
     events = [
         *_stop_events(longest, places),
         *reported,

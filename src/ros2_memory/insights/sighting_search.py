@@ -112,11 +112,9 @@ class MatchTester:
             ):
                 block = self._block(topic, rows, window)
                 if waiting is None or block.last < waiting.first:
-                    if waiting is not None:
-                        yield waiting
-                    waiting = block
-                    continue
-                newer, waiting = _merged_and_split(waiting, block)
+                    newer, waiting = waiting, block
+                else:
+                    newer, waiting = _merged_and_split(waiting, block)
                 if newer is not None:
                     yield newer
         except QueryTimeoutError:
@@ -218,23 +216,23 @@ class Run:
     begun: bool = True
 
 
-class Runs(NamedTuple):
+class BlockRuns(NamedTuple):
     """Consecutive matches in a block.
 
     Attributes:
-        found: the newest first.
+        runs: the newest first.
         goes_back: whether an earlier match may belong to the oldest.
         goes_on: whether a later match may belong to the newest.
         is_blank: whether it has neither a match nor a message that surely is none.
     """
 
-    found: list[Run]
+    runs: list[Run]
     goes_back: bool = False
     goes_on: bool = False
     is_blank: bool = False
 
 
-def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> Runs:
+def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     """Returns the runs of matches in some messages, of which there is at least one.
 
     A run ends with a message that does not match, and where none comes for longer than
@@ -246,19 +244,19 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> Runs:
     ends = np.cumsum((met == NOT_MET) | begins)
     rows = np.flatnonzero(met == MET)
     if not rows.size:
-        return Runs([], is_blank=int(ends[-1]) == 0)
+        return BlockRuns([], is_blank=int(ends[-1]) == 0)
     new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
     starts = np.flatnonzero(new)
     stops = np.r_[starts[1:], rows.size]
     others = np.flatnonzero(met == NOT_MET)
     until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
     columns = times[rows[starts]], times[rows[stops - 1]], stops - starts, np.minimum(until, after)
-    found = [
+    runs = [
         Run(topic, first, last, messages, None if end == MAX_NS else end)
-        for first, last, messages, end in zip(*(column.tolist() for column in columns), strict=True)
+        for first, last, messages, end in np.stack(columns, axis=1).tolist()
     ]
-    return Runs(
-        found[::-1],
+    return BlockRuns(
+        runs[::-1],
         goes_back=not apart and int(ends[rows[0]]) == 0,
         goes_on=not apart and ends[rows[-1]] == ends[-1],
     )
@@ -303,17 +301,17 @@ class _TopicRuns:
         if not tested.times.size:
             return
         after, self._begins = self._begins, int(tested.times[0])
-        runs = runs_of(self._topic, tested, after, apart=self._apart)
+        added = runs_of(self._topic, tested, after, apart=self._apart)
         is_near = after - int(tested.times[-1]) <= SILENCE_NS
-        if runs.is_blank:
+        if added.is_blank:
             self._is_open = self._is_open and is_near
             return
-        if self._is_open and is_near and runs.goes_on:
-            newer, older = self.runs.pop(), runs.found.pop(0)
+        if self._is_open and is_near and added.goes_on:
+            newer, older = self.runs.pop(), added.runs.pop(0)
             messages = newer.messages + older.messages
             self.runs.append(replace(newer, first=older.first, messages=messages))
-        self.runs += runs.found
-        self._is_open = runs.goes_back
+        self.runs += added.runs
+        self._is_open = added.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that was not searched.
@@ -426,9 +424,6 @@ def _has_enough(runs_by_topic: dict[str, _TopicRuns], enough: int, reached: Ns) 
 
 
 def _newest_first(runs_by_topic: dict[str, _TopicRuns]) -> list[Run]:
-    if len(runs_by_topic) == 1:
-        [only] = runs_by_topic.values()
-        return only.runs
     return sorted(
         (run for topic_runs in runs_by_topic.values() for run in topic_runs.runs),
         key=_by_last,

@@ -215,34 +215,34 @@ def _goal_sightings(
 def _episodes_of_text(
     view: View, topic: str, condition: Condition, scope: Scope, shown: _Selection
 ) -> _FoundRows:
-    found = find_episodes(
+    result = find_episodes(
         view, topic, condition, scope, limit=shown.limit, oldest_first=shown.oldest_first
     )
     searched = scope.window
-    if found.since is not None:
-        searched = TimeWindow(found.since, searched.stop)
+    if result.since is not None:
+        searched = TimeWindow(result.since, searched.stop)
     view.notes.retract_outside(searched)
     episodes = tuple(
         with_robot(view, topic, episode, shown.frame_id)
-        for episode in found.episodes
+        for episode in result.episodes
         if view.call.wants(episode.until)
     )
-    return _FoundRows(found.total, searched, not found.episodes, episodes=episodes)
+    return _FoundRows(result.total, searched, not result.episodes, episodes=episodes)
 
 
 def _runs_as_sightings(
     view: View, search: ReverseSearch, scope: Scope, shown: _Selection, fields: Sequence[str]
 ) -> _FoundRows:
-    found = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
-    if found.is_over:
+    result = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
+    if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
         view.notes.complete = False
-        reached = unix_text(found.searched_to or MIN_NS)
+        reached = unix_text(result.searched_to or MIN_NS)
         view.notes.add(
             f"the search ran out of time at {reached}: to continue, pass that time as end"
         )
-    runs = found.runs[-shown.limit :][::-1] if shown.oldest_first else found.runs[: shown.limit]
-    searched, is_cut = scope.window, found.searched_to is not None
+    runs = result.runs[-shown.limit :][::-1] if shown.oldest_first else result.runs[: shown.limit]
+    searched, is_cut = scope.window, result.searched_to is not None
     if is_cut:
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
@@ -258,7 +258,7 @@ def _runs_as_sightings(
     )
     if fields:
         sightings = _with_fields(view, sightings, [newest for _, newest in wanted], fields)
-    return _FoundRows(None if is_cut else len(found.runs), searched, not runs, sightings=sightings)
+    return _FoundRows(None if is_cut else len(result.runs), searched, not runs, sightings=sightings)
 
 
 def read_sightings(
@@ -271,7 +271,7 @@ def read_sightings(
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
         NoDataError: there is no such topic, or none of its messages can be decoded.
-        QueryTimeoutError: the call's time is over before the first match was found.
+        QueryTimeoutError: the call's time is over before the first match was result.
     """
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
@@ -279,11 +279,11 @@ def read_sightings(
         return [(goal.first, goal.last) for goal in reversed(goals)], None
     if says_episodes(view, topics):
         return episode_times(view, topics[0], condition, scope)
-    found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
-    if found.is_over:
+    result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
+    if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    spans = [(run.first, _lasted_until(view, run, scope)) for run in reversed(found.runs)]
-    return spans, spans[0][0] if found.is_over else None
+    spans = [(run.first, _lasted_until(view, run, scope)) for run in reversed(result.runs)]
+    return spans, spans[0][0] if result.is_over else None
 
 
 def _latched_notes(
@@ -327,15 +327,14 @@ def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
     To its last match where a silence is next; so does a log entry. What a latched topic states
     lasts through silences. Not beyond the end of a scope.
     """
-    last, until = run.last, run.until
+    last = run.last
     if view.timeline.is_log(run.topic):
         return last
-    end = scope.window.asked()[1]
-    if until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
-        until = held_until(view, run.topic, last, end)
-    else:
-        until = max(last, min(until, end)) if until - last <= SILENCE_NS else last
-    return scope.holds_until(last, until)
+    _, end = scope.window.asked()
+    if run.until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
+        return scope.holds_until(last, held_until(view, run.topic, last, end))
+    is_silent = run.until - last > SILENCE_NS
+    return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
 
 
 def _sighting(

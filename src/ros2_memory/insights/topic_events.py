@@ -107,7 +107,7 @@ def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterat
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    # What a part has before or after is of it all the same.
+    # The parts that lie across a bound of the window are made, too.
     of_topics = [_timed_events_back(view, topic, window.widened(PART_NS)) for topic in topics]
     yield from merge(*((at for at, _ in timed) for timed in of_topics), reverse=True)
 
