@@ -215,7 +215,7 @@ class TrueIntervals:
 
     @classmethod
     def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> TrueIntervals:
-        """Returns those of tuples of start, stop and whether it is known that it began then."""
+        """Returns intervals of their starts, stops, and whether each is known to begin there."""
         starts, stops, begun = zip(*spans, strict=True) if spans else ((), (), ())
         return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
 

@@ -173,7 +173,7 @@ class _LabelReader:
                 parts = defaultdict(list)
                 sources = (_detection_blocks(self._view, topic, window) for topic in topics)
                 for block in heapq.merge(*sources, key=lambda block: -block.last):
-                    parts[block.topic].append(self._counted(block, wanted))
+                    parts[block.topic].append(self._read_block(block, wanted))
                     reached = block.first if len(topics) == 1 else block.last
                     if reading.expired():
                         raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
@@ -191,8 +191,11 @@ class _LabelReader:
     def _add_intervals(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
         self.visible += [joined(parts_of_topic[::-1]).visible for parts_of_topic in parts.values()]
 
-    def _counted(self, block: _DetectionBlock, wanted: Callable[[str], bool]) -> IntervalPart:
-        """Returns when labels that are wanted were in view, by messages that count."""
+    def _read_block(self, block: _DetectionBlock, wanted: Callable[[str], bool]) -> IntervalPart:
+        """Returns when wanted labels were in view in a block, by detections that count.
+
+        How many of each one message has is taken up into `most_at_once`.
+        """
         times, detections = block.detected.log_times, block.detected.found
         is_wanted = np.array([wanted(word) for word in detections.labels.words], np.bool_)
         counts = is_wanted[detections.labels.codes] & ~(detections.scores < self._least_score)
