@@ -98,10 +98,10 @@ class TimeBins:
 
     def pieces(self, times: ArrayLike) -> NDArray[np.intp]:
         """Returns the piece of each time; times outside of the window count to its ends."""
-        found = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
-        return np.clip(found, 0, len(self.member) - 1)
+        pieces = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
+        return np.clip(pieces, 0, len(self.member) - 1)
 
-    def among(self, times: ArrayLike) -> Flags:
+    def membership(self, times: ArrayLike) -> Flags:
         """Returns for each time and each bin whether it is in the bin; as `pieces` for others."""
         return self.member[self.pieces(times)]
 
@@ -110,22 +110,22 @@ class TimeBins:
 
         What lies outside of the window does not count.
         """
-        begin = np.asarray(starts, np.int64)
-        until = _passed(self.edges, begin) - _passed(
-            self.edges, np.maximum(begin, np.asarray(stops, np.int64))
+        start_times = np.asarray(starts, np.int64)
+        elapsed_until_edges = _summed_ages(self.edges, start_times) - _summed_ages(
+            self.edges, np.maximum(start_times, np.asarray(stops, np.int64))
         )
-        return np.diff(until) @ self.member.astype(np.int64)
+        return np.diff(elapsed_until_edges) @ self.member.astype(np.int64)
 
 
-def _passed(edges: Ints, times: Ints) -> Ints:
-    """Returns for each edge how long ago the times before it were, added up.
+def _summed_ages(edges: Ints, times: Ints) -> Ints:
+    """Returns for each edge the sum (ns) of how long before it each of the earlier times was.
 
     Sums may wrap around; so do their differences, which are what is wanted.
     """
     ordered = np.sort(times)
-    before = np.searchsorted(ordered, edges)
+    counts_before = np.searchsorted(ordered, edges)
     sums = np.concatenate((np.zeros(1, np.int64), np.cumsum(ordered)))
-    return before.astype(np.int64) * edges - sums[before]
+    return counts_before.astype(np.int64) * edges - sums[counts_before]
 
 
 def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -> TimeBins:
@@ -135,32 +135,38 @@ def time_bins(window: TimeWindow, by: ClockBin, offset: Offset = local_offset) -
         InvalidArgumentsError: there would be too many.
     """
     days_long = (window.stop - window.start) // (_DAY_S * NS_PER_S)
-    if days_long > (most := MOST_BINS if by == "day" else MOST_DAYS):
-        raise _too_long(by, most)
-    unit = _HOUR_S if by == "hour" else _DAY_S
-    starts = [window.start]
-    at = window.start // NS_PER_S
-    last = (window.stop - 1) // NS_PER_S
-    while (at := _next_edge(at, unit, offset)) <= last:
-        if at * NS_PER_S > window.start:
-            starts.append(at * NS_PER_S)
+    most_days = MOST_BINS if by == "day" else MOST_DAYS
+    if days_long > most_days:
+        raise _too_long(by, most_days)
+    starts = _piece_starts(window, _HOUR_S if by == "hour" else _DAY_S, offset)
     locals_s = [start // NS_PER_S + offset(start // NS_PER_S) for start in starts]
-    days = [local // _DAY_S for local in locals_s]
+    days = [local_s // _DAY_S for local_s in locals_s]
     if by == "day":
-        keys = days
+        bin_of_piece = days
     elif by == "weekday":
-        keys = [date.fromordinal(_EPOCH + day).weekday() for day in days]
+        bin_of_piece = [date.fromordinal(_EPOCH + day).weekday() for day in days]
     else:
-        keys = [local % _DAY_S // _HOUR_S for local in locals_s]
-    known = sorted(set(keys))
-    if len(known) > MOST_BINS + 1:  # a window of so many days touches one day more
+        bin_of_piece = [local_s % _DAY_S // _HOUR_S for local_s in locals_s]
+    bins = sorted(set(bin_of_piece))
+    if len(bins) > MOST_BINS + 1:  # a window of so many days touches one day more
         raise _too_long(by, MOST_BINS)
     return TimeBins(
-        tuple(_name(key, by) for key in known),
-        np.array([*starts, window.stop], np.int64),
-        np.array(keys)[:, None] == np.array(known),
-        np.array(days, np.int64),
+        names=tuple(_bin_name(number, by) for number in bins),
+        edges=np.array([*starts, window.stop], np.int64),
+        member=np.array(bin_of_piece)[:, None] == np.array(bins),
+        day_of=np.array(days, np.int64),
     )
+
+
+def _piece_starts(window: TimeWindow, unit_s: int, offset: Offset) -> list[Ns]:
+    """Returns the window's start, and where local days (or hours) begin in it."""
+    starts = [window.start]
+    last_s = (window.stop - 1) // NS_PER_S
+    edge_s = _next_edge(window.start // NS_PER_S, unit_s, offset)
+    while edge_s <= last_s:
+        starts.append(edge_s * NS_PER_S)
+        edge_s = _next_edge(edge_s, unit_s, offset)
+    return starts
 
 
 def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
@@ -170,27 +176,27 @@ def _too_long(by: ClockBin, most: int) -> InvalidArgumentsError:
     )
 
 
-def _next_edge(at: int, unit: int, offset: Offset) -> int:
+def _next_edge(at_s: int, unit_s: int, offset: Offset) -> int:
     """Returns the first Unix second after this one in which another local day (or hour) begins."""
     while True:
-        ahead = offset(at)
-        following = at - (at + ahead) % unit + unit
+        ahead = offset(at_s)
+        following = at_s - (at_s + ahead) % unit_s + unit_s
         if offset(following) == ahead:
             return following
         # Clocks are changed on the way: the first second of the new time.
-        low, high = at, following
+        low, high = at_s, following
         while high - low > 1:
             middle = (low + high) // 2
             low, high = (middle, high) if offset(middle) == ahead else (low, middle)
-        if (high + offset(high)) // unit != (high - 1 + ahead) // unit:
+        if (high + offset(high)) // unit_s != (high - 1 + ahead) // unit_s:
             return high
-        at = high
+        at_s = high
 
 
-def _name(key: int, by: ClockBin) -> str:
+def _bin_name(number: int, by: ClockBin) -> str:
     if by == "day":
-        return date.fromordinal(_EPOCH + key).isoformat()
-    return _WEEKDAYS[key] if by == "weekday" else f"{key:02d}:00"
+        return date.fromordinal(_EPOCH + number).isoformat()
+    return _WEEKDAYS[number] if by == "weekday" else f"{number:02d}:00"
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,7 +215,7 @@ class TrueIntervals:
 
     @classmethod
     def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> TrueIntervals:
-        """Returns them of tuples."""
+        """Returns intervals of their starts, stops, and whether each is known to begin there."""
         starts, stops, begun = zip(*spans, strict=True) if spans else ((), (), ())
         return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
 
@@ -224,7 +230,7 @@ def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
     ordered = np.sort(np.asarray(times, np.int64))
     days = bins.day_of[bins.pieces(ordered)]
     _, first = np.unique(days, return_index=True)
-    return [int(each) for each in ordered[first]]
+    return [int(at) for at in ordered[first]]
 
 
 def usual_time(times: Sequence[Ns], of_days: int, offset: Offset = local_offset) -> Usual:
@@ -250,33 +256,38 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
     topic = resolve_path_topic(view)
     asked_frame = None if where is None else where.frame_id
     placement = map_placement(view, topic, asked_frame)
-    named = view.limits.places if where is None else where.places(placement.frame_id)
-    places = places_in(view, named, placement, window)
+    named_places = view.limits.places if where is None else where.places(placement.frame_id)
+    places = places_in(view, named_places, placement, window)
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
             f"by place needs named places in {frames}, and there is none in "
             f"{places_setting(view.limits)}"
         )
-    inside = [
-        united((each.start, each.stop + 1) for each in joined.inside(place.region, window))
+    spans_inside = [
+        united((visit.start, visit.stop + 1) for visit in joined.inside(place.region, window))
         for place, joined in places
     ]
-    known = placed_times(joined_in(view, placement.frame_id, window).track, [])
-    cuts = {at for spans in (*inside, known) for span in spans for at in span}
-    within = sorted(at for at in cuts if window.start < at < window.stop)
-    edges = np.array([window.start, *within, window.stop], np.int64)
-    in_places = np.array([_covered(edges, spans) for spans in inside]).T
+    placed_spans = placed_times(joined_in(view, placement.frame_id, window).track, [])
+    edges = _edges_at_spans(window, [*spans_inside, placed_spans])
+    in_places = np.array([_lies_in_spans(edges, spans) for spans in spans_inside]).T
     if (np.diff(edges)[in_places.sum(axis=1) > 1] > NS_PER_S).any():
         view.notes.add("places overlap: what is in two of them counts to both")
     in_none = ~in_places.any(axis=1)
-    placed = _covered(edges, known)
+    placed = _lies_in_spans(edges, placed_spans)
     member = np.column_stack((in_places, in_none & placed, in_none & ~placed))
-    names = (*(each.name for each, _ in places), ELSEWHERE, UNKNOWN)
+    names = (*(place.name for place, _ in places), ELSEWHERE, UNKNOWN)
     return TimeBins(names, edges, member, None)
 
 
-def _covered(edges: Ints, spans: Sequence[tuple[Ns, Ns]]) -> Flags:
+def _edges_at_spans(window: TimeWindow, span_lists: Sequence[Sequence[tuple[Ns, Ns]]]) -> Ints:
+    """Returns the bounds of a window, and those of spans that lie in it, in order."""
+    bounds = {at for spans in span_lists for span in spans for at in span}
+    inner = sorted(at for at in bounds if window.start < at < window.stop)
+    return np.array([window.start, *inner, window.stop], np.int64)
+
+
+def _lies_in_spans(edges: Ints, spans: Sequence[tuple[Ns, Ns]]) -> Flags:
     """Returns for each piece between two edges whether it lies in one of some half-open spans."""
     starts, stops = np.array(spans, np.int64).reshape(-1, 2).T
     begun = np.searchsorted(starts, edges[:-1], side="right")
@@ -328,9 +339,8 @@ class BinnedWindow:
         self._by = by
         self._topics = tuple(topics)
         start, end = asked.asked()
-        reach = recorded_reach(view.snapshot, asked)
-        if reach is not None:
-            start, end = max(start, reach[0]), min(end, reach[1])
+        first, last = recorded_reach(view.snapshot, asked) or (start, end)
+        start, end = max(start, first), min(end, last)
         if end < start:
             raise no_data_between(view, self._topics, asked)
         self.counted = reached(view.snapshot, asked)
@@ -357,9 +367,12 @@ class BinnedWindow:
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
-        parts = self.view.timeline.segments_in(self.counted)
+        segments = self.view.timeline.segments_in(self.counted)
         spans = np.concatenate(
-            [np.empty((2, 0), np.int64), *(part.bounds_in(topics, self.counted) for part in parts)],
+            [
+                np.empty((2, 0), np.int64),
+                *(segment.bounds_in(topics, self.counted) for segment in segments),
+            ],
             axis=1,
         )
         firsts, lasts = pieces_of(spans[0], spans[1], pause)
@@ -373,17 +386,18 @@ class BinnedWindow:
 
     def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
         """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
-        self.add(column, kind, self._lengths(spans).tolist(), self._total(spans))
+        self.add(column, kind, self._time_in_bins(spans).tolist(), self._time_in_window(spans))
 
     def add_counts(self, column: str, times: ArrayLike) -> None:
         """Adds how many of these times each bin has."""
-        counts = self.bins.among(times).sum(axis=0)
+        counts = self.bins.membership(times).sum(axis=0)
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
     def add_held(self, held: TrueIntervals) -> None:
         """Adds how often something began, how long it held, and its first and last time."""
         inside = (held.stops >= self.counted.start) & (held.starts < self.counted.stop)
-        starts, stops = (some[inside].clip(*self._ends) for some in (held.starts, held.stops))
+        starts = held.starts[inside].clip(*self._counted_bounds)
+        stops = held.stops[inside].clip(*self._counted_bounds)
         begins = starts[held.begun[inside]]
         self.add_counts("count", begins)
         self.add_lengths(
@@ -396,23 +410,20 @@ class BinnedWindow:
 
     def add_first(self, column: str, times: Ints) -> None:
         """Adds the first of these times in each bin."""
-        among = self.bins.among(times)
-        first = [int(times[each].min()) if each.any() else None for each in among.T]
+        in_bins = self.bins.membership(times)
+        first = [int(times[in_bin].min()) if in_bin.any() else None for in_bin in in_bins.T]
         self.add(column, "time", first, min(times.tolist(), default=None))
 
     def _last_held(self, starts: Ints, stops: Ints) -> Values:
         """Returns for each bin when something held there for the last time."""
-        found: list[float | None] = [None] * len(self.bins.names)
-        begin, end = self.bins.pieces(starts), self.bins.pieces(stops)
-        newest = np.full(len(self.bins.member), MIN_NS)
-        np.maximum.at(newest, end, np.minimum(stops, self.bins.edges[end + 1] - 1))
-        for first, last in zip(begin[begin < end].tolist(), end[begin < end].tolist(), strict=True):
-            before = newest[first:last]
-            np.maximum(before, self.bins.edges[first + 1 : last + 1] - 1, out=before)
-        for number, some in enumerate(self.bins.member.T):
-            latest = int(newest[some].max(initial=MIN_NS))
-            found[number] = None if latest == MIN_NS else latest
-        return found
+        piece_ends = self.bins.edges[1:] - 1
+        first_pieces, last_pieces = self.bins.pieces(starts), self.bins.pieces(stops)
+        newest = np.full(len(piece_ends), MIN_NS)
+        np.maximum.at(newest, last_pieces, np.minimum(stops, piece_ends[last_pieces]))
+        for first, last in zip(first_pieces.tolist(), last_pieces.tolist(), strict=True):
+            newest[first:last] = piece_ends[first:last]
+        last_of_bins = (int(newest[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
+        return [None if last == MIN_NS else last for last in last_of_bins]
 
     def usual_of(self, times: Ints) -> Usual | None:
         """Returns the usual time of day of the first of these times in each day."""
@@ -424,29 +435,30 @@ class BinnedWindow:
         if self.bins.day_of is None:
             return 0
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
-        found = set()
+        recorded_days = set()
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             missing = sum(max(min(end, stop) - max(begin, start), 0) for begin, end in self.gaps)
             if missing < stop - start:
-                found.add(day)
-        return len(found)
+                recorded_days.add(day)
+        return len(recorded_days)
 
-    def _lengths(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
+    def _time_in_bins(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
         """Returns how much time (ns) of half-open spans passed in each bin."""
-        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._ends)
+        starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._counted_bounds)
         lengths = self.bins.lengths(starts, stops)
         for skipped in self.elapsed.skipped:
             lengths -= self.bins.lengths(starts.clip(*skipped), stops.clip(*skipped))
         return lengths
 
-    def _total(self, spans: Sequence[tuple[Ns, Ns]]) -> Ns:
+    def _time_in_window(self, spans: Sequence[tuple[Ns, Ns]]) -> Ns:
         """Returns how much time (ns) of half-open spans passed in the window."""
-        start, stop = self._ends
+        start, stop = self._counted_bounds
         inside = [(max(begin, start), min(end, stop)) for begin, end in spans]
         return sum(self.elapsed.between(begin, end) for begin, end in inside if begin < end)
 
     @property
-    def _ends(self) -> tuple[Ns, Ns]:
+    def _counted_bounds(self) -> tuple[Ns, Ns]:
+        """Start and stop of what is counted of the window."""
         start = self.window.start if self._since is None else max(self.window.start, self._since)
         return start, max(start, self.window.stop)
 
@@ -467,19 +479,19 @@ class BinnedWindow:
 
     def answer(self) -> Bins:
         """Returns the answer, with notes on what could not be read."""
-        recorded = self._lengths([self._ends]) - self._lengths(self.gaps)
+        bounds = [self._counted_bounds]
+        recorded = self._time_in_bins(bounds) - self._time_in_bins(self.gaps)
+        recorded_in_all = self._time_in_window(bounds) - self._time_in_window(self.gaps)
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
         columns = zip(recorded.tolist(), *self._values, strict=True)
         rows = [*zip(self.bins.names, columns, strict=True)]
-        empty = [not any(values) for _, values in rows]
         if self._since is not None:
             is_late = self.bins.edges[1:] > self._since
-            counted: list[bool] = np.any(self.bins.member[is_late], axis=0).tolist()
-            rows, empty = [*compress(rows, counted)], [*compress(empty, counted)]
+            rows = [*compress(rows, np.any(self.bins.member[is_late], axis=0))]
         if self._by != "place":
-            self._note_empty(empty, [name for name, _ in rows])
-            rows = [row for row, is_empty in zip(rows, empty, strict=True) if not is_empty]
+            self._note_empty(rows)
+            rows = [(name, values) for name, values in rows if any(values)]
         return Bins(
             by=self._by,
             about=self._topics,
@@ -487,20 +499,19 @@ class BinnedWindow:
             end=self.window.stop,
             columns=(("recorded_s", "duration"), *self._columns),
             rows=tuple(rows),
-            all=(self._total([self._ends]) - self._total(self.gaps), *self._all),
+            all=(recorded_in_all, *self._all),
             usual=self.usual,
             usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),
         )
 
-    def _note_empty(self, empty: Sequence[bool], names: Sequence[str]) -> None:
+    def _note_empty(self, rows: Sequence[tuple[str, Values]]) -> None:
         """Notes the bins in which nothing was recorded: several in a row by the first and last."""
         spans: list[str] = []
-        for is_empty, some in groupby(zip(empty, names, strict=True), lambda row: row[0]):
-            of_span = [name for _, name in some]
-            if is_empty:
-                one = len(of_span) == 1
-                spans.append(of_span[0] if one else f"{of_span[0]} to {of_span[-1]}")
+        for has_values, group in groupby(rows, lambda row: any(row[1])):
+            first, *later = (name for name, _ in group)
+            if not has_values:
+                spans.append(f"{first} to {later[-1]}" if later else first)
         if spans:
             more = len(spans) - _MOST_SPANS
             shown = ", ".join(spans[:_MOST_SPANS]) + (f" and {more} more" if more > 0 else "")

@@ -92,11 +92,12 @@ def count_labels(
             f'label as value ("{ANY_LABEL}" for all), and no field'
         )
     topics = matching_topics(view, topic)
-    seen = _Seen(view, scope, condition.least_score if condition.min_score > 0 else -np.inf)
-    seen.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
-    window = scope.window if seen.since is None else replace(scope.window, start=seen.since)
-    table, elapsed = united(seen.visible), elapsed_in(view, window)
-    rows = _rows(table, seen.most, elapsed)
+    least_score = condition.least_score if condition.min_score > 0 else -np.inf
+    reader = _LabelReader(view, scope, least_score)
+    reader.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
+    window = scope.window if reader.since is None else replace(scope.window, start=reader.since)
+    table, elapsed = united(reader.visible), elapsed_in(view, window)
+    rows = _label_rows(table, reader.most_at_once, elapsed)
     note_robots_on(view, topics, window)
     note_unread(view, asked, nothing=not rows, search=True)
     note_edges(view, asked)
@@ -114,7 +115,7 @@ def count_labels(
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
-    start, end = asked.asked() if seen.since is None else window.asked()
+    start, end = asked.asked() if reader.since is None else window.asked()
     first, last = recorded_reach(view.snapshot, asked) or (start, end)
     return Bins(
         by=BY_LABEL,
@@ -123,39 +124,40 @@ def count_labels(
         end=max(min(end, last), start),
         columns=_COLUMNS,
         rows=tuple(rows[:_MOST_LABELS]),
-        all=_whole(seen, table, elapsed),
+        all=_row_of_all(reader, table, elapsed),
         notes=view.notes.sentences(),
     )
 
 
-class _Block(NamedTuple):
+class _DetectionBlock(NamedTuple):
     """Messages of a topic that no other ones of it lie between."""
 
     topic: str
-    found: Detected
+    detected: Detected
 
     @property
     def first(self) -> Ns:
-        return int(self.found.log_times[0])
+        return int(self.detected.log_times[0])
 
     @property
     def last(self) -> Ns:
-        return int(self.found.log_times[-1])
+        return int(self.detected.log_times[-1])
 
 
-class _Seen:
+class _LabelReader:
     """Reads what counts, the newest first.
 
     Attributes:
         visible: when labels were in view.
-        most: of each label, how many one message has at most; `most_of_all`: of all together.
+        most_at_once: of each label, how many one message has at most.
+        most_at_once_of_all: of all labels together.
         since: back to when all was read, where the time was over before; else None.
     """
 
     def __init__(self, view: View, scope: Scope, least_score: float) -> None:
         self.visible: list[IntervalTable] = []
-        self.most: Counter[str] = Counter()
-        self.most_of_all = 0
+        self.most_at_once: Counter[str] = Counter()
+        self.most_at_once_of_all = 0
         self.since: Ns | None = None
         self._view = view
         self._scope = scope
@@ -169,95 +171,100 @@ class _Seen:
         try:
             for window in self._scope.narrowed():
                 parts = defaultdict(list)
-                sources = (_blocks(self._view, topic, window) for topic in topics)
+                sources = (_detection_blocks(self._view, topic, window) for topic in topics)
                 for block in heapq.merge(*sources, key=lambda block: -block.last):
-                    parts[block.topic].append(self._counted(block, wanted))
+                    parts[block.topic].append(self._read_block(block, wanted))
                     reached = block.first if len(topics) == 1 else block.last
                     if reading.expired():
                         raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
-                self._take(parts)
+                self._add_intervals(parts)
         except QueryTimeoutError:
             if reached is None:
                 raise
-            self._take(parts)
+            self._add_intervals(parts)
             self.since = reached
             self._view.notes.add_lack(
                 f"not all before {unix_text(reached)} is counted: "
                 f"{self._view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
             )
 
-    def _take(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
-        self.visible += [joined(some[::-1]).visible for some in parts.values()]
+    def _add_intervals(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
+        self.visible += [joined(parts_of_topic[::-1]).visible for parts_of_topic in parts.values()]
 
-    def _counted(self, block: _Block, wanted: Callable[[str], bool]) -> IntervalPart:
-        """Returns when labels that are wanted were in view, by messages that count."""
-        times, found = block.found.log_times, block.found.found
-        words = np.array([wanted(word) for word in found.labels.words], np.bool_)
-        counts = words[found.labels.codes] & ~(found.scores < self._least_score)
+    def _read_block(self, block: _DetectionBlock, wanted: Callable[[str], bool]) -> IntervalPart:
+        """Returns when wanted labels were in view in a block, by detections that count.
+
+        How many of each one message has is taken up into `most_at_once`.
+        """
+        times, detections = block.detected.log_times, block.detected.found
+        is_wanted = np.array([wanted(word) for word in detections.labels.words], np.bool_)
+        counts = is_wanted[detections.labels.codes] & ~(detections.scores < self._least_score)
         if self._scope.is_bounded:
             # The newest first, as it reads what the other topic said.
             holds = [self._scope.holds_at(time) for time in times[::-1].tolist()]
-            counts &= np.array(holds[::-1], np.bool_)[found.rows]
-        rows, codes = found.rows[counts], found.labels.codes[counts].astype(np.int64)
-        labels = found.labels.words
+            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+        rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+        labels = detections.labels.words
         if rows.size:
-            pairs, times_each = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
-            for code, at_once in zip(pairs[1].tolist(), times_each.tolist(), strict=True):
-                self.most[labels[code]] = max(self.most[labels[code]], at_once)
-            self.most_of_all = max(self.most_of_all, int(np.bincount(rows).max()))
-        visible = visible_in(times, rows, codes, found.scores[counts], labels)
+            pairs, counts_at_once = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
+            for code, at_once in zip(pairs[1].tolist(), counts_at_once.tolist(), strict=True):
+                self.most_at_once[labels[code]] = max(self.most_at_once[labels[code]], at_once)
+            self.most_at_once_of_all = max(self.most_at_once_of_all, int(np.bincount(rows).max()))
+        visible = visible_in(times, rows, codes, detections.scores[counts], labels)
         return IntervalPart(block.first, block.last, visible)
 
 
-def _blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_Block]:
+def _detection_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[_DetectionBlock]:
     """Yields the messages of a topic in blocks that do not overlap, the newest first."""
     reader = DetectionRows(view)
     left_out = 0
-    for together in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
-        found = joined_detected([reader.of(rows) for rows in together])
-        left_out += sum(map(len, together)) - found.log_times.size
-        if found.log_times.size:
-            yield _Block(topic, found)
+    for overlapping in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
+        detected = joined_detected([reader.of(rows) for rows in overlapping])
+        left_out += sum(map(len, overlapping)) - detected.log_times.size
+        if detected.log_times.size:
+            yield _DetectionBlock(topic, detected)
     if left_out:
         view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
 
 
-def _rows(
-    table: IntervalTable, most: Mapping[str, int], elapsed: Elapsed
+def _label_rows(
+    table: IntervalTable, most_at_once: Mapping[str, int], elapsed: Elapsed
 ) -> list[tuple[str, tuple[float | None, ...]]]:
     """Returns the values of each label, those seen most often first."""
     intervals: defaultdict[str, list[VisibleInterval]] = defaultdict(list)
-    for each in table.intervals():
-        intervals[each.label].append(each)
-    found: list[tuple[str, tuple[float | None, ...]]] = [
-        (
-            named(label),
-            (
-                len(some),
-                elapsed.among((each.first, each.last) for each in some),
-                min(each.first for each in some),
-                max(each.last for each in some),
-                max((each.best for each in some if each.best is not None), default=None),
-                most[label],
-            ),
-        )
-        for label, some in intervals.items()
-    ]
-    return sorted(found, key=lambda row: (-(row[1][0] or 0), row[0]))
+    for interval in table.intervals():
+        intervals[interval.label].append(interval)
+    rows = []
+    for label, of_label in intervals.items():
+        spans = [(interval.first, interval.last) for interval in of_label]
+        rows.append((named(label), _row(of_label, spans, elapsed, most_at_once[label])))
+    return sorted(rows, key=lambda row: (-(row[1][0] or 0), row[0]))
 
 
-def _whole(seen: _Seen, table: IntervalTable, elapsed: Elapsed) -> tuple[float | None, ...]:
-    """Returns the values of all labels together: for how long any of them was in view."""
-    every = table.intervals()
-    spans = united_spans((each.first, each.last) for each in every)
+def _row(
+    intervals: Sequence[VisibleInterval],
+    spans: Sequence[tuple[Ns, Ns]],
+    elapsed: Elapsed,
+    most_at_once: int,
+) -> tuple[float | None, ...]:
+    """Returns the values of `_COLUMNS` for intervals, which last for some spans in all."""
     return (
-        len(every),
+        len(intervals),
         elapsed.among(spans),
         min((first for first, _ in spans), default=None),
         max((last for _, last in spans), default=None),
-        max((each.best for each in every if each.best is not None), default=None),
-        seen.most_of_all,
+        max((interval.best for interval in intervals if interval.best is not None), default=None),
+        most_at_once,
     )
+
+
+def _row_of_all(
+    reader: _LabelReader, table: IntervalTable, elapsed: Elapsed
+) -> tuple[float | None, ...]:
+    """Returns the values of all labels together: for how long any of them was in view."""
+    intervals = table.intervals()
+    spans = united_spans((interval.first, interval.last) for interval in intervals)
+    return _row(intervals, spans, elapsed, reader.most_at_once_of_all)
 
 
 _MOST_VALUES: Final = 100
@@ -305,20 +312,19 @@ def count_values(
     start, end = asked.asked()
     first, last = recorded_reach(view.snapshot, asked) or (start, end)
     start, stop = max(start, first), min(end, last) + 1
-    held: list[Held] = []
     try:
-        held += values.during(start, stop)
+        values_held = values.during(start, stop)
     except QueryTimeoutError as error:
         # What is newer is known all the same.
-        held += values.known[::-1]
-        if not held:
+        values_held = values.known[::-1]
+        if not values_held:
             raise
         start = values.reached
         view.notes.add_lack(f"{error}: only what is after {unix_text(start)} is counted")
-    if not held:
+    if not values_held:
         raise no_data_between(view, (topic,), asked)
-    tallies = _tallied(view, held, asked, (start, stop), condition)
-    rows = sorted(tallies, key=lambda each: (-each.length, each.first))
+    tallies = _tallies_of(values_held, elapsed_in(view, asked), (start, stop), condition)
+    rows = sorted(tallies, key=lambda tally: (-tally.length, tally.first))
     if len(rows) > _MOST_VALUES:
         more = counted(len(rows) - _MOST_VALUES, "value")
         view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")
@@ -332,45 +338,46 @@ def count_values(
         end=stop - 1,
         columns=(("count", "count"), ("seconds", "duration"), ("first", "time"), ("last", "time")),
         rows=tuple(
-            (each.name, (each.count, each.length, each.first, each.last))
-            for each in rows[:_MOST_VALUES]
+            (tally.name, (tally.count, tally.length, tally.first, tally.last))
+            for tally in rows[:_MOST_VALUES]
         ),
         all=(
-            sum(each.count for each in rows),
-            sum(each.length for each in rows),
-            min((each.first for each in rows), default=None),
-            max((each.last for each in rows), default=None),
+            sum(tally.count for tally in rows),
+            sum(tally.length for tally in rows),
+            min((tally.first for tally in rows), default=None),
+            max((tally.last for tally in rows), default=None),
         ),
         notes=view.notes.sentences(),
     )
 
 
-def _tallied(
-    view: View,
-    held: Sequence[Held],
-    asked: TimeWindow,
+def _tallies_of(
+    values: Sequence[Held],
+    elapsed: Elapsed,
     window: tuple[Ns, Ns],
     condition: Condition | None,
 ) -> list[_Tally]:
-    found: dict[str, _Tally | None] = {}
-    elapsed = elapsed_in(view, asked)
-    for each in held:
-        if each.word not in found:
-            counts = condition is None or condition.matches({"value": each.exact})
-            found[each.word] = (
-                None
-                if each.is_blank or not counts
-                else _Tally(_name(each), 0, 0, each.start, each.stop)
-            )
-        tally = found[each.word]
-        if tally is not None:
-            tally.count += 1
-            tally.length += elapsed.between(max(each.start, window[0]), min(each.stop, window[1]))
-            tally.last = each.stop
-    return [each for each in found.values() if each is not None]
+    """Returns a tally for each value that counts, whose length is that in a window (ns)."""
+    start, stop = window
+    tallies: dict[str, _Tally] = {}
+    uncounted: set[str] = set()
+    for value in values:
+        if value.word in uncounted:
+            continue
+        if value.word not in tallies:
+            counts = condition is None or condition.matches({"value": value.exact})
+            if value.is_blank or not counts:
+                uncounted.add(value.word)
+                continue
+            tallies[value.word] = _Tally(_shown_value(value), 0, 0, value.start, value.stop)
+        tally = tallies[value.word]
+        tally.count += 1
+        tally.length += elapsed.between(max(value.start, start), min(value.stop, stop))
+        tally.last = value.stop
+    return [*tallies.values()]
 
 
-def _name(held: Held) -> str:
+def _shown_value(held: Held) -> str:
     value = held.value
     name = value if isinstance(value, str) else json.dumps(value)
     return Quoted(shortened(name, _LONGEST_VALUE))

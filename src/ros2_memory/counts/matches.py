@@ -94,15 +94,15 @@ def count_matches(
     binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
     held, since, unknown = None, None, []
+    is_one_topic = where is None and not during and len(topics) == 1
     # Events have labels without scores.
-    by_events = isinstance(condition.test, Contains | Equals) and not condition.min_score
-    alone = where is None and not during and len(topics) == 1
-    if alone and by_events:
-        held, since = _by_events(binned, topics[0], condition, value)
+    can_be_event = isinstance(condition.test, Contains | Equals) and not condition.min_score
+    if is_one_topic and can_be_event:
+        held, since = _held_by_events(binned, topics[0], condition, value)
     if held is None:
         scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
-        lasting = [*_lasting_at_begin(binned, topics, condition, scope)]
+        lasting = _held_at_begin(binned, topics, condition, scope)
         held = TrueIntervals.of([*lasting, *((first, last, True) for first, last in spans)])
         unknown = scope.unknown
     binned.count_since(since)
@@ -134,7 +134,7 @@ def _by_value(
     return count_values(view, topics[0], asked, fields=fields, condition=wanted)
 
 
-def _by_events(
+def _held_by_events(
     binned: BinnedWindow, topic: str, condition: Condition, value: JsonValue
 ) -> tuple[TrueIntervals | None, Ns | None]:
     """Returns when a condition held, by the events of a topic, and since when these are known.
@@ -149,8 +149,8 @@ def _by_events(
         return None, None
     if wanted is not None and condition.field is None and _has_lists(view, topic):
         return None, None  # booleans in lists are no events
-    parts, since = _events(view, topic, binned.counted)
-    _note_limits(view, topic, parts)
+    parts, since = _events_in_order(view, topic, binned.counted)
+    _note_uncounted(view, topic, parts)
     if wanted is not None:
         before = _met_before(binned, topic, condition) if since is None else None
         return _flag_held(binned, topic, parts, condition, before, wanted=wanted), since
@@ -159,18 +159,20 @@ def _by_events(
 
 def _has_lists(view: View, topic: str) -> bool:
     """Returns whether the newest message of a topic has a list, which may hold booleans."""
-    newest = view.stream.newest(topic, TimeWindow.everything())
-    waiting = [None if newest is None else view.value(newest)]
-    while waiting:
-        value = waiting.pop()
+    message = view.stream.newest(topic, TimeWindow.everything())
+    values = [None if message is None else view.value(message)]
+    while values:
+        value = values.pop()
         if isinstance(value, list):
             return True
         if isinstance(value, dict):
-            waiting.extend(value.values())
+            values.extend(value.values())
     return False
 
 
-def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvents], Ns | None]:
+def _events_in_order(
+    view: View, topic: str, window: TimeWindow
+) -> tuple[list[TopicEvents], Ns | None]:
     """Returns the events of a topic in order, and since when they are known, if not all are.
 
     Raises:
@@ -179,12 +181,12 @@ def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvent
     reading = view.call.partial_after(READING_S)
     parts: list[TopicEvents] = []
 
-    def reached(_: Ns) -> None:
+    def end_in_time(_: Ns) -> None:
         if reading.expired() and parts:
             raise QueryTimeoutError("the rest is left out")
 
     try:
-        parts.extend(events_back(view, topic, window, reached=reached))
+        parts.extend(events_back(view, topic, window, reached=end_in_time))
     except QueryTimeoutError:
         if not parts:
             raise
@@ -192,7 +194,7 @@ def _events(view: View, topic: str, window: TimeWindow) -> tuple[list[TopicEvent
     return parts[::-1], None
 
 
-def _note_limits(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:
+def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:
     left_out = sum(part.left_out for part in parts)
     if left_out:
         view.notes.add(f"{topic} changes too often to count all: {left_out} more")
@@ -205,7 +207,7 @@ def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueInter
     """Returns when a thing with a label was in view; None where there are no labels at all."""
     if not any(part.visible.labels for part in parts):
         return None
-    of_labels = [
+    parts_of_labels = [
         IntervalPart(
             part.first,
             part.last,
@@ -217,8 +219,8 @@ def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueInter
         if part.first <= part.last
     ]
     # Each label's first: only of one label it is known whether a message lay between.
-    seen = united([joined(of_labels).visible.under_one_label("")]).intervals()
-    return TrueIntervals.of([(each.first, each.last, True) for each in seen])
+    intervals = united([joined(parts_of_labels).visible.under_one_label("")]).intervals()
+    return TrueIntervals.of([(interval.first, interval.last, True) for interval in intervals])
 
 
 def _flag_held(
@@ -236,27 +238,33 @@ def _flag_held(
     """
     start, end = binned.counted.asked()
     events = joined_events([part.without_sights() for part in parts])
-    spans: list[tuple[Ns, Ns, bool]] = []
-    if events is not None:
+    spans: list[tuple[Ns, Ns, bool]]
+    if events is None:
+        spans = [(start, end, False)] if before else []
+    else:
         flags, toggles = events.of_kind(FLAG)
-        meant = [each for each in flags if condition.field in {None, each.name}]
+        meant = [flag for flag in flags if condition.field in {None, flag.name}]
         if len(meant) != 1:
             return None
         last = held_until(binned.view, topic, events.last, max(events.last, end))
-        spans += _spans_of(meant[0], toggles, last, wanted=wanted)
-        if before is not None and meant[0].first != wanted:
-            spans += [(start, meant[0].at, False)] if before else []
-        elif before is not None:
-            [(since, stop, _), *later] = spans
-            spans = [(start, stop, False) if before else (since, stop, True), *later]
-    elif before:
-        spans.append((start, end, False))
-    spans.sort()
-    gaps = _gaps_of(binned, topic)
-    return TrueIntervals.of([part for each in spans for part in _without_gaps(*each, gaps)])
+        spans = [*_spans_of_flag(meant[0], toggles, last, wanted=wanted)]
+        if before is not None:
+            spans = _with_time_before(spans, meant[0], start, before=before, wanted=wanted)
+    gaps = _gaps_for_topic(binned, topic)
+    return TrueIntervals.of([part for span in sorted(spans) for part in _without_gaps(*span, gaps)])
 
 
-def _lasting_at_begin(
+def _with_time_before(
+    spans: list[tuple[Ns, Ns, bool]], flag: KnownState, start: Ns, *, before: bool, wanted: bool
+) -> list[tuple[Ns, Ns, bool]]:
+    """Returns when a boolean held from the begin of a window on, at which `before` is known."""
+    if flag.first != wanted:
+        return [(start, flag.at, False), *spans] if before else spans
+    [(since, stop, _), *later] = spans
+    return [(start, stop, False) if before else (since, stop, True), *later]
+
+
+def _held_at_begin(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
 ) -> Iterator[tuple[Ns, Ns, bool]]:
     """Yields until when latched topics still met a condition, by messages before the window."""
@@ -283,21 +291,21 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
     return condition.matches(view.extractor.exact(message, held.type))
 
 
-def _spans_of(
-    known: KnownState, toggles: Sequence[Change], last: Ns, *, wanted: bool
+def _spans_of_flag(
+    flag: KnownState, toggles: Sequence[Change], last: Ns, *, wanted: bool
 ) -> Iterator[tuple[Ns, Ns, bool]]:
     """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
-    since, begun, value = known.at, False, bool(known.first)
+    since, is_begun, value = flag.at, False, bool(flag.first)
     for toggle in toggles:
-        if toggle.name == known.name:
+        if toggle.name == flag.name:
             if value is wanted:
-                yield since, toggle.time, begun
-            since, begun, value = toggle.time, True, bool(toggle.value)
+                yield since, toggle.time, is_begun
+            since, is_begun, value = toggle.time, True, bool(toggle.value)
     if value is wanted:
-        yield since, last, begun
+        yield since, last, is_begun
 
 
-def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
+def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     """Returns the gaps in the recording, each until the first message of a topic after it."""
     bags = binned.view.stream.overlapping_bags([topic], binned.counted)
     # Within a bag that has the topic before and after it, a gap ends where it does.
@@ -308,14 +316,14 @@ def _gaps_of(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
 
 
 def _without_gaps(
-    start: Ns, stop: Ns, begun: bool, gaps: Sequence[tuple[Ns, Ns]]
+    start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]
 ) -> list[tuple[Ns, Ns, bool]]:
     """Returns a time without the gaps in it; what comes after a gap is not known to begin there."""
     parts: list[tuple[Ns, Ns, bool]] = []
     for begin, end in gaps:
         if end < start or begin >= stop:
             continue
-        if begin > start or (begin == start and begun):  # it may toggle in the last message
-            parts.append((start, begin, begun))
-        start, begun = end, False
-    return [*parts, (start, stop, begun)] if start < stop or not parts else parts
+        if begin > start or (begin == start and is_begun):  # it may toggle in the last message
+            parts.append((start, begin, is_begun))
+        start, is_begun = end, False
+    return [*parts, (start, stop, is_begun)] if start < stop or not parts else parts

@@ -105,11 +105,21 @@ class Part(NamedTuple):
     greatest: Extreme
 
 
-class _Known(NamedTuple):
-    """What is known of a column of a part without it: also its least and greatest number."""
+class _OutlineNumbers(NamedTuple):
+    """What an outline states of a column: its totals, and its least and greatest number."""
 
     totals: Totals
     ends: tuple[Extreme, Extreme]
+
+
+class _Least(NamedTuple):
+    """The least number, times the sign, and the log time of the first message that holds it."""
+
+    number: float
+    first: Ns
+
+
+_NO_NUMBER: Final = _Least(math.inf, MAX_NS)
 
 
 class PieceNumbers:
@@ -145,10 +155,10 @@ class PieceNumbers:
         self.failures: list[UndecodableError] = []
         self._read = 0
         self._reading = view.call.partial_after(READING_S)
-        self._left: Ns = MAX_NS
-        self._waiting: list[Rows] = []
+        self._reached_to: Ns = MAX_NS
+        self._pending: list[Rows] = []
         self._parts: defaultdict[tuple[int, int], list[Part]] = defaultdict(list)
-        self._known: dict[tuple[int, int, Extreme], Extreme] = {}
+        self._exact_extremes: dict[tuple[int, int, Extreme], Extreme] = {}
         self._columns: dict[tuple[Definition, str, str], str | None] = {}
 
     def collect(self, window: TimeWindow) -> None:
@@ -160,16 +170,16 @@ class PieceNumbers:
         """
         try:
             for rows in scan(
-                self._view, self._topic, window, newest_first=True, reached=self._reached
+                self._view, self._topic, window, newest_first=True, reached=self._add_newer_than
             ):
-                self._waiting.append(rows)
+                self._pending.append(rows)
         except QueryTimeoutError:
             if not self._parts:
                 raise
-            self.since = self._left + 1
-        for rows in self._waiting:
+            self.since = self._reached_to + 1
+        for rows in self._pending:
             self._add(rows, MIN_NS if self.since is None else self.since)
-        self._waiting.clear()
+        self._pending.clear()
 
     def parts(self, field: int, piece: int) -> Sequence[Part]:
         """Returns the parts of a piece that hold numbers of a field, in any order."""
@@ -178,30 +188,31 @@ class PieceNumbers:
     def extreme(self, field: int, pieces: Iterable[int], sign: int) -> tuple[float, Ns] | None:
         """Returns the least (or greatest) number in some pieces, and when it was first.
 
-        What the columns do not decide is read, but for the time being over.
+        What the columns do not decide is read from bags; if the time for that is over, the number
+        may be off by the error of its column.
         """
-        found = sorted(
+        candidates = sorted(
             part.least if sign == LEAST else part.greatest
             for piece in pieces
             for part in self.parts(field, piece)
         )
-        best = (math.inf, MAX_NS)
-        for extreme in found:
-            if extreme.low > best[0]:
+        least = _NO_NUMBER
+        for extreme in candidates:
+            if extreme.low > least.number:
                 break
-            if extreme.low == best[0] and extreme.first >= best[1]:
+            if extreme.low == least.number and extreme.first >= least.first:
                 continue
-            settled = self._settled(field, sign, extreme)
-            best = min(best, (settled.high, settled.first))
-        return (best[0] * sign, best[1]) if found else None
+            exact = self._exact_extreme(field, sign, extreme)
+            least = min(least, _Least(exact.high, exact.first))
+        return (least.number * sign, least.first) if candidates else None
 
-    def _reached(self, at: Ns) -> None:
+    def _add_newer_than(self, at: Ns) -> None:
         """Adds what no table that is left overlaps; ends the scan where the time is over."""
-        settled = [rows for rows in self._waiting if rows.span[0] > at]
-        self._waiting = [rows for rows in self._waiting if rows.span[0] <= at]
-        for rows in settled:
+        complete = [rows for rows in self._pending if rows.span[0] > at]
+        self._pending = [rows for rows in self._pending if rows.span[0] <= at]
+        for rows in complete:
             self._add(rows, MIN_NS)
-        self._left = at
+        self._reached_to = at
         if self._reading.expired() and self._parts:
             raise QueryTimeoutError("the rest is left out")
 
@@ -211,18 +222,18 @@ class PieceNumbers:
         is_cut = piece != bisect_right(self._edges, rows.last)
         if rows.index is not None or is_cut or rows.first < since:
             return False
-        every = [self._ends(rows, field) for field in range(len(self._fields))]
-        known = [some for some in every if some is not None]
-        if len(known) < len(every):
+        outlines = [self._outline_numbers(rows, field) for field in range(len(self._fields))]
+        stated = [outline for outline in outlines if outline is not None]
+        if len(stated) < len(outlines):
             return False
-        for field, (totals, ends) in enumerate(known):
+        for field, (totals, ends) in enumerate(stated):
             total = totals.total * SUM_SCALE
             part = Part(rows.first, rows.last, totals.size, total, *ends)
             self._parts[field, piece].append(part)
         return True
 
-    def _ends(self, rows: Rows, field: int) -> _Known | None:
-        """Returns what is known of a field in a part without its columns; None where nothing is."""
+    def _outline_numbers(self, rows: Rows, field: int) -> _OutlineNumbers | None:
+        """Returns the numbers of a field by the outline of a table; None where it has none."""
         table = rows.table
         if not isinstance(table, StoredTable) or table.definition is None:
             return None
@@ -237,38 +248,48 @@ class PieceNumbers:
             return None
         least = Extreme(zone.low, zone.low, *totals.least)
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
-        return _Known(totals, (least, greatest))
+        return _OutlineNumbers(totals, (least, greatest))
 
     def _add(self, rows: Rows, since: Ns) -> None:
         """Adds the numbers of a table from a log time on."""
         if self._add_totals(rows, since):
             return
-        found = of_columns(self._view, rows, self._held)
-        if found is None:
-            self._add_read(rows, since)
-        for some, held in found or ():
-            self._add_found(some, held, self._pieces(some, since))
+        stored = of_columns(self._view, rows, self._numbers_of_fields)
+        if stored is None:
+            self._add_from_messages(rows, since)
+        for part_of_rows, numbers_of_fields in stored or ():
+            self._add_to_pieces(part_of_rows, numbers_of_fields, self._pieces(part_of_rows, since))
 
-    def _held(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
-        """Returns the numbers of all fields of a table; None where columns lack some."""
-        found = [numbers(rows.table, field, self._view.extractor) for field in self._fields]
-        held = [_of_rows(some, rows) for some in found if some is not None]
-        return (rows, held) if len(held) == len(found) else None
+    def _numbers_of_fields(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
+        """Returns rows with the numbers of all fields in them; None where columns lack some."""
+        numbers_of_fields = []
+        for field in self._fields:
+            stored = numbers(rows.table, field, self._view.extractor)
+            if stored is None:
+                return None
+            numbers_of_fields.append(_numbers_that_count(stored, rows))
+        return rows, numbers_of_fields
 
-    def _add_found(
-        self, rows: Rows, held: Sequence[FieldNumbers], pieces: Iterable[tuple[int, int, int]]
+    def _add_to_pieces(
+        self,
+        rows: Rows,
+        numbers_of_fields: Sequence[FieldNumbers],
+        pieces: Iterable[tuple[int, int, int]],
     ) -> None:
         """Adds the numbers of each field in some rows to pieces, which are as `_pieces` yields."""
         outlines = [
-            self._ends(rows, field) if rows.index is None else None for field in range(len(held))
+            self._outline_numbers(rows, field) if rows.index is None else None
+            for field in range(len(numbers_of_fields))
         ]
         for piece, start, stop in pieces:
             is_whole = stop - start == len(rows)
             first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
-            for field, (numbers_of_field, outline) in enumerate(zip(held, outlines, strict=True)):
+            for field, (numbers_of_field, outline) in enumerate(
+                zip(numbers_of_fields, outlines, strict=True)
+            ):
                 begin, end = np.searchsorted(numbers_of_field.rows, [start, stop]).tolist()
                 if begin < end:
-                    part = _part(rows, numbers_of_field, (begin, end), (first, last), outline)
+                    part = _part_of(rows, numbers_of_field, (begin, end), (first, last), outline)
                     self._parts[field, piece].append(part)
 
     def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
@@ -285,159 +306,172 @@ class PieceNumbers:
             if max(start, least) < stop:
                 yield piece, max(start, least), stop
 
-    def _add_read(self, rows: Rows, since: Ns) -> None:
+    def _add_from_messages(self, rows: Rows, since: Ns) -> None:
         """Does as `_add`, by the messages: columns do not hold all fields."""
         self._read += len(rows)
         if self._most_read is not None and self._read > self._most_read:
             raise TooManyError
         for bag, positions in rows.bag_rows():
-            read = [
-                (found.time, sample)
-                for found in messages_of(self._view, rows.some(positions))
-                if (sample := self._sample(found)) is not None
+            samples_by_time = [
+                (message.time, sample)
+                for message in messages_of(self._view, rows.some(positions))
+                if (sample := self._sample(message)) is not None
             ]
-            if not read:
+            if not samples_by_time:
                 continue
-            times = np.array([time for time, _ in read], np.int64)
-            whole = Rows(BagUnit(bag, Table(rows.table.channel, times, times, times), 0), _all)
-            samples = [[sample[nth] for _, sample in read] for nth in range(len(self._fields))]
-            self._add_found(whole, [*map(_of_samples, samples)], self._pieces(whole, since))
+            times = np.array([time for time, _ in samples_by_time], np.int64)
+            table = Table(rows.table.channel, times, times, times)
+            read = Rows(BagUnit(bag, table, 0), lambda: None)
+            samples = [
+                [sample[nth] for _, sample in samples_by_time] for nth in range(len(self._fields))
+            ]
+            numbers_of_fields = [*map(_numbers_of_samples, samples)]
+            self._add_to_pieces(read, numbers_of_fields, self._pieces(read, since))
 
-    def _sample(self, found: StoredMessage) -> list[list[float]] | None:
+    def _sample(self, stored: StoredMessage) -> list[list[float]] | None:
         """Returns the numbers of each field in a message; None where it cannot be decoded."""
-        message = self._view.bags.decode(found, self.failures)
+        message = self._view.bags.decode(stored, self.failures)
         if message is None:
             return None
-        at = partial(self._view.extractor.exact_at, message, found.type)
+        at = partial(self._view.extractor.exact_at, message, stored.type)
         return [[*numbers_in(at(field))] for field in self._fields]
 
-    def _settled(self, field: int, sign: int, extreme: Extreme) -> Extreme:
-        """Returns an extreme as the bags have it."""
+    def _exact_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme:
+        """Returns an extreme with its number and message known; by the bags where it is open."""
         if extreme.is_settled:
             return extreme
         key = (field, sign, extreme)
-        if key not in self._known:
+        if key not in self._exact_extremes:
             try:
-                found = self._read_extreme(field, sign, extreme)
+                exact = self._extreme_in_bags(field, sign, extreme)
             except QueryTimeoutError:
-                found = None
+                exact = None
                 self._view.notes.add(
                     "out of time before bags were read for the exact least and greatest numbers: "
                     f"those of {self._fields[field]} may be off in their last digits"
                 )
             number, first = extreme.middle, extreme.first
-            self._known[key] = found or Extreme(number, number, first, first)
-        return self._known[key]
+            self._exact_extremes[key] = exact or Extreme(number, number, first, first)
+        return self._exact_extremes[key]
 
-    def _read_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
+    def _extreme_in_bags(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
         """Returns an extreme by the bags that may hold it; None where these cannot be read."""
-        extractor, path = self._view.extractor, self._fields[field]
-        best = (math.inf, MAX_NS)
-        waiting: list[tuple[Ns, int, Rows]] = []
-        for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
-            known = numbers(rows.table, path, extractor)
-            if known is not None and (not known.error or known.exactly is not None):
-                best = min(best, _first_furthest(rows, _of_rows(known, rows), sign))
-                continue
-            for some in _by_bag(rows, _candidates(rows, known, sign, extreme)):
-                waiting.append((int(some.times[0]), len(waiting), some))
-        if (
-            extreme.low == extreme.high
-            and best[1] == MAX_NS
-            and len(waiting) == 1 == len(waiting[0][2])
-        ):
+        least, undecided = self._least_in_columns(field, sign, extreme)
+        is_number_known = extreme.low == extreme.high and least.first == MAX_NS
+        if is_number_known and len(undecided) == 1 == len(undecided[0]):
             # Of all messages only this one can have the number.
-            return Extreme(extreme.low, extreme.low, waiting[0][0], waiting[0][0])
-        for first, _, rows in sorted(waiting, key=lambda one: one[:2]):
-            if best[0] <= extreme.low and best[1] <= first:
+            at = int(undecided[0].times[0])
+            return Extreme(extreme.low, extreme.low, at, at)
+        for rows in sorted(undecided, key=lambda rows: int(rows.times[0])):
+            if least.number <= extreme.low and least.first <= int(rows.times[0]):
                 break
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
             for _, decoded in decoded_rows(self._view, rows):
-                known = numbers(decoded.table, path, extractor)
-                if known is not None:
-                    best = min(best, _first_furthest(decoded, _of_rows(known, decoded), sign))
-        return None if best[1] == MAX_NS else Extreme(best[0], best[0], best[1], best[1])
+                stored = numbers(decoded.table, self._fields[field], self._view.extractor)
+                if stored is not None:
+                    counting = _numbers_that_count(stored, decoded)
+                    least = min(least, _least_of(decoded, counting, sign))
+        if least.first == MAX_NS:
+            return None
+        return Extreme(least.number, least.number, least.first, least.first)
+
+    def _least_in_columns(
+        self, field: int, sign: int, extreme: Extreme
+    ) -> tuple[_Least, list[Rows]]:
+        """Returns an extreme as far as columns have exact numbers, and rows that bags decide."""
+        least = _NO_NUMBER
+        undecided: list[Rows] = []
+        for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
+            stored = numbers(rows.table, self._fields[field], self._view.extractor)
+            if stored is not None and (not stored.error or stored.exactly is not None):
+                least = min(least, _least_of(rows, _numbers_that_count(stored, rows), sign))
+            else:
+                undecided += _by_bag(rows, _candidates(rows, stored, sign, extreme))
+        return least, undecided
 
 
-def _candidates(rows: Rows, known: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:
+def _candidates(rows: Rows, stored: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:
     """Returns which of some rows may hold an extreme, ascending."""
-    if known is None:
+    if stored is None:
         return np.arange(len(rows))
-    known = _of_rows(known, rows)
-    off = known.error if known.errors is None else known.errors
-    return np.unique(known.rows[sign * known.numbers - off <= extreme.high])
+    field_numbers = _numbers_that_count(stored, rows)
+    off = field_numbers.error if field_numbers.errors is None else field_numbers.errors
+    return np.unique(field_numbers.rows[sign * field_numbers.numbers - off <= extreme.high])
 
 
-def _by_bag(rows: Rows, some: IntArray) -> Iterator[Rows]:
+def _by_bag(rows: Rows, positions_wanted: IntArray) -> Iterator[Rows]:
     """Yields some of the rows, those of each bag by themselves."""
-    for _, positions in rows.bag_rows():
-        kept = np.intersect1d(positions, some, assume_unique=True)
-        if kept.size:
-            yield rows.some(kept)
+    for _, positions_of_bag in rows.bag_rows():
+        wanted_of_bag = np.intersect1d(positions_of_bag, positions_wanted, assume_unique=True)
+        if wanted_of_bag.size:
+            yield rows.some(wanted_of_bag)
 
 
-def _first_furthest(rows: Rows, found: FieldNumbers, sign: int) -> tuple[float, Ns]:
-    """Returns the least exact number, times the sign, and when it was first."""
-    if not found.rows.size:
-        return math.inf, MAX_NS
-    number, row = _furthest(found, np.arange(found.rows.size), sign)
-    return number, int(rows.times[row])
+def _least_of(rows: Rows, field_numbers: FieldNumbers, sign: int) -> _Least:
+    """Returns the least exact number of a field in some rows."""
+    if not field_numbers.rows.size:
+        return _NO_NUMBER
+    number, row = _least_with_row(field_numbers, np.arange(field_numbers.rows.size), sign)
+    return _Least(number, int(rows.times[row]))
 
 
-def _of_rows(found: FieldNumbers, rows: Rows) -> FieldNumbers:
+def _numbers_that_count(field_numbers: FieldNumbers, rows: Rows) -> FieldNumbers:
     """Returns the numbers of the rows that count, by their positions among these."""
     if rows.index is None:
-        return found
-    kept = np.flatnonzero(rows.mask()[found.rows])
-    exactly = found.exactly
-    return found._replace(
-        rows=np.searchsorted(rows.index, found.rows[kept]),
-        numbers=found.numbers[kept],
-        errors=None if found.errors is None else found.errors[kept],
+        return field_numbers
+    kept = np.flatnonzero(rows.mask()[field_numbers.rows])
+    exactly = field_numbers.exactly
+    return field_numbers._replace(
+        rows=np.searchsorted(rows.index, field_numbers.rows[kept]),
+        numbers=field_numbers.numbers[kept],
+        errors=None if field_numbers.errors is None else field_numbers.errors[kept],
         exactly=None if exactly is None else lambda among: exactly(kept[among]),
     )
 
 
-def _extreme(rows: Rows, found: FieldNumbers, among: tuple[int, int], sign: int) -> Extreme:
-    begin, end = among
-    if not found.error or found.exactly is not None:
-        number, row = _furthest(found, np.arange(begin, end), sign)
+def _extreme_of_column(
+    rows: Rows, field_numbers: FieldNumbers, bounds: tuple[int, int], sign: int
+) -> Extreme:
+    """Returns the extreme of the numbers from one index to another, as the column decides it."""
+    begin, end = bounds
+    if not field_numbers.error or field_numbers.exactly is not None:
+        number, row = _least_with_row(field_numbers, np.arange(begin, end), sign)
         at = int(rows.times[row])
         return Extreme(number, number, at, at)
-    signed = sign * found.numbers[begin:end]
-    off = found.error if found.errors is None else found.errors[begin:end]
+    signed = sign * field_numbers.numbers[begin:end]
+    off = field_numbers.error if field_numbers.errors is None else field_numbers.errors[begin:end]
     low, high = float((signed - off).min()), float((signed + off).min())
-    may = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
-    return Extreme(low, high, *rows.times[found.rows[may]].tolist())
+    candidates = begin + np.flatnonzero(signed - off <= high)[[0, -1]]
+    return Extreme(low, high, *rows.times[field_numbers.rows[candidates]].tolist())
 
 
-def _part(
+def _part_of(
     rows: Rows,
-    found: FieldNumbers,
-    among: tuple[int, int],
+    field_numbers: FieldNumbers,
+    bounds: tuple[int, int],
     span: tuple[Ns, Ns],
-    outline: _Known | None,
+    outline: _OutlineNumbers | None,
 ) -> Part:
     """Returns some of the numbers of a field, in messages of a span (ns, inclusive), as a part."""
-    (begin, end), (first, last) = among, span
-    total = float((found.numbers[begin:end] * SUM_SCALE).sum())
-    extremes = [_extreme(rows, found, among, sign) for sign in (LEAST, GREATEST)]
+    (begin, end), (first, last) = bounds, span
+    total = float((field_numbers.numbers[begin:end] * SUM_SCALE).sum())
+    extremes = [_extreme_of_column(rows, field_numbers, bounds, sign) for sign in (LEAST, GREATEST)]
     if outline is not None:
         # Those of the whole table are exact, where they lie here.
         extremes = [
-            whole if first <= whole.first <= whole.last <= last else own
-            for own, whole in zip(extremes, outline.ends, strict=True)
+            stated if first <= stated.first <= stated.last <= last else computed
+            for computed, stated in zip(extremes, outline.ends, strict=True)
         ]
     return Part(first, last, end - begin, total, *extremes)
 
 
-def _of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
+def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
     """Returns the numbers of one field, of which each message has some."""
-    found = np.array([number for sample in samples for number in sample])
-    if found.dtype.kind not in "iu":
-        found = found.astype(np.float64)
-    return FieldNumbers(np.repeat(np.arange(len(samples)), [*map(len, samples)]), found, 0.0)
+    values = np.array([number for sample in samples for number in sample])
+    if values.dtype.kind not in "iu":
+        values = values.astype(np.float64)
+    return FieldNumbers(np.repeat(np.arange(len(samples)), [*map(len, samples)]), values, 0.0)
 
 
 def numbers_in(value: JsonValue) -> Iterator[float]:
@@ -451,21 +485,21 @@ def numbers_in(value: JsonValue) -> Iterator[float]:
             yield leaf
 
 
-def _all() -> None:
-    """Finds that all rows count."""
-
-
-def _furthest(found: FieldNumbers, among: IntArray, sign: int) -> tuple[float, int]:
+def _least_with_row(
+    field_numbers: FieldNumbers, positions: IntArray, sign: int
+) -> tuple[float, int]:
     """Returns the least exact number, times the sign, and its first row."""
-    values = found.numbers[among]
-    if found.error and found.exactly is not None:
-        off = found.error if found.errors is None else found.errors[among]
-        may = np.flatnonzero(sign * values - off <= (sign * values + off).min())
-        among = among[may]
-        values = found.exactly(among)
+    values = field_numbers.numbers[positions]
+    if field_numbers.error and field_numbers.exactly is not None:
+        off = (
+            field_numbers.error if field_numbers.errors is None else field_numbers.errors[positions]
+        )
+        candidates = np.flatnonzero(sign * values - off <= (sign * values + off).min())
+        positions = positions[candidates]
+        values = field_numbers.exactly(positions)
     nth = int(values.argmin() if sign == LEAST else values.argmax())
     number: float = values[nth].item()
-    return sign * number, int(found.rows[among[nth]])
+    return sign * number, int(field_numbers.rows[positions[nth]])
 
 
 _CELL: Final[tuple[tuple[str, BinColumn], ...]] = (
@@ -510,55 +544,57 @@ def count_range(
             f"{len(names)} fields by {by} in {size} bins are too many for one reply: "
             "name fewer fields, or ask about a shorter window"
         )
-    of_fields = _numbers(view, name, binned, names) if names else []
+    cells_of_fields = _cells_of_fields(view, name, binned, names) if names else []
     edges = binned.bins.edges[1:-1]
     counts, first, last = count_messages(view, name, binned.counted, edges)
     if not counts.any():
         raise no_data_between(view, (name,), asked)
     member = binned.bins.member
     binned.add("count", "count", (counts @ member).tolist(), int(counts.sum()))
-    held = [counts.astype(bool) & each for each in member.T]
-    binned.add(
-        "first", "time", [min(first[each].tolist(), default=None) for each in held], first.min()
-    )
-    binned.add(
-        "last", "time", [max(last[each].tolist(), default=None) for each in held], last.max()
-    )
-    for field, cells in zip(names, of_fields, strict=True):
+    in_bins = [counts.astype(bool) & in_bin for in_bin in member.T]
+    firsts = [min(first[in_bin].tolist(), default=None) for in_bin in in_bins]
+    lasts = [max(last[in_bin].tolist(), default=None) for in_bin in in_bins]
+    binned.add("first", "time", firsts, first.min())
+    binned.add("last", "time", lasts, last.max())
+    for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:
             view.notes.add(f"{field} holds no number in the window")
             continue
         for nth, (column, kind) in enumerate(_CELL):
-            *each, whole = [None if cell is None else cell[nth] for cell in cells]
-            binned.add(f"{field}.{column}", kind, each, whole)
+            *of_bins, of_window = [None if cell is None else cell[nth] for cell in cells]
+            binned.add(f"{field}.{column}", kind, of_bins, of_window)
     note_robots(view, name, binned.counted)
     return binned.answer()
 
 
-def _numbers(
+def _cells_of_fields(
     view: View, topic: str, binned: BinnedWindow, fields: Sequence[str]
 ) -> list[Sequence[_Cell | None]]:
-    """Returns for each field the numbers in each bin, and in all of them together."""
-    found = PieceNumbers(view, topic, fields, binned.bins.edges[1:-1])
-    found.collect(binned.counted)
-    binned.count_since(found.since)
-    if found.failures:
-        reason = found.failures[0].reason
+    """Returns for each field the cell of each bin, and last that of all of them together."""
+    collected = PieceNumbers(view, topic, fields, binned.bins.edges[1:-1])
+    collected.collect(binned.counted)
+    binned.count_since(collected.since)
+    if collected.failures:
+        reason = collected.failures[0].reason
         view.notes.add_lack(f"messages left out, since they cannot be decoded: {reason}")
-    pieces = [np.flatnonzero(member).tolist() for member in binned.bins.member.T]
-    pieces.append([*range(len(binned.bins.member))])
-    return [[_cell(found, field, some) for some in pieces] for field in range(len(fields))]
+    pieces_of_bins = [np.flatnonzero(member).tolist() for member in binned.bins.member.T]
+    pieces_of_bins.append([*range(len(binned.bins.member))])
+    return [
+        [_cell(collected, field, pieces) for pieces in pieces_of_bins]
+        for field in range(len(fields))
+    ]
 
 
-def _cell(found: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | None:
+def _cell(collected: PieceNumbers, field: int, pieces: Sequence[int]) -> _Cell | None:
     """Returns the numbers of a field in some pieces; None if there are none."""
-    parts = [part for piece in pieces for part in found.parts(field, piece)]
-    least = found.extreme(field, pieces, LEAST)
-    greatest = found.extreme(field, pieces, GREATEST)
+    parts = [part for piece in pieces for part in collected.parts(field, piece)]
+    least = collected.extreme(field, pieces, LEAST)
+    greatest = collected.extreme(field, pieces, GREATEST)
     if least is None or greatest is None:
         return None
+    (least_number, least_at), (greatest_number, greatest_at) = least, greatest
     total = math.fsum(part.total for part in parts)
     mean = float(f"{total / sum(part.size for part in parts) / SUM_SCALE:.{_MEAN_DIGITS}g}")
     # The extremes are exact; what columns add up to is not. Plus 0: no reply says -0.0.
-    mean = min(max(mean, least[0]), greatest[0]) + 0.0
-    return least[0] + 0, least[1], greatest[0] + 0, greatest[1], mean
+    mean = min(max(mean, least_number), greatest_number) + 0.0
+    return least_number + 0, least_at, greatest_number + 0, greatest_at, mean

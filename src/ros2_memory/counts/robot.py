@@ -63,35 +63,36 @@ def count_path(
         NoDataError: there are no poses in the window.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    region = None if where is None else parse_where(memory.limits, where)
+    place_asked = None if where is None else parse_where(memory.limits, where)
     view, asked = open_span(memory, call, span)
     name = resolve_path_topic(view, topic)
-    binned = BinnedWindow(view, asked, by, (name,), region)
-    way, since = path_by_poses(view, name, binned.counted)
-    if way is None:
+    binned = BinnedWindow(view, asked, by, (name,), place_asked)
+    path, since = path_by_poses(view, name, binned.counted)
+    if path is None:
         raise no_data_between(view, (name,), asked)
     binned.count_since(since)
-    total = way.totals.distance_m
+    total_m = path.totals.distance_m
     edges = binned.bins.edges[1:-1]
-    if region is not None and by != "place":
-        track = joined_in_region(view, region, binned.counted).track
-        inside = robot_inside(track, region.region, binned.counted)
-        total, inner = totals_inside(way.line, inside).distance_m, _upto(way.line, inside, edges)
+    if place_asked is not None and by != "place":
+        track = joined_in_region(view, place_asked, binned.counted).track
+        inside = robot_inside(track, place_asked.region, binned.counted)
+        total_m = totals_inside(path.line, inside).distance_m
+        metres_before = _metres_before(path.line, inside, edges)
     else:
-        inner = way.line.metres_at(edges) if len(way.line) else np.zeros(len(edges))
+        metres_before = path.line.metres_at(edges) if len(path.line) else np.zeros(len(edges))
     # Sums of floats differ by less than a micrometre where nothing was driven.
-    metres = np.diff([0.0, *inner.tolist(), total]).round(6)
-    binned.add("metres", "metres", (metres @ binned.bins.member).tolist(), total)
+    metres = np.diff([0.0, *metres_before.tolist(), total_m]).round(6)
+    binned.add("metres", "metres", (metres @ binned.bins.member).tolist(), total_m)
     require_one_robot(view, name, asked)
     return binned.answer()
 
 
-def _upto(line: Line, inside: Sequence[Inside], edges: Ints) -> NDArray[np.float64]:
+def _metres_before(line: Line, inside: Sequence[Inside], edges: Ints) -> NDArray[np.float64]:
     """Returns how many metres were driven in some times before each edge."""
     metres = np.zeros(len(edges))
-    for one in inside:
-        ends = np.append(edges.clip(one.start, one.stop), one.start)
-        driven = line.metres_at(ends)
+    for stay in inside:
+        bounds = np.append(edges.clip(stay.start, stay.stop), stay.start)
+        driven = line.metres_at(bounds)
         metres += driven[:-1] - driven[-1]
     return metres
 
@@ -131,7 +132,7 @@ def count_visits(
     view = open_view(memory, call, min(window.stop, wall))
     asked = clamped(view, window)
     topic = resolve_path_topic(view)
-    mixed = note_robots(view, topic, asked)
+    mixed_spans = note_robots(view, topic, asked)
     named_frame = None if place is None else place.frame_id
     asked_frame = frame_id if named_frame is None else named_frame
     placement = map_placement(view, topic, asked_frame)
@@ -140,9 +141,9 @@ def count_visits(
     binned = BinnedWindow(view, asked, by, (topic,), place)
     joined = joined_in(view, placement.frame_id, binned.window)
     binned.count_since(joined.since)
-    known = placed_times(joined.track, mixed)
-    binned.add_lengths("placed_s", "duration", known)
-    binned.add_unknown(unknown_times(view, binned.counted, known, WHEREABOUTS))
+    placed_spans = placed_times(joined.track, mixed_spans)
+    binned.add_lengths("placed_s", "duration", placed_spans)
+    binned.add_unknown(unknown_times(view, binned.counted, placed_spans, WHEREABOUTS))
     if place is not None and by != "place":
         stayed = _stays(view, placement.frame_id, place.region, binned.window)
         if not stayed and asked_frame is None:
@@ -152,54 +153,56 @@ def count_visits(
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
     places = places_in(view, named, placement, binned.window)
-    inside = [_stays(view, each.frame_id, each.region, binned.window) for each, _ in places]
+    stays_of_places = [
+        _stays(view, place.frame_id, place.region, binned.window) for place, _ in places
+    ]
     if by == "place":
-        _add_each_place(binned, inside)
+        _add_visits_by_place(binned, stays_of_places)
         return binned.answer()
     if len(places) * len(binned.bins.names) > MOST_CELLS:
         raise InvalidArgumentsError(
             f"{len(places)} places by {by} in {len(binned.bins.names)} bins are too many for one "
             "reply: name one in where, or ask about a shorter window"
         )
-    for (each, _), stays in zip(places, inside, strict=True):
-        binned.add_counts(f"{each.name}.entries", _entries(stays))
-        binned.add_lengths(f"{each.name}.minutes", "minutes", _spans(stays))
+    for (named_place, _), stays in zip(places, stays_of_places, strict=True):
+        binned.add_counts(f"{named_place.name}.entries", _entry_times(stays))
+        binned.add_lengths(f"{named_place.name}.minutes", "minutes", _stay_spans(stays))
     return binned.answer()
 
 
 def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Inside]:
     """Returns when robots were in a region, as `visits` counts them, in order."""
-    return sorted(each.inside for each in RegionVisits(view, frame_id, region, window).every)
+    return sorted(visit.inside for visit in RegionVisits(view, frame_id, region, window).every)
 
 
-def _add_visits(binned: BinnedWindow, inside: Sequence[Inside]) -> None:
+def _add_visits(binned: BinnedWindow, stays: Sequence[Inside]) -> None:
     """Adds the visits to one place."""
-    entries = _entries(inside)
-    exits = np.array([each.stop for each in inside if each.left], np.int64)
+    entries = _entry_times(stays)
+    exits = np.array([stay.stop for stay in stays if stay.left], np.int64)
     binned.add_counts("entries", entries)
     binned.add_counts("exits", exits)
-    binned.add_lengths("minutes", "minutes", _spans(inside))
+    binned.add_lengths("minutes", "minutes", _stay_spans(stays))
     binned.add_first("first_entry", entries)
     binned.add_first("first_exit", exits)
     binned.usual = binned.usual_of(entries)
     binned.usual_exit = binned.usual_of(exits)
 
 
-def _add_each_place(binned: BinnedWindow, inside: Sequence[Sequence[Inside]]) -> None:
+def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Inside]]) -> None:
     """Adds the visits to each named place in the bin of that place."""
-    rest: list[None] = [None] * (len(binned.bins.names) - len(inside))
-    entries = [sum(each.entered for each in stays) for stays in inside]
-    exits = [sum(each.left for each in stays) for stays in inside]
+    rest: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
+    entries = [sum(stay.entered for stay in stays) for stays in stays_of_places]
+    exits = [sum(stay.left for stay in stays) for stays in stays_of_places]
     between = binned.elapsed.between
-    lengths = [sum(between(start, stop) for start, stop in _spans(stays)) for stays in inside]
+    lengths = [sum(between(stay.start, stay.stop) for stay in stays) for stays in stays_of_places]
     binned.add("entries", "count", [*entries, *rest], sum(entries))
     binned.add("exits", "count", [*exits, *rest], sum(exits))
     binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))
 
 
-def _entries(inside: Sequence[Inside]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    return np.array([each.start for each in inside if each.entered], np.int64)
+def _entry_times(stays: Sequence[Inside]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+    return np.array([stay.start for stay in stays if stay.entered], np.int64)
 
 
-def _spans(inside: Sequence[Inside]) -> list[tuple[int, int]]:
-    return [(each.start, each.stop) for each in inside]
+def _stay_spans(stays: Sequence[Inside]) -> list[tuple[int, int]]:
+    return [(stay.start, stay.stop) for stay in stays]

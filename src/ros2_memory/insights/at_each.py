@@ -49,24 +49,23 @@ def at_each(
     """
 
     @wraps(query)
-    def answer(memory: Memory, call: Call, /, *args: P.args, **given: P.kwargs) -> A | AtEach:
-        moment = given["moment"]
+    def answer(memory: Memory, call: Call, /, *args: P.args, **kwargs: P.kwargs) -> A | AtEach:
+        moment = kwargs["moment"]
         if not isinstance(moment, AtTime) or not moment.each:
-            return query(memory, call, *args, **given)
-        reach = max(ns_argument("timestamps", one.end_s) for one in moment.each)
-        index = OneSnapshot(memory.index, memory.index.snapshot(reach))
-        fixed = replace(memory, index=index)
+            return query(memory, call, *args, **kwargs)
+        reach = max(ns_argument("timestamps", single.end_s) for single in moment.each)
+        fixed = replace(memory, index=OneSnapshot(memory.index, memory.index.snapshot(reach)))
         answers: list[MomentAnswer | NothingAt] = []
         failures: list[NoDataError] = []
-        for one in moment.each:
-            given["moment"] = one
+        for single in moment.each:
+            kwargs["moment"] = single
             try:
-                answers.append(query(fixed, call, *args, **given))
+                answers.append(query(fixed, call, *args, **kwargs))
             except NoDataError as error:
-                at = ns_argument("timestamps", one.at_s or 0.0)
+                at = ns_argument("timestamps", single.at_s or 0.0)
                 answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
                 failures.append(error)
-        if len(failures) == len(answers) and len({each.detail for each in failures}) == 1:
+        if len(failures) == len(answers) and len({failure.detail for failure in failures}) == 1:
             raise failures[0]
         return AtEach(tuple(answers))
 
@@ -83,19 +82,19 @@ class OneSnapshot:
         self._snapshot = snapshot
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:  # noqa: ARG002 - of the protocol
-        """Returns the one."""
+        """Returns the snapshot that the index had."""
         return self._snapshot
 
     def refresh(self) -> Snapshot:
-        """Returns the one, too."""
+        """Returns the same; nothing is read again."""
         return self._snapshot
 
     def heartbeat(self) -> Heartbeat | None:
-        """Returns that of the index; so does the next."""
+        """Returns the heartbeat of now."""
         return self._index.heartbeat()
 
     def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """As above."""
+        """Returns the recordings that are joined with one now."""
         return self._index.joined_with(recording)
 
 
@@ -123,26 +122,26 @@ def in_each(
     whole = search_window(span, memory.now(wall, snapshot.latest, call))
     first, last = recorded_reach(snapshot, whole) or (0, -1)
     windows = hours_of_days(whole.intersect(TimeWindow(first, last + 1)), *between)
-    fixed = replace(memory, index=OneSnapshot(memory.index, snapshot))
-    found: list[InWindow] = []
+    fixed_memory = replace(memory, index=OneSnapshot(memory.index, snapshot))
+    answers: list[InWindow] = []
     notes: tuple[str, ...] = ()
     for window in windows:
         answer: OneAnswer
         try:
-            answer = ask(fixed, TimeRange.over(window))
+            answer = ask(fixed_memory, TimeRange.over(window))
         except NoDataError as error:
             answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
         except QueryTimeoutError:
-            if not found:
+            if not answers:
                 raise
-            left = counted(len(windows) - len(found), "day is", "days are")
-            notes = (f"out of time: the last {left} left out; ask about a shorter window",)
+            days_left = counted(len(windows) - len(answers), "day is", "days are")
+            notes = (f"out of time: the last {days_left} left out; ask about a shorter window",)
             break
-        found.append(InWindow(window.start, window.stop, answer))
-    if all(isinstance(each.answer, NothingAt) for each in found):
+        answers.append(InWindow(window.start, window.stop, answer))
+    if all(isinstance(day.answer, NothingAt) for day in answers):
         detail = "nothing is recorded between these hours in this window"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)
-    return InEach(tuple(found), notes=notes)
+    return InEach(tuple(answers), notes=notes)
 
 
 def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWindow]:
@@ -164,12 +163,15 @@ def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWind
     over = timedelta(days=ends <= begins)
     # The hours of the day before may go on after midnight.
     days = [first + timedelta(days=nth) for nth in range(-1, (last - first).days + 1)]
-    spans = [TimeWindow(_moment(day, begins), _moment(day + over, ends)) for day in days]
-    return [part for span in spans if not (part := window.intersect(span)).empty]
+    hours = (
+        window.intersect(TimeWindow(_local_time_ns(day, begins), _local_time_ns(day + over, ends)))
+        for day in days
+    )
+    return [part for part in hours if not part.empty]
 
 
-def _moment(day: date, at: time) -> Ns:
-    """Returns a local time of a day; of one that clocks skip, when they do."""
+def _local_time_ns(day: date, at: time) -> Ns:
+    """Returns when it is a local time on a day; for one that clocks skip, when they skip it."""
     local = datetime.combine(day, at)
     # By the time before clocks are put forward, what is skipped is later than by that after.
     low, high = local.replace(fold=1).timestamp(), local.timestamp()

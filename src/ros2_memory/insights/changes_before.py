@@ -53,7 +53,7 @@ LENGTH_NS: Final = 10 * NS_PER_S
 """How long before an event a change counts."""
 _LEAD_NS: Final = 30 * NS_PER_S
 """How long before a window messages are read: a change shows by the message before it."""
-_KNOWN_NS: Final = 3600 * NS_PER_S
+_OLDEST_STATE_NS: Final = 3600 * NS_PER_S
 """How old a state may be that no later message repeats: of a goal, or of a latched boolean."""
 _AROUND_NS: Final = 600 * NS_PER_S
 """A topic with a bag so near is recorded, though it may have nothing to report."""
@@ -73,7 +73,7 @@ _ACTIVE_GOAL: Final = frozenset({1, 2, 3})
 _ROUTINE: Final = ("goal accepted", "goal succeeded")
 
 
-class _Change(NamedTuple):
+class _DatedChange(NamedTuple):
     """Something that changed on a topic; a log entry that is repeated goes on until `last`."""
 
     first: Ns
@@ -92,13 +92,13 @@ class ChangesBefore:
 
     def __init__(
         self,
-        changes: Iterable[_Change],
+        changes: Iterable[_DatedChange],
         looked_at: tuple[str, ...],
         state: tuple[tuple[str, bool | str], ...],
         events: Mapping[str, TopicEvents],
     ) -> None:
         self._changes = sorted(changes)
-        self._longest = max((each.last - each.first for each in self._changes), default=0)
+        self._longest = max((change.last - change.first for change in self._changes), default=0)
         self.looked_at = looked_at
         self.state = state
         self.events = events
@@ -120,15 +120,15 @@ class ChangesBefore:
         What changed up to `slack` after it counts as at the moment. `without` is how sentences
         begin that are left out: those of the boolean that toggled.
         """
-        found = {}
+        changes = {}
         begin = bisect_left(self._changes, (at - length - self._longest,))
         end = bisect_left(self._changes, (at + slack + 1,))
         for first, last, text in self._changes[begin:end]:
             # A report that goes on is repeated within seconds, if not at the moment itself.
             since = max(0, at - last)
             if since <= length and not (without and text.startswith(without)):
-                found[first, text] = PastChange(text, since)
-        return tuple(sorted(found.values(), key=lambda each: each.before))
+                changes[first, text] = PastChange(text, since)
+        return tuple(sorted(changes.values(), key=lambda change: change.before))
 
 
 def is_routine(change: PastChange) -> bool:
@@ -138,7 +138,7 @@ def is_routine(change: PastChange) -> bool:
 
 def topics_with_changes(view: View) -> list[str]:
     """Returns the topics whose events show changes: those with events, and the commands."""
-    timeline, command = view.timeline, _command(view)
+    timeline, command = view.timeline, _command_topic(view)
     return [
         topic
         for topic in timeline.topics()
@@ -147,44 +147,54 @@ def topics_with_changes(view: View) -> list[str]:
 
 
 def changes_in(
-    view: View, window: TimeWindow, known: Mapping[str, TopicEvents | None]
+    view: View, window: TimeWindow, earlier: Mapping[str, TopicEvents | None]
 ) -> ChangesBefore:
     """Returns what changed in a window, and in the seconds before it.
 
     Args:
         view: of the call.
         window: of the changes.
-        known: the events in the window of topics that were asked before.
+        earlier: the events in the window of topics that were asked before.
     """
     timeline = view.timeline
-    joined: dict[str, TopicEvents] = {}
+    events_of_topics: dict[str, TopicEvents] = {}
     looked_at: list[str] = []
-    command = _command(view)
+    command = _command_topic(view)
     for topic in topics_with_changes(view):
         types = timeline.types_of(topic)
-        found = known[topic] if topic in known else events_in(view, topic, window)
-        events = _with_lead(view, topic, window, found, types)
+        inside = earlier[topic] if topic in earlier else events_in(view, topic, window)
+        events = _with_lead(view, topic, window, inside, types)
         if events is not None:
-            joined[topic] = events
-        if any(map(has_changes, types)) or (events is not None and events.known):
-            looked_at += [topic] if _is_recorded(view, topic, window) else []
-    changes: list[_Change] = []
-    for topic, events in joined.items():
-        if topic != command:
-            changes += _changes(topic, events)
-    if command in joined:
-        actions = [[*_activity(events)] for events in joined.values()]
-        changes += [
-            _Change(stop.time, stop.time, f"{command} went to zero while a goal was active")
-            for stop in joined[command].of_kind(COMMAND)[1]
-            if not stop.value and any(_is_active(action, stop.time) for action in actions)
-        ]
+            events_of_topics[topic] = events
+        can_show_changes = any(map(has_changes, types)) or (events is not None and events.known)
+        if can_show_changes and _is_recorded(view, topic, window):
+            looked_at.append(topic)
+    changes = [
+        change
+        for topic, events in events_of_topics.items()
+        if topic != command
+        for change in _changes_of_topic(topic, events)
+    ]
     return ChangesBefore(
-        changes,
+        [*changes, *_commanded_stops(command, events_of_topics)],
         tuple(looked_at),
-        tuple(_state(view, window, joined)),
-        joined,
+        tuple(_state_at_end(view, window, events_of_topics)),
+        events_of_topics,
     )
+
+
+def _commanded_stops(
+    command: str, events_of_topics: Mapping[str, TopicEvents]
+) -> Iterator[_DatedChange]:
+    """Yields when the commanded velocity became zero while a goal was active."""
+    if command not in events_of_topics:
+        return
+    actions = [[*_goal_activity(events)] for events in events_of_topics.values()]
+    _, commands = events_of_topics[command].of_kind(COMMAND)
+    for change in commands:
+        if not change.value and any(_is_active(action, change.time) for action in actions):
+            text = f"{command} went to zero while a goal was active"
+            yield _DatedChange(change.time, change.time, text)
 
 
 def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
@@ -192,96 +202,97 @@ def _is_recorded(view: View, topic: str, window: TimeWindow) -> bool:
     return any(view.timeline.extents(topic, window.widened(_AROUND_NS)))
 
 
-def _command(view: View) -> str:
+def _command_topic(view: View) -> str:
     """Returns the topic of velocities that command the robot's base; empty if there is none.
 
     Of `/cmd_vel_nav`, `/cmd_vel_smoothed` and `/cmd_vel`, which follow each other, the last.
     """
     timeline = view.timeline
-    found = [
+    topics = [
         topic
         for topic in timeline.topics()
         if topic.rsplit("/", 1)[-1].startswith("cmd_vel")
         and not VELOCITIES.isdisjoint(timeline.types_of(topic))
     ]
-    return min(found, key=lambda topic: (len(topic), topic), default="")
+    return min(topics, key=lambda topic: (len(topic), topic), default="")
 
 
 def _with_lead(
     view: View,
     topic: str,
     window: TimeWindow,
-    found: TopicEvents | None,
+    events: TopicEvents | None,
     types: Sequence[str],
 ) -> TopicEvents | None:
     """Returns the events in a window, joined with the state before it.
 
     None where neither can have a change: a detector's topic is not read for it.
     """
-    if not (LOG in types or found is None or found.known):
+    if not (LOG in types or events is None or events.known):
         return None
     start = max(window.start - _LEAD_NS, MIN_NS)
-    newest = view.stream.newest(topic, TimeWindow(max(start - _KNOWN_NS, MIN_NS), start))
+    newest = view.stream.newest(topic, TimeWindow(max(start - _OLDEST_STATE_NS, MIN_NS), start))
     before = None if newest is None else events_of_messages(view, [newest])
-    parts = (before, events_in(view, topic, TimeWindow(start, window.start)), found)
+    parts = (before, events_in(view, topic, TimeWindow(start, window.start)), events)
     return joined_events([part.without_sights() for part in parts if part is not None])
 
 
-def _changes(topic: str, events: TopicEvents) -> Iterator[_Change]:
+def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
     for report in events.reports:
-        yield _Change(report.first, report.last, _reported(report))
-    charge = next((each.first for each in events.known if each.kind == CHARGE), 0)
+        yield _DatedChange(report.first, report.last, _report_sentence(report))
+    level = next((state.first for state in events.known if state.kind == CHARGE), 0)
     for change in events.changes:
-        text = _changed(topic, change, charge)
+        text = _change_sentence(topic, change, level)
         if change.kind == CHARGE:
-            charge = change.value
+            level = change.value
         if text:
-            yield _Change(change.time, change.time, text)
-    for known in events.known:
+            yield _DatedChange(change.time, change.time, text)
+    for state in events.known:
         # Where earlier messages are without it, a goal is new, and a status that is not ok; and a
         # charge had been just above a limit.
-        if known.at == events.first:
+        if state.at == events.first:
             continue
-        if known.kind == GOAL:
-            word = GOAL_WORDS.get(known.first, "accepted")
-            yield _Change(known.at, known.at, f"{action_of(topic)} goal {word}")
-        elif known.kind == STATUS and known.first:
-            yield _Change(known.at, known.at, _status(known.name, known.first, known.text))
-        elif known.kind == CHARGE and known.first:
-            yield _Change(known.at, known.at, _fell(topic, known.first))
+        if state.kind == GOAL:
+            word = GOAL_WORDS.get(state.first, "accepted")
+            yield _DatedChange(state.at, state.at, f"{action_of(topic)} goal {word}")
+        elif state.kind == STATUS and state.first:
+            sentence = _status_sentence(state.name, state.first, state.text)
+            yield _DatedChange(state.at, state.at, sentence)
+        elif state.kind == CHARGE and state.first:
+            yield _DatedChange(state.at, state.at, _low_charge_sentence(topic, state.first))
 
 
-def _changed(topic: str, change: Change, charge: int) -> str:
+def _change_sentence(topic: str, change: Change, level_before: int) -> str:
     """Returns a sentence for a change; empty for one that is not reported."""
     if change.kind == FLAG:
         return toggled(topic, change)
     if change.kind == STATUS:
-        return _status(change.name, change.value, change.text)
+        return _status_sentence(change.name, change.value, change.text)
     if change.kind == GOAL and change.value in GOAL_WORDS:
         return f"{action_of(topic)} goal {GOAL_WORDS[change.value]}"
-    if change.kind == CHARGE and change.value > charge:
-        return _fell(topic, change.value)
+    if change.kind == CHARGE and change.value > level_before:
+        return _low_charge_sentence(topic, change.value)
     return ""
 
 
-def _fell(topic: str, level: int) -> str:
+def _low_charge_sentence(topic: str, level: int) -> str:
     return f"{topic} fell below {LOW_CHARGES[level - 1]:.0%}"
 
 
-def _status(name: str, level: int, text: str) -> str:
+def _status_sentence(name: str, level: int, text: str) -> str:
     word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
     more = f": {text}" if text else ""
     return Quoted(f"status of {name} became {word}{more}"[:_MAX_LOG_CHARS])
 
 
-def _reported(report: Report) -> str:
+def _report_sentence(report: Report) -> str:
     if report.reports == 1:
         return Quoted(report.text)
     span = unix_from_ns(report.last - report.first)
     return Quoted(f"{report.text} ({report.reports} times in {span:.0f} s)")
 
 
-def _activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
+def _goal_activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
     """Yields, whenever the status of a goal changes, whether the newest one is active from then on.
 
     An older goal does not count: that it ended may not be recorded.
@@ -290,33 +301,35 @@ def _activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:
     begun = {goal.name: goal.at for goal in goals}
     states = [(goal.at, goal.name, goal.first) for goal in goals]
     states += [(change.time, change.name, change.value) for change in changes]
-    newest, active = MIN_NS, set[str]()
+    newest, active_goals = MIN_NS, set[str]()
     for time, name, value in sorted(states):
         if begun[name] > newest:
             newest = begun[name]
-            active.clear()
+            active_goals.clear()
         if begun[name] == newest:
-            (active.add if value in _ACTIVE_GOAL else active.discard)(name)
-        yield time, bool(active)
+            active_goals.discard(name)
+            if value in _ACTIVE_GOAL:
+                active_goals.add(name)
+        yield time, bool(active_goals)
 
 
-def _is_active(action: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
-    """Returns whether the newest goal of an action was active at a time; see `_activity`."""
-    nth = bisect_right(action, (time, True)) - 1
-    return nth >= 0 and action[nth][1]
+def _is_active(activity: Sequence[tuple[Ns, bool]], time: Ns) -> bool:
+    """Returns whether the newest goal of an action was active at a time; see `_goal_activity`."""
+    nth = bisect_right(activity, (time, True)) - 1
+    return nth >= 0 and activity[nth][1]
 
 
-def _state(
-    view: View, window: TimeWindow, joined: Mapping[str, TopicEvents]
+def _state_at_end(
+    view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents]
 ) -> Iterator[tuple[str, bool | str]]:
     """Yields booleans, statuses that are not ok, and the newest goal of each action, at the end."""
-    for topic, events in joined.items():
-        is_battery = any(each.kind == CHARGE for each in events.known)
+    for topic, events in events_of_topics.items():
+        is_battery = any(state.kind == CHARGE for state in events.known)
         for flag in () if is_battery else events.of_kind(FLAG)[0]:
             yield flag_name(topic, flag), bool(flag.last)
         goals, _ = events.of_kind(GOAL)
         if goals:
-            newest = max(goals, key=lambda each: each.at)
+            newest = max(goals, key=lambda state: state.at)
             word = GOAL_WORDS.get(newest.last, "active")
             if newest.last in _ACTIVE_GOAL and last_listed(view, topic, window, {newest.name}):
                 word = "listed no more"  # its server has restarted
@@ -343,14 +356,14 @@ def before(
     view = open_view(memory, call, max(at, min(at + _AFTER_NS, memory.clock.now())))
     window = TimeWindow(max(at - length, MIN_NS), min(at + SLACK_NS + 1, MAX_NS))
     changes = changes_in(view, window, {})
-    found = changes.before(at, length, slack=SLACK_NS)
+    past = changes.before(at, length, slack=SLACK_NS)
     later = changes_in(view, TimeWindow(window.stop, min(at + _AFTER_NS + 1, MAX_NS)), {})
-    robot, speed_mps = _robot(view, at, frame_id)
+    robot, speed_mps = _pose_and_speed(view, at, frame_id)
     if not view.timeline.overlapping(window):
         view.notes.add(f"nothing was recorded in the {length_s:g} s before")
     elif not changes.looked_at:
         view.notes.add("no topic that would show a change is recorded at this time")
-    elif not found:
+    elif not past:
         view.notes.add(f"nothing changed on the topics looked at in the {length_s:g} s before")
     for topic, events in changes.events.items():
         note_left_out(view, topic, events)
@@ -359,10 +372,10 @@ def before(
     return Before(
         at,
         length,
-        found[:_MOST_CHANGES],
-        len(found[_MOST_CHANGES:]),
+        past[:_MOST_CHANGES],
+        len(past[_MOST_CHANGES:]),
         changes.looked_at,
-        sum(_is_recorded(view, each, window) for each in view.timeline.topics()),
+        sum(_is_recorded(view, topic, window) for topic in view.timeline.topics()),
         robot,
         speed_mps,
         (*changes.state, *_charges(view, at)),
@@ -371,7 +384,7 @@ def before(
     )
 
 
-def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float | None]:
+def _pose_and_speed(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float | None]:
     """Returns the robot's newest pose, in the map where that is known, and its speed.
 
     Raises:
@@ -379,18 +392,18 @@ def _robot(view: View, at: Ns, frame_id: str | None) -> tuple[Pose | None, float
     """
     window = TimeWindow(max(at - _POSE_NS, MIN_NS), at + 1)
     try:
-        found, pose = newest_pose(view, resolve_path_topic(view), window) or (None, None)
+        message, pose = newest_pose(view, resolve_path_topic(view), window) or (None, None)
     except (InvalidArgumentsError, NoDataError):
         return None, None
-    if found is None:
+    if message is None:
         return None, None
-    twist = view.extractor.twist(view.bags.decode(found), found.type)
+    twist = view.extractor.twist(view.bags.decode(message), message.type)
     speed_mps = None if twist is None else math.hypot(*twist.linear)
     if pose is None:
         return None, speed_mps
-    recording = found.bag.recording
-    there = placed(view, pose, found.time, recording, frame_id)
-    return with_place(view, there, found.time, recording), speed_mps
+    recording = message.bag.recording
+    placed_pose = placed(view, pose, message.time, recording, frame_id)
+    return with_place(view, placed_pose, message.time, recording), speed_mps
 
 
 def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
@@ -399,7 +412,7 @@ def _charges(view: View, at: Ns) -> Iterator[tuple[str, str]]:
     for topic in timeline.topics():
         if BATTERY not in timeline.types_of(topic):
             continue
-        found = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
-        part = None if found is None else charge_of(view.value(found))
-        if part is not None:
-            yield topic, f"{part:.0%}"
+        message = view.stream.newest(topic, TimeWindow(max(at - _LEAD_NS, MIN_NS), at + 1))
+        fraction = None if message is None else charge_of(view.value(message))
+        if fraction is not None:
+            yield topic, f"{fraction:.0%}"

@@ -88,37 +88,43 @@ def compare(
         if gap_around(view, window) is not None:
             note_unrecorded(view, window)
     windows = clamped(view, asked), clamped(view, other)
-    frame, things = _things(view, windows, region)
-    drives = [drive_in(view, each) for each in windows]
-    ways = [_way(view, drive, each) for drive, each in zip(drives, windows, strict=True)]
+    frame, things = _compare_things(view, windows, region)
+    drives = [drive_in(view, window) for window in windows]
+    path_numbers = [
+        _path_numbers(view, drive, window) for drive, window in zip(drives, windows, strict=True)
+    ]
     placement = known_placement(view)
-    elapsed = [each.elapsed for each in drives]
-    places = _places(view, placement, windows, region, elapsed)
-    apart = _paths_apart(view, placement, drives, windows, region)
-    errors, silences = ([of(view, each) for each in windows] for of in (_errors, _silent))
+    elapsed = [drive.elapsed for drive in drives]
+    places = _minutes_in_places(view, placement, windows, region, elapsed)
+    apart = _path_differences(view, placement, drives, windows, region)
+    errors = [_error_counts(view, window) for window in windows]
+    silences = [_silent_seconds(view, window) for window in windows]
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
     lengths = (
-        unix_from_ns(passed.between(*each.asked()))
-        for each, passed in zip(windows, elapsed, strict=True)
+        unix_from_ns(passed.between(*window.asked()))
+        for window, passed in zip(windows, elapsed, strict=True)
     )
-    recorded = [_recorded(view, *each) for each in zip(windows, elapsed, strict=True)]
+    recorded = [
+        _recorded_seconds(view, window, passed)
+        for window, passed in zip(windows, elapsed, strict=True)
+    ]
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     view.notes.retract_outside(*windows)
     if region is not None:
         view.notes.add("way, errors and silent_s are not only of that place")
     return Comparison(
-        oldest=min(each.start for each in windows),
-        newest=max(each.stop for each in windows),
+        oldest=min(window.start for window in windows),
+        newest=max(window.stop for window in windows),
         lengths=Pair(*lengths),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
-        way=_differing(ways[0], ways[1], _LEAST),
-        places=_differing(places[0], places[1], _LEAST_MINUTES),
-        errors=_differing(errors[0], errors[1], _LEAST_COUNT),
-        silences=_differing(silences[0], silences[1], _LEAST_SILENT_S),
+        way=_differing(*path_numbers, least=_LEAST),
+        places=_differing(*places, least=_LEAST_MINUTES),
+        errors=_differing(*errors, least=_LEAST_COUNT),
+        silences=_differing(*silences, least=_LEAST_SILENT_S),
         way_frame_id=apart.frame_id,
         stood=apart.stood,
         farthest=apart.farthest,
@@ -126,19 +132,23 @@ def compare(
     )
 
 
-def _things(
+def _compare_things(
     view: View, windows: tuple[TimeWindow, TimeWindow], where: Where | None
 ) -> tuple[str, ComparedThings]:
     """Returns the frame of things, and what became of them from the earlier window to the later."""
     limits = view.limits
-    both = TimeWindow(min(one.start for one in windows), max(one.stop for one in windows))
-    for each in windows:
-        note_undecoded(view, each)
-    known = known_things(view, limits.min_score, limits.labels, both)
-    note_other_frames(view, known, where)
-    first, second = sorted(windows, key=lambda each: (each.start, each.stop))
-    frame = next((known.frames[each.epoch] for each in known.estimate.instances), known.frames[0])
-    if any(gap_around(view, each) is not None for each in windows):
+    both = TimeWindow(
+        min(window.start for window in windows), max(window.stop for window in windows)
+    )
+    for window in windows:
+        note_undecoded(view, window)
+    things = known_things(view, limits.min_score, limits.labels, both)
+    note_other_frames(view, things, where)
+    first, second = sorted(windows, key=lambda window: (window.start, window.stop))
+    frame = next(
+        (things.frames[instance.epoch] for instance in things.estimate.instances), things.frames[0]
+    )
+    if any(gap_around(view, window) is not None for window in windows):
         view.notes.add("things are not compared: there is nothing to compare them with")
         return frame, ComparedThings((), (), (), (), 0)
     if first.start == second.start:
@@ -149,38 +159,38 @@ def _things(
             f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "
             "times ends within the other"
         )
-    runs = {each.epoch for each in known.estimate.instances}
+    runs = {instance.epoch for instance in things.estimate.instances}
     if (
         len(runs) > 1
-        and not known.has_map
+        and not things.has_map
         and not is_one_run(view, resolve_path_topic(view), windows)
     ):
         view.notes.add(
             "things are not recognised from one run of odometry to another, which has its own "
             "coordinates: one whose label was seen in both windows is in not_comparable"
         )
-    view.notes.add(*vague_notes(known, windows), *unplaced_notes(known, (first, second)))
-    places = places_asked(limits, where, known.frames)
-    return frame, ThingsBetween(known, first, second, where, places).compared()
+    view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, (first, second)))
+    places = places_asked(limits, where, things.frames)
+    return frame, ThingsBetween(things, first, second, where, places).compared()
 
 
-def _way(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
+def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
     """Returns the numbers of the path; None for unknown ones."""
-    known = drive.known
-    if known is None:
+    trajectory = drive.valid_trajectory
+    if trajectory is None:
         return dict.fromkeys(_LEAST)
-    view.notes.add(*length_notes(known))
+    view.notes.add(*length_notes(trajectory))
     start, end = window.asked()
     stood = drive.stood(end - start)
     return {
-        "distance_m": known.totals.distance_m,
-        "max_speed": known.max_speed,
+        "distance_m": trajectory.totals.distance_m,
+        "max_speed": trajectory.max_speed,
         "stood_s": None if stood is None else unix_from_ns(stood),
         "standstills": None if stood is None else float(len(drive.stops(end - start))),
     }
 
 
-class _WaysApart(NamedTuple):
+class _PathDifferences(NamedTuple):
     """The differences between two paths in space, and the frame of their places."""
 
     frame_id: str = ""
@@ -188,57 +198,61 @@ class _WaysApart(NamedTuple):
     farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
 
 
-def _paths_apart(
+def _path_differences(
     view: View,
     placement: MapPlacement | None,
     drives: Sequence[Drive],
     windows: tuple[TimeWindow, TimeWindow],
     where: Where | None,
-) -> _WaysApart:
+) -> _PathDifferences:
     """Returns where the robot stood, and where it drove, in one window and not in the other."""
-    if placement is None or any(each.path is None for each in drives):
-        return _WaysApart()
+    if placement is None or any(drive.path is None for drive in drives):
+        return _PathDifferences()
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
-        return _WaysApart()
+        return _PathDifferences()
     if not placement.is_map and not is_one_run(view, resolve_path_topic(view), windows):
         view.notes.add(
             f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
             "lead to a map"
         )
-        return _WaysApart()
+        return _PathDifferences()
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    tracks = [joined_in(view, frame, each).track for each in windows]
+    tracks = [joined_in(view, frame, window).track for window in windows]
     stands = [
         [
             *placed_standstills(
-                track, ((each.start, each.end) for each, _ in drive.standstills), region
+                track,
+                ((standstill.start, standstill.end) for standstill, _ in drive.standstills),
+                region,
             )
         ]
         for track, drive in zip(tracks, drives, strict=True)
     ]
     stood: list[StandstillPlace] = []
     for at in stood_at(*stands):
-        this, other = (unix_from_ns(each) for each in at.durations)
-        if differ(this, other, _LEAST["stood_s"]):
+        this_s, other_s = (unix_from_ns(duration) for duration in at.durations)
+        if differ(this_s, other_s, _LEAST["stood_s"]):
             inside = places_at(places, frame, at.x, at.y)
-            stood.append(StandstillPlace((at.x, at.y), inside, Pair(this, other), at.since))
-    stood.sort(key=lambda each: -abs((each.seconds.this or 0.0) - (each.seconds.other or 0.0)))
+            stood.append(StandstillPlace((at.x, at.y), inside, Pair(this_s, other_s), at.since))
+    stood.sort(key=lambda stand: -abs((stand.seconds.this or 0.0) - (stand.seconds.other or 0.0)))
     points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
-    one, two = (None if each is None else _far(places, frame, each) for each in points)
-    return _WaysApart(frame, tuple(stood), (one, two))
+    this, other = (_with_named_place(places, frame, point) for point in points)
+    return _PathDifferences(frame, tuple(stood), (this, other))
 
 
-def _far(places: Sequence[Place], frame: str, point: FarPoint) -> FarFromOther | None:
-    """Returns a point with its named place; None where the paths are equal."""
-    if point.away_m < _LEAST_APART_M:
+def _with_named_place(
+    places: Sequence[Place], frame: str, point: FarPoint | None
+) -> FarFromOther | None:
+    """Returns a point with its named place; None where there is none, or the paths are equal."""
+    if point is None or point.away_m < _LEAST_APART_M:
         return None
     inside = places_at(places, frame, point.x, point.y)
     return FarFromOther((point.x, point.y), inside, point.away_m, point.time)
 
 
-def _places(
+def _minutes_in_places(
     view: View,
     placement: MapPlacement | None,
     windows: tuple[TimeWindow, TimeWindow],
@@ -252,7 +266,7 @@ def _places(
     places = view.limits.places
     if placement is None or (where is None and not places):
         return [{}, {}]
-    found: list[dict[str, float | None]] = []
+    minutes_of_windows: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
             asked = [
@@ -261,38 +275,44 @@ def _places(
             ]
         else:
             asked = [
-                (place.title, place.region, joined_in(view, frame, window))
+                (
+                    place.title,
+                    place.region,
+                    joined_in(view, place.frame_id or placement.frame_id, window),
+                )
                 for place in where.each
-                for frame in [place.frame_id or placement.frame_id]
             ]
         minutes: dict[str, float | None] = {}
         for name, region, joined in asked:
-            lasted = passed.among((one.start, one.stop) for one in joined.inside(region, window))
+            lasted = passed.among((stay.start, stay.stop) for stay in joined.inside(region, window))
             minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
-        found.append(minutes)
+        minutes_of_windows.append(minutes)
     # Where it was in neither window, as far as is known, nothing differs.
-    been = {name for minutes in found for name, lasted in minutes.items() if lasted}
-    return [{name: lasted for name, lasted in minutes.items() if name in been} for minutes in found]
+    been = {name for minutes in minutes_of_windows for name, lasted in minutes.items() if lasted}
+    return [
+        {name: lasted for name, lasted in minutes.items() if name in been}
+        for minutes in minutes_of_windows
+    ]
 
 
-def _errors(view: View, window: TimeWindow) -> Mapping[str, float]:
+def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported."""
     counts: dict[str, float] = defaultdict(float)
-    for found in found_events(view, window, has_errors).values():
-        for error in () if found is None else found.errors:
+    for events in found_events(view, window, has_errors).values():
+        for error in () if events is None else events.errors:
             counts[Quoted(error.text)] += error.reports
     return counts
 
 
-def _silent(view: View, window: TimeWindow) -> Mapping[str, float]:
+def _silent_seconds(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns for how many seconds each topic was silent while the robot was on."""
-    silent: dict[str, float] = defaultdict(float)
-    for each in silences_in(view, window):
-        silent[each.topic] += unix_from_ns(each.length)
-    return silent
+    seconds: dict[str, float] = defaultdict(float)
+    for silence in silences_in(view, window):
+        seconds[silence.topic] += unix_from_ns(silence.length)
+    return seconds
 
 
-def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
+def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
     """Returns how many seconds of a window were recorded, but for pauses of less than a split."""
     start, end = window.asked()
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
@@ -312,23 +332,24 @@ def _recorded(view: View, window: TimeWindow, elapsed: Elapsed) -> float:
 def _differing(
     this: Mapping[str, float | None],
     other: Mapping[str, float | None],
+    *,
     least: Mapping[str, float] | float,
 ) -> tuple[tuple[str, Pair], ...]:
     """Returns the numbers that differ, those that differ most first.
 
     A name that one side lacks is 0 there; a number that is not known on one side is listed.
     """
-    found: list[tuple[float, str, Pair]] = []
+    differing: list[tuple[float, str, Pair]] = []
     for name in dict.fromkeys([*this, *other]):
         one, two = this.get(name, 0.0), other.get(name, 0.0)
         floor = least if isinstance(least, float) else least[name]
         if one is None or two is None:
             if one is not two:
-                found.append((0.0, name, Pair(one, two)))
+                differing.append((0.0, name, Pair(one, two)))
         elif differ(one, two, floor):
-            found.append((abs(one - two), name, Pair(one, two)))
-    found.sort(key=lambda each: (-each[0], each[1]))
-    return tuple((name, pair) for _, name, pair in found)
+            differing.append((abs(one - two), name, Pair(one, two)))
+    differing.sort(key=lambda row: (-row[0], row[1]))
+    return tuple((name, pair) for _, name, pair in differing)
 
 
 def differ(one: float, two: float, least: float) -> bool:

@@ -6,7 +6,7 @@ from bisect import bisect_left
 from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import merge
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.clock_steps import Elapsed
 from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
@@ -49,7 +49,7 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.history.view import View
 
@@ -57,9 +57,21 @@ _BRAKING_NS: Final[Ns] = 4 * NS_PER_S
 """A standstill that begins so soon after a loss of speed is what that led to."""
 
 
+class Stop(NamedTuple):
+    """A standstill, as far as it is in a window, and whether it goes on after that."""
+
+    standstill: Standstill
+    goes_on: bool
+
+    @property
+    def length(self) -> Ns:
+        """How long it lasts in the window."""
+        return self.standstill.end - self.standstill.start
+
+
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """How the robot moved: its path, and its standstills with whether each goes on afterwards.
+    """How the robot moved: its path, and its standstills.
 
     `drops` are sudden losses of speed that no standstill follows. `elapsed` is how much time passed
     between moments of the window.
@@ -67,24 +79,24 @@ class Drive:
 
     path: PathSlice | None = None
     trajectory: Trajectory | None = None
-    standstills: tuple[tuple[Standstill, bool], ...] = ()
+    standstills: tuple[Stop, ...] = ()
     drops: tuple[SpeedDrop, ...] = ()
     elapsed: Elapsed = field(default_factory=Elapsed)
 
     @property
-    def known(self) -> Trajectory | None:
+    def valid_trajectory(self) -> Trajectory | None:
         """The path's trajectory, if it has a valid pose."""
-        known = self.trajectory
-        return known if known is not None and known.is_known else None
+        trajectory = self.trajectory
+        return trajectory if trajectory is not None and trajectory.is_known else None
 
-    def stops(self, length: Ns) -> tuple[tuple[Standstill, bool], ...]:
+    def stops(self, length: Ns) -> tuple[Stop, ...]:
         """Returns the standstills that a window of a length lists.
 
         Those that fill it, or last half of the shortest one in it: so of windows that follow each
         other one at least lists it, and none lists the last moment of one before it.
         """
         least = min(SHORTEST_NS // 2, length)
-        return tuple(each for each in self.standstills if each[0].end - each[0].start >= least)
+        return tuple(stop for stop in self.standstills if stop.length >= least)
 
     def stood(self, length: Ns) -> Ns | None:
         """Returns how long the robot stood in all, in a window of a length; None if not known.
@@ -93,19 +105,23 @@ class Drive:
         show it, nor where the robot neither moved nor stood for most of the time: noise hides where
         it stood.
         """
-        stood = self.elapsed.among((each.start, each.end) for each, _ in self.standstills)
-        known = self.known
-        if known is None:
+        stood = self.elapsed.among(
+            (standstill.start, standstill.end) for standstill, _ in self.standstills
+        )
+        trajectory = self.valid_trajectory
+        if trajectory is None:
             return stood or None
-        recorded_s = known.totals.duration_s - unix_from_ns(known.totals.gap_ns)
-        if ns_from_unix(recorded_s) > SILENCE_NS * max(known.poses - 1, 1):
+        recorded_s = trajectory.totals.duration_s - unix_from_ns(trajectory.totals.gap_ns)
+        if ns_from_unix(recorded_s) > SILENCE_NS * max(trajectory.poses - 1, 1):
             return None
         if not stood:
-            is_hidden = length >= SHORTEST_NS and known.totals.distance_m <= CREEP_MPS * recorded_s
+            is_hidden = (
+                length >= SHORTEST_NS and trajectory.totals.distance_m <= CREEP_MPS * recorded_s
+            )
             return None if is_hidden else 0
         else_s = recorded_s - unix_from_ns(stood)
-        is_hidden = else_s > recorded_s / 2 and known.totals.distance_m < CREEP_MPS * else_s
-        if is_hidden and not known.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
+        is_hidden = else_s > recorded_s / 2 and trajectory.totals.distance_m < CREEP_MPS * else_s
+        if is_hidden and not trajectory.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
             return None
         return stood
 
@@ -131,13 +147,11 @@ def drive_in(view: View, window: TimeWindow) -> Drive:
 
 def _standstills_in(
     view: View, topic: str, window: TimeWindow
-) -> tuple[tuple[tuple[Standstill, bool], ...], tuple[SpeedDrop, ...]]:
-    """Returns where the robot of a pose topic stood still, in order, as far as it is in a window.
+) -> tuple[tuple[Stop, ...], tuple[SpeedDrop, ...]]:
+    """Returns where the robot of a pose topic stood still, and where it lost speed without that.
 
-    And where they lose speed suddenly without standing still next.
-
-    With each comes whether it goes on after the window, or up to the last pose that is known; not
-    where others were recorded for long after that pose.
+    Each in order. A standstill goes on where it does after the window, or up to the last pose that
+    is known, but not where other topics were recorded for long after that pose.
 
     Poses outside of the window count too: a standstill that goes on beyond an end of the window
     ends there, however little of it is inside. So those of windows that follow each other add up.
@@ -145,36 +159,43 @@ def _standstills_in(
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
     """
+    slices = _stands_of_slices(view, topic, window.widened(CONTEXT_NS))
+    stands = [stand for _, stand in slices][::-1]
+    standing = standstills_of(joined_blocks([stand.blocks for stand in stands]))
+    starts = [standstill.start for standstill in standing]
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
-    stands = [one for _, one in _stands(view, topic, window.widened(CONTEXT_NS))][::-1]
-    found = standstills_of(joined_blocks([each.blocks for each in stands]))
-    last = max((each.last for each in stands), default=MIN_NS)
-    begins = [each.start for each in found]
-    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
-    is_silent = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
-    standstills = tuple(
-        (
-            each._replace(start=max(each.start, start), end=min(each.end, end)),
-            each.end > end or (each.end == last and not is_silent),
-        )
-        for each in found
-        if each.start < end and each.end > start
-    )
     drops = tuple(
-        each
+        drop
         for stand in stands
-        for each in stand.drops
-        if start <= each.time <= end
-        and bisect_left(begins, each.time - SLOT_NS) == bisect_left(begins, each.time + _BRAKING_NS)
+        for drop in stand.drops
+        if start <= drop.time <= end
+        and bisect_left(starts, drop.time - SLOT_NS) == bisect_left(starts, drop.time + _BRAKING_NS)
     )
-    return standstills, drops
+    last = max((stand.last for stand in stands), default=MIN_NS)
+    return tuple(_stops_between(view, standing, start, end, last)), drops
 
 
-def _stands(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:
+def _stops_between(
+    view: View, standing: Sequence[Standstill], start: Ns, end: Ns, last: Ns
+) -> Iterator[Stop]:
+    """Yields standstills as far as they are between two times; `last` is that of the last pose."""
+    later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
+    was_recorded_later = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
+    for standstill in standing:
+        if standstill.start < end and standstill.end > start:
+            yield Stop(
+                standstill._replace(
+                    start=max(standstill.start, start), end=min(standstill.end, end)
+                ),
+                standstill.end > end or (standstill.end == last and not was_recorded_later),
+            )
+
+
+def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:
     """Yields what shows where the robot stood; see `slices_by_poses`."""
 
-    def make(some: PoseSlice) -> Stands:
-        return stands_of(some.poses, some.start, some.stop)
+    def make(part: PoseSlice) -> Stands:
+        return stands_of(part.poses, part.start, part.stop)
 
     return slices_by_poses(view, topic, window, STANDS, make, failures=[], beside=BESIDE_NS)
 
@@ -187,5 +208,5 @@ def drive_made(view: View, window: TimeWindow) -> Iterator[Ns]:
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_pose_topic(view)
         path = slices_of_path(view, topic, window.widened(SLICE_NS), [])
-        stands = _stands(view, topic, window.widened(SLICE_NS + BESIDE_NS))
+        stands = _stands_of_slices(view, topic, window.widened(SLICE_NS + BESIDE_NS))
         yield from merge((at for at, _ in path), (at for at, _ in stands), reverse=True)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.places.where import Scope
 
-_LOOKED_AT: Final = 50
+_MOST_LOOKED_AT: Final = 50
 """Of the newest values of a topic so many are looked at for an empty text."""
 _LONGEST_STATE: Final = 10_000
 """No text that says what a robot does is longer (characters)."""
@@ -41,7 +41,7 @@ MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
 
 
-class Spoken(NamedTuple):
+class FoundEpisodes(NamedTuple):
     """The episodes that a search found, in the order that was asked for.
 
     Attributes:
@@ -67,7 +67,7 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     values = HeldValues(View(view.memory, view.call), topics[0])
     newest = takewhile(lambda held: len(held.word) <= _LONGEST_STATE, values.back(MAX_NS))
     try:
-        return any(held.is_blank for held in islice(newest, _LOOKED_AT))
+        return any(held.is_blank for held in islice(newest, _MOST_LOOKED_AT))
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
@@ -76,7 +76,7 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
 
 def find_episodes(
     view: View, topic: str, condition: Condition, scope: Scope, *, limit: int, oldest_first: bool
-) -> Spoken:
+) -> FoundEpisodes:
     """Returns the newest episodes whose text meets a condition, or the oldest with their total.
 
     Raises:
@@ -85,55 +85,55 @@ def find_episodes(
     """
     search = ReverseSearch(view, topic, condition)
     values = HeldValues(view, topic)
-    kept: deque[Episode] = deque(maxlen=limit if oldest_first else limit + 1)
+    episodes: deque[Episode] = deque(maxlen=limit if oldest_first else limit + 1)
     total, since = 0, None
     try:
-        for episode in _met(values, condition, scope):
-            kept.append(episode)
+        for episode in _matching_episodes(values, condition, scope):
+            episodes.append(episode)
             total += 1
             if total > limit and not oldest_first:
-                since = kept[-2].first
+                since = episodes[-2].first
                 break
     except QueryTimeoutError as error:
         if values.reached >= scope.window.stop:
             raise
-        if not kept:
+        if not episodes:
             raise out_of_time(view, values.reached) from error
         since = values.reached
         view.notes.add_lack(
             f"the search ran out of time at {unix_text(since)}: to continue, pass that time as end"
         )
-    if not kept:
+    if not episodes:
         search.require_testable()
-    chosen = [*reversed(kept)] if oldest_first else [*kept][:limit]
-    return Spoken(tuple(chosen), total if since is None else None, since)
+    chosen = [*reversed(episodes)] if oldest_first else [*episodes][:limit]
+    return FoundEpisodes(tuple(chosen), total if since is None else None, since)
 
 
-def _met(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Episode]:
+def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Episode]:
     """Yields the episodes of a scope that meet a condition, newest first.
 
-    Each when the text before it is known, so one that yields nothing more has looked at all.
+    Each waits until the text before it is known: when the last one comes, all was searched.
     """
     start, _ = scope.window.asked()
-    waiting: Episode | None = None
+    pending: Episode | None = None
     newer: Held | None = None
     named = (held for held in values.back(scope.window.stop) if not held.is_blank)
     while True:
         try:
             held = next(named, None)
         except QueryTimeoutError:
-            if waiting is not None:
-                yield waiting
+            if pending is not None:
+                yield pending
             raise
-        if waiting is not None:
-            yield waiting if held is None else replace(waiting, previous=spell_of(held))
-            waiting = None
+        if pending is not None:
+            yield pending if held is None else replace(pending, previous=spell_of(held))
+            pending = None
         if held is None or held.stop <= start:
             return
         if condition.matches(json.loads(held.word)) and scope.holds_at(held.start):
             following = newer or values.named_after(held.stop)
             after = None if following is None else spell_of(following)
-            waiting = Episode(spell_of(held), None, after)
+            pending = Episode(spell_of(held), None, after)
         newer = held
 
 
@@ -143,10 +143,10 @@ def episode_times(
     """Returns when all episodes of a scope held, oldest first, as `read_sightings` does.
 
     Raises:
-        QueryTimeoutError: the call's time is over before one was found.
+        QueryTimeoutError: the call's time is over before one was result.
     """
-    found = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
-    return [(each.first, each.until) for each in found.episodes], found.since
+    result = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
+    return [(episode.first, episode.until) for episode in result.episodes], result.since
 
 
 def spell_of(held: Held) -> Spell:
@@ -156,12 +156,12 @@ def spell_of(held: Held) -> Spell:
     return Spell(shown, held.start, held.stop, held.ended)
 
 
-def with_robot(view: View, topic: str, found: Episode, frame_id: str | None) -> Episode:
+def with_robot(view: View, topic: str, episode: Episode, frame_id: str | None) -> Episode:
     """Returns an episode with where the robot was when it began."""
-    recording = recording_at(view, topic, found.first)
+    recording = recording_at(view, topic, episode.first)
     if recording is None:
-        return found
-    return replace(found, robot=robot_at(view, found.first, recording, frame_id))
+        return episode
+    return replace(episode, robot=robot_at(view, episode.first, recording, frame_id))
 
 
 class SaidMeanwhile:
@@ -183,7 +183,7 @@ class SaidMeanwhile:
         if not self._is_over:
             try:
                 held = self._values.during(first, max(until, first + 1))
-                return tuple(spell_of(each) for each in held if not each.is_blank)
+                return tuple(spell_of(value) for value in held if not value.is_blank)
             except QueryTimeoutError as error:
                 self._is_over = True
                 self._view.notes.add_lack(
@@ -228,24 +228,24 @@ def topic_changes(
     if not held:
         raise no_data_between(view, (topic,), window)
     elapsed = elapsed_in(view, window)
-    found = [
-        replace(spell_of(each), skipped=elapsed.skipped_between(each.start, each.stop))
-        for each in held
-        if not each.is_blank
+    spells = [
+        replace(spell_of(value), skipped=elapsed.skipped_between(value.start, value.stop))
+        for value in held
+        if not value.is_blank
     ]
-    if len(found) > max_samples:
+    if len(spells) > max_samples:
         view.notes.add(
-            f"the first {max_samples} of {len(found)} changes: to continue, ask again with "
-            f"start={unix_text(found[max_samples].first)}"
+            f"the first {max_samples} of {len(spells)} changes: to continue, ask again with "
+            f"start={unix_text(spells[max_samples].first)}"
         )
-    note_unread(view, window, gaps=len(found) > max_samples)
+    note_unread(view, window, gaps=len(spells) > max_samples)
     note_edges(view, window)
     note_robots(view, topic, window)
     types = view.timeline.types_of(topic)
     return Changes(
         topic,
         ", ".join(sorted(types)),
-        len(found),
-        tuple(found[:max_samples]),
+        len(spells),
+        tuple(spells[:max_samples]),
         notes=view.notes.sentences(),
     )

@@ -38,21 +38,22 @@ def describe_type(memory: Memory, call: Call, type_name: str) -> TypeFields:
     timeline = view.timeline
     topics = [topic for topic, types in timeline.types.items() if type_name in types]
     if not topics:
-        known = sorted(set(chain.from_iterable(timeline.types.values())))
+        recorded = sorted(set(chain.from_iterable(timeline.types.values())))
         raise NoDataError(
             NoDataReason.TOPIC_NOT_RECORDED,
-            f"no topic was recorded under this type; there are {listed(known, at_most=MAX_FIELDS)}",
+            "no topic was recorded under this type; there are "
+            f"{listed(recorded, at_most=MAX_FIELDS)}",
         )
     failure = ""
     for topic in topics:
         # A topic may have changed its type since.
         last = timeline.totals(topic)[type_name].last
-        among = view.stream.messages([topic], TimeWindow.until(last), newest_first=True)
-        found = next((each for each in among if each.type == type_name), None)
-        if found is None:
+        messages = view.stream.messages([topic], TimeWindow.until(last), newest_first=True)
+        newest = next((stored for stored in messages if stored.type == type_name), None)
+        if newest is None:
             continue
         try:
-            message = memory.reader.decode(found.record)
+            message = memory.reader.decode(newest.record)
         except UndecodableError as error:
             failure = error.reason
             continue
@@ -109,17 +110,19 @@ def extremes_of(
     """
     names = tuple(dict.fromkeys(fields))
     whole = np.empty(0, np.int64)
-    found = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
+    piece_numbers = PieceNumbers(view, topic, names, whole, most_read=MAX_MESSAGES)
     try:
-        found.collect(window)
+        piece_numbers.collect(window)
     except TooManyError:
         view.notes.add(TOO_MANY)
         return ()
-    if found.since is not None:
-        view.notes.add_lack(f"out of time: extremes are of what is after {unix_text(found.since)}")
+    if piece_numbers.since is not None:
+        view.notes.add_lack(
+            f"out of time: extremes are of what is after {unix_text(piece_numbers.since)}"
+        )
     extremes = []
     for nth, field in enumerate(names):
-        least, most = (found.extreme(nth, [0], sign) for sign in (LEAST, GREATEST))
+        least, most = (piece_numbers.extreme(nth, [0], sign) for sign in (LEAST, GREATEST))
         if least is not None and most is not None:
             extremes.append(Extremes(field, *least, *most))
     return tuple(extremes)

@@ -77,25 +77,25 @@ def action_of(topic: str) -> str:
 
 
 def goals_in(
-    view: View, window: TimeWindow, found_of: Mapping[str, TopicEvents | None]
+    view: View, window: TimeWindow, events_of_topics: Mapping[str, TopicEvents | None]
 ) -> Iterator[GoalRun]:
     """Yields the goals that a message of a window lists and that were active in it.
 
-    `found_of` has what the messages of each topic report in the window.
+    `events_of_topics` has what the messages of each topic report in the window.
     """
-    for topic, found in found_of.items():
-        if found is None or GOALS not in view.timeline.types_of(topic):
+    for topic, events in events_of_topics.items():
+        if events is None or GOALS not in view.timeline.types_of(topic):
             continue
         # Which goals it listed before: what a window's first message lists need not be new.
-        before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
-        earlier = None if before is None else events_of_messages(view, [before])
+        message_before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
+        earlier = None if message_before is None else events_of_messages(view, [message_before])
         listed = [] if earlier is None else earlier.of_kind(GOAL)[0]
-        old = {goal.name: goal.last for goal in listed}
-        goals = [*_goals(topic, found, old)]
-        lost = last_listed(view, topic, window, {each.goal for each in goals if each.ended is None})
-        for each in goals:
-            last = lost.get(each.goal)
-            yield each if last is None else each._replace(last=last, is_lost=True)
+        statuses_before = {goal.name: goal.last for goal in listed}
+        goals = [*_goal_runs(topic, events, statuses_before)]
+        lost = last_listed(view, topic, window, {goal.goal for goal in goals if goal.ended is None})
+        for goal in goals:
+            last = lost.get(goal.goal)
+            yield goal if last is None else goal._replace(last=last, is_lost=True)
 
 
 def last_listed(view: View, topic: str, window: TimeWindow, active: set[str]) -> dict[str, Ns]:
@@ -104,19 +104,19 @@ def last_listed(view: View, topic: str, window: TimeWindow, active: set[str]) ->
     Each with the log time of the last message that lists it: a server lists what has not ended for
     as long as it runs.
     """
-    found: dict[str, Ns] = {}
-    left = set(active)
-    newest = view.stream.messages([topic], window, newest_first=True) if left else iter(())
+    last_listings: dict[str, Ns] = {}
+    unlisted = set(active)
+    newest = view.stream.messages([topic], window, newest_first=True) if unlisted else iter(())
     for nth, message in enumerate(newest):
         events = events_of_messages(view, [message])
         if events is None or events.beyond or events.undecodable:
             break  # what it lists is not known
-        listed = {goal.name for goal in events.of_kind(GOAL)[0]} & left
-        left -= listed
-        found |= dict.fromkeys(listed if nth else (), message.time)
-        if not left:
+        listed = {goal.name for goal in events.of_kind(GOAL)[0]} & unlisted
+        unlisted -= listed
+        last_listings |= dict.fromkeys(listed if nth else (), message.time)
+        if not unlisted:
             break
-    return found
+    return last_listings
 
 
 def goals_asked(
@@ -147,14 +147,16 @@ def goals_asked(
             f"{topics[0]}: the status of a goal is {', '.join(_STATUS_WORDS.values())} "
             f"(0 to {max(_STATUS_WORDS)}), or {_FAILED}, which is canceled or aborted"
         )
-    found = {topic: events_in(view, topic, scope.window) for topic in topics}
-    for topic, events in found.items():
+    events_of_topics = {topic: events_in(view, topic, scope.window) for topic in topics}
+    for topic, events in events_of_topics.items():
         if events is not None:
             note_limits(view, topic, events)
-    goals = [each for each in goals_in(view, scope.window, found) if each.status in wanted]
-    goals.sort(key=lambda each: (each.last, each.first, each.goal), reverse=True)
-    goals = [each for each in goals if scope.holds_at(each.last)]
-    if lost := sum(each.is_lost for each in goals):
+    goals = [
+        goal for goal in goals_in(view, scope.window, events_of_topics) if goal.status in wanted
+    ]
+    goals.sort(key=lambda goal: (goal.last, goal.first, goal.goal), reverse=True)
+    goals = [goal for goal in goals if scope.holds_at(goal.last)]
+    if lost := sum(goal.is_lost for goal in goals):
         view.notes.add(
             f"{counted(lost, 'goal')} whose end was not published, and which the action server "
             "listed no more: last is when it did"
@@ -162,22 +164,24 @@ def goals_asked(
     return goals
 
 
-def _goals(topic: str, found: TopicEvents, old: Mapping[str, int]) -> Iterator[GoalRun]:
+def _goal_runs(
+    topic: str, events: TopicEvents, statuses_before: Mapping[str, int]
+) -> Iterator[GoalRun]:
     """Yields the goals of an action, given those that were listed before with their statuses."""
     ends: dict[str, tuple[Ns, int]] = {}
-    goals, changes = found.of_kind(GOAL)
+    goals, changes = events.of_kind(GOAL)
     for change in changes:
         if change.value in _ENDED:
             ends.setdefault(change.name, (change.time, change.value))
-    for known in goals:
-        is_listed_first = known.at == found.first
-        if old.get(known.name) in _ENDED:
+    for goal in goals:
+        is_listed_first = goal.at == events.first
+        if statuses_before.get(goal.name) in _ENDED:
             continue
-        if known.first in _ENDED:
-            if known.name not in old and is_listed_first:
+        if goal.first in _ENDED:
+            if goal.name not in statuses_before and is_listed_first:
                 continue  # it may have ended long before
-            ends[known.name] = (known.at, known.first)
-        ended, status = ends.get(known.name, (None, known.last))
-        accepted = None if known.name in old else known.at
-        last = found.last if ended is None else ended
-        yield GoalRun(topic, known.name, accepted, ended, status, known.at, last)
+            ends[goal.name] = (goal.at, goal.first)
+        ended, status = ends.get(goal.name, (None, goal.last))
+        accepted = None if goal.name in statuses_before else goal.at
+        last = events.last if ended is None else ended
+        yield GoalRun(topic, goal.name, accepted, ended, status, goal.at, last)

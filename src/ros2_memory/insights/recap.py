@@ -11,11 +11,11 @@ from bisect import bisect_left
 from collections import Counter
 from dataclasses import replace
 from heapq import nsmallest
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.facts import FLAG, has_events
 from ros2_memory.analysis.intervals import IntervalTable, united
-from ros2_memory.analysis.motion.standstills import SHORTEST_NS, Standstill
+from ros2_memory.analysis.motion.standstills import SHORTEST_NS
 from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -39,7 +39,7 @@ from ros2_memory.insights.changes_before import (
     changes_in,
     is_routine,
 )
-from ros2_memory.insights.drive import Drive, drive_in
+from ros2_memory.insights.drive import Drive, Stop, drive_in
 from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
 from ros2_memory.insights.topic_events import events_in, note_limits, toggled
@@ -138,41 +138,49 @@ def recap(
     places = robot_places(view, window, frame_id)
     drive = drive_in(view, window)
     elapsed = drive.elapsed
-    there = None if region is None else _There(times_in_region(view, region, window), elapsed)
-    found = found_events(view, window)
+    region_stays = (
+        None if region is None else _RegionStays(times_in_region(view, region, window), elapsed)
+    )
+    events_of_topics = found_events(view, window)
     least = memory.limits.min_score if min_score is None else min_score
-    reported, things, throughout = _topic_events(
-        view, window, found, there, min_score=least, most=most_events
+    reported = _reported_events(view, window, events_of_topics, region_stays)
+    things = _things_in_view(
+        view, window, events_of_topics, region_stays, min_score=least, most=most_events
     )
     stops = drive.stops(end - start)
-    if there is not None:
-        stops = tuple(each for each in stops if there.overlaps(each[0].start, each[0].end))
-    longest = nsmallest(most_events, stops, key=lambda each: each[0].start - each[0].end)
-    events = [*_stops(longest, places), *reported, *_of_recording(view, window, drive)]
-    events += [_goal(each, start, elapsed) for each in goals_in(view, window, found)]
-    if there is not None:
-        events = [each for each in events if there.has(each)]
+    if region_stays is not None:
+        stops = tuple(
+            stop
+            for stop in stops
+            if region_stays.overlaps(stop.standstill.start, stop.standstill.end)
+        )
+    longest = nsmallest(most_events, stops, key=lambda stop: -stop.length)
+    events = [
+        *_stop_events(longest, places),
+        *reported,
+        *things.events,
+        *_recording_events(view, window, drive),
+    ]
+    goals = goals_in(view, window, events_of_topics)
+    events += [_goal_event(goal, start, elapsed) for goal in goals]
+    if region_stays is not None:
+        events = [event for event in events if region_stays.has(event)]
     note_unread(view, window)
     note_edges(view, window)
     _note_foxglove_logs(view, window)
-    counts = Counter(each.kind for each in events)
-    counts |= Counter(thing=things, stop=len(stops))
+    counts = Counter(event.kind for event in events)
+    counts |= Counter(thing=things.total, stop=len(stops))
     shown = _most_important(view, events, counts, most_events)
     if with_changes:
-        shown = _with_changes(changes_in(view, window, found), shown)
+        shown = _with_changes(changes_in(view, window, events_of_topics), shown)
     shown = [
-        replace(each, skipped=elapsed.skipped_between(each.start, each.end or each.start))
-        for each in shown
+        replace(event, skipped=elapsed.skipped_between(event.start, event.end or event.start))
+        for event in shown
     ]
     if places is not None:
-        shown = [
-            replace(each, places=places.names_at(_when(each, places)))
-            if each.kind in _OF_ROBOT
-            else each
-            for each in shown
-        ]
+        shown = [_with_place_names(event, places) for event in shown]
     stood = drive.stood(end - start)
-    if stood is None and drive.known is not None:
+    if stood is None and drive.valid_trajectory is not None:
         view.notes.add(
             "the positions are too noisy, or too few, to detect standstills: stood_s is null"
         )
@@ -186,14 +194,14 @@ def recap(
         shortest_stop=SHORTEST_NS,
         frame_id=None if drive.path is None or places is None else places.frame_id,
         events=tuple(shown),
-        throughout=tuple(sorted(throughout)),
+        throughout=tuple(sorted(things.throughout)),
         counts=tuple((_PLURALS[kind], counts[kind]) for kind in _KINDS if counts[kind]),
         skipped=elapsed.skipped_between(start, end),
     )
-    if there is None or region is None:
-        answer = _with_way(view, answer, drive)
+    if region_stays is None or region is None:
+        answer = _with_path(view, answer, drive)
     else:
-        answer = replace(_with_way_there(answer, drive, there), where=region.shown)
+        answer = replace(_with_path_in_region(answer, drive, region_stays), where=region.shown)
     view.notes.retract_outside(window)
     return replace(answer, notes=view.notes.sentences())
 
@@ -205,22 +213,24 @@ def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
         types = timeline.types_of(topic)
         if FOXGLOVE_LOGS.isdisjoint(types):
             continue
-        here = FOXGLOVE_LOGS & {
+        foxglove_types = FOXGLOVE_LOGS & {
             held.type
-            for each in timeline.extents(topic, window)
-            for held in each.bag.summary.of(topic)
+            for extent in timeline.extents(topic, window)
+            for held in extent.bag.summary.of(topic)
         }
-        if here:
+        if foxglove_types:
             # Where the topic has two types, its levels have no names; no log of ROS has a 4.
-            asks = '"above", field "level", value "WARN"'
-            asks = asks if len(types) == 1 else '"equals", field "level", value 4'
+            search = '"above", field "level", value "WARN"'
+            if len(types) > 1:
+                search = '"equals", field "level", value 4'
+            type_name = min(foxglove_types)
             view.notes.add(
-                f"errors in {topic} are not among the events, since it is of {min(here)}: "
-                f"find_matches with condition_type {asks} lists them"
+                f"errors in {topic} are not among the events, since it is of {type_name}: "
+                f"find_matches with condition_type {search} lists them"
             )
 
 
-class _There:
+class _RegionStays:
     """The times at which the robot was in a region, in order."""
 
     def __init__(self, spans: Sequence[Inside], elapsed: Elapsed) -> None:
@@ -230,7 +240,7 @@ class _There:
     def overlaps(self, start: Ns, end: Ns | None = None) -> bool:
         """Returns whether some of a time, or a moment, is among them."""
         last = start if end is None else end
-        return any(each.start <= last and start <= each.stop for each in self.spans)
+        return any(stay.start <= last and start <= stay.stop for stay in self.spans)
 
     def has(self, event: Event) -> bool:
         """Returns whether an event happened then; how long a boolean held is of no matter."""
@@ -240,51 +250,57 @@ class _There:
 
     def covers(self, start: Ns, end: Ns) -> bool:
         """Returns whether a time is in one of them as a whole, or in none at all."""
-        inside = any(each.start <= start and end <= each.stop for each in self.spans)
+        inside = any(stay.start <= start and end <= stay.stop for stay in self.spans)
         return inside or not self.overlaps(start, end)
 
-    def length_of(self, standstills: Iterable[tuple[Standstill, bool]]) -> Ns:
+    def length_of(self, standstills: Iterable[Stop]) -> Ns:
         """Returns how long the robot stood in them."""
         return sum(
-            self._elapsed.between(max(stood.start, each.start), min(stood.end, each.stop))
+            self._elapsed.between(max(stood.start, stay.start), min(stood.end, stay.stop))
             for stood, _ in standstills
-            for each in self.spans
-            if stood.start < each.stop and each.start < stood.end
+            for stay in self.spans
+            if stood.start < stay.stop and stay.start < stood.end
         )
 
 
-def _with_way(view: View, answer: Recap, drive: Drive) -> Recap:
+def _with_path(view: View, answer: Recap, drive: Drive) -> Recap:
     view.notes.add(*() if drive.trajectory is None else length_notes(drive.trajectory))
-    known = drive.known
-    if known is None:
+    trajectory = drive.valid_trajectory
+    if trajectory is None:
         return answer
     return replace(
         answer,
-        distance_m=known.totals.distance_m,
-        max_speed=known.max_speed,
-        path_sum_m=known.totals.path_sum_m if known.is_noisy else None,
-        gap_m=known.totals.gap_m if known.totals.gaps else None,
+        distance_m=trajectory.totals.distance_m,
+        max_speed=trajectory.max_speed,
+        path_sum_m=trajectory.totals.path_sum_m if trajectory.is_noisy else None,
+        gap_m=trajectory.totals.gap_m if trajectory.totals.gaps else None,
     )
 
 
-def _with_way_there(answer: Recap, drive: Drive, there: _There) -> Recap:
+def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    way = drive.path
-    driven = None if way is None or not way.poses else totals_inside(way.line, there.spans)
+    path = drive.path
+    driven = (
+        None if path is None or not path.poses else totals_inside(path.line, region_stays.spans)
+    )
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,
         max_speed=None if driven is None else driven.max_speed,
-        stood=None if answer.stood is None else there.length_of(drive.standstills),
-        visits=len(there.spans),
-        inside=drive.elapsed.among((each.start, each.stop) for each in there.spans),
+        stood=None if answer.stood is None else region_stays.length_of(drive.standstills),
+        visits=len(region_stays.spans),
+        inside=drive.elapsed.among((stay.start, stay.stop) for stay in region_stays.spans),
     )
 
 
-def _when(event: Event, places: RobotPlaces) -> Ns:
-    """Returns at which log time (ns) to place an event."""
-    stood = event.kind == "stop" and event.end is not None
-    return places.within(event.start, event.end or 0) if stood else event.start
+def _with_place_names(event: Event, places: RobotPlaces) -> Event:
+    """Returns an event with the names of the places in which the robot was then."""
+    if event.kind not in _OF_ROBOT:
+        return event
+    at = event.start
+    if event.kind == "stop" and event.end is not None:
+        at = places.within(event.start, event.end)
+    return replace(event, places=places.names_at(at))
 
 
 def found_events(
@@ -299,82 +315,103 @@ def found_events(
     }
 
 
-def _topic_events(
+def _reported_events(
     view: View,
     window: TimeWindow,
-    found_of: Mapping[str, TopicEvents | None],
-    there: _There | None,
+    events_of_topics: Mapping[str, TopicEvents | None],
+    region_stays: _RegionStays | None,
+) -> list[Event]:
+    """Returns the toggles and errors that messages report; notes say what is left out of them."""
+    events: list[Event] = []
+    for topic, topic_events in events_of_topics.items():
+        if topic_events is None:
+            continue
+        _, toggles = topic_events.of_kind(FLAG)
+        if toggles:
+            unrecorded = unrecorded_times(view, topic, TimeWindow(*window.asked()))
+            events += _flip_events(topic, toggles, [begin for begin, _ in unrecorded])
+        events += map(_error_event, _errors_in_region(view, topic, topic_events, region_stays))
+        note_limits(view, topic, topic_events)
+    return events
+
+
+class _ThingsInView(NamedTuple):
+    """Things that came into view or left it, how many, and the labels seen throughout a window."""
+
+    events: list[Event]
+    total: int
+    throughout: set[str]
+
+
+def _things_in_view(
+    view: View,
+    window: TimeWindow,
+    events_of_topics: Mapping[str, TopicEvents | None],
+    region_stays: _RegionStays | None,
     *,
     min_score: float,
     most: int,
-) -> tuple[list[Event], int, set[str]]:
-    """Returns events that messages report, the number of things seen, and those seen throughout.
+) -> _ThingsInView:
+    """Returns the things that were seen; only the `most` that were seen longest are its events.
 
-    Of things that came or went, only the `most` that were seen longest are among the events.
+    In a region nothing counts as seen throughout. A note says how many have too low a score.
     """
     start, end = window.asked()
     newest = view.snapshot.latest
     known_to = window.stop if newest is None else min(window.stop, newest)
-    events: list[Event] = []
     visible: list[IntervalTable] = []
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
-    for topic, found in found_of.items():
-        if found is None:
+    for topic_events in events_of_topics.values():
+        if topic_events is None:
             continue
-        seen = found.visible.scoring(min_score) if min_score else found.visible
-        below += found.visible.size - seen.size
-        _, toggles = found.of_kind(FLAG)
-        if toggles:
-            ends = [begin for begin, _ in unrecorded_times(view, topic, TimeWindow(start, end))]
-            events += _flips(topic, toggles, ends)
-        events += map(_error, _errors(view, topic, found, there))
+        seen = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
+        below += topic_events.visible.size - seen.size
         visible.append(seen)
         throughout.update(seen.throughout(start, end))
-        for label in seen.at_end(found.last, known_to):
-            last_seen[label] = max(found.last, last_seen.get(label, found.last))
-        note_limits(view, topic, found)
+        for label in seen.at_end(topic_events.last, known_to):
+            last_seen[label] = max(topic_events.last, last_seen.get(label, topic_events.last))
     if below:
         sights = counted(below, "sighting", "sightings")
         view.notes.add(f"{sights} left out: no score in it reaches min_score {min_score:g}")
     things = united(visible)
-    if there is None:
+    if region_stays is None:
         things = things.without(throughout)
     else:
         throughout = set()
-        things = things.during([(each.start, each.stop) for each in there.spans])
-    events += [
+        things = things.during([(stay.start, stay.stop) for stay in region_stays.spans])
+    events = [
         Event(
             "thing",
-            each.first,
-            each.last,
-            repeating(f"{each.label} in view", [each.label]),
-            goes_on=each.last == last_seen.get(each.label),
-            score=each.best,
+            interval.first,
+            interval.last,
+            repeating(f"{interval.label} in view", [interval.label]),
+            goes_on=interval.last == last_seen.get(interval.label),
+            score=interval.best,
         )
-        for each in things.longest(most)
+        for interval in things.longest(most)
     ]
-    return events, things.size, throughout
+    return _ThingsInView(events, things.size, throughout)
 
 
-def _of_recording(view: View, window: TimeWindow, drive: Drive) -> Iterator[Event]:
+def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[Event]:
     """Yields losses of speed, and when nothing was recorded, clocks were set or topics silent."""
     for time, before_mps, after_mps in drive.drops:
         text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
         yield Event("drop", time, None, text)
     for begin, until in recording_gaps(view, TimeWindow(*window.asked())):
-        yield Event("gap", begin, until, _why_nothing(view, begin, until))
+        yield Event("gap", begin, until, _gap_sentence(view, begin, until))
     for at, by in clock_steps(view, window):
         how = f"forward by {seconds(by)}" if by > 0 else f"back by {seconds(-by)} or more"
         yield Event("clock step", at, None, f"the clock was set {how}")
     for group in grouped(silences_in(view, window)):
-        topics, first = listed([each.topic for each in group]), group[0]
+        topics, first = listed([silence.topic for silence in group]), group[0]
         text = f"{topics} {'was' if len(group) == 1 else 'were'} silent"
         yield Event("silence", first.start, first.end, text, goes_on=first.goes_on)
 
 
-def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
+def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
     spans = deleted_between(view, TimeWindow(begin, until))
     deleted = unix_from_ns(sum(stop - start for start, stop in spans))
     if not deleted:
@@ -383,7 +420,7 @@ def _why_nothing(view: View, begin: Ns, until: Ns) -> str:
     return f"nothing is here: {deleted:.1f} of {whole:.1f} s were deleted"
 
 
-def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None) -> Iterator[Event]:
+def _stop_events(stops: Iterable[Stop], places: RobotPlaces | None) -> Iterator[Event]:
     for (start, end, box), goes_on in stops:
         (x, y, _), frame = box.centre, ""
         point: tuple[float, float] | None = (x, y)
@@ -396,16 +433,22 @@ def _stops(stops: Iterable[tuple[Standstill, bool]], places: RobotPlaces | None)
         yield Event("stop", start, end, text, goes_on, point=point)
 
 
-def _errors(view: View, topic: str, found: TopicEvents, there: _There | None) -> tuple[Report, ...]:
+def _errors_in_region(
+    view: View, topic: str, events: TopicEvents, region_stays: _RegionStays | None
+) -> tuple[Report, ...]:
     """Returns the errors of a window; in a region only their reports there count."""
-    if there is None or all(there.covers(each.first, each.last) for each in found.errors):
-        return found.errors
-    parts = [events_in(view, topic, TimeWindow(each.start, each.stop + 1)) for each in there.spans]
+    if region_stays is None or all(
+        region_stays.covers(error.first, error.last) for error in events.errors
+    ):
+        return events.errors
+    parts = [
+        events_in(view, topic, TimeWindow(stay.start, stay.stop + 1)) for stay in region_stays.spans
+    ]
     inside = joined_events([part for part in parts if part is not None])
     return () if inside is None else inside.errors
 
 
-def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
+def _goal_event(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     """Returns a goal from when it was accepted; one from before the window, from when it ended."""
     kind = "failed goal" if goal.outcome in FAILURES else "goal"
     if goal.accepted is None:
@@ -425,7 +468,7 @@ def _goal(goal: GoalRun, start: Ns, elapsed: Elapsed) -> Event:
     return Event(kind, goal.accepted, goal.ended, f"{goal.action} goal {goal.outcome} {after}")
 
 
-def _flips(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
+def _flip_events(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterator[Event]:
     """Yields each toggle with how long its value held: until the next, or beyond the window.
 
     Or as long as it was recorded: `ends` are the times at which the topic ceased to be, in order.
@@ -441,7 +484,7 @@ def _flips(topic: str, toggles: Sequence[Change], ends: Sequence[Ns]) -> Iterato
         until[toggle.name] = toggle.time
 
 
-def _error(error: Report) -> Event:
+def _error_event(error: Report) -> Event:
     again = f" ({error.reports} times)" if error.reports > 1 else ""
     end = error.last if error.reports > 1 else None
     return Event("error", error.first, end, Quoted(f"error: {error.text}{again}"))
@@ -449,28 +492,38 @@ def _error(error: Report) -> Event:
 
 def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:
     """Returns the events, and with each stop, speed drop and toggle what changed before."""
-    found: dict[Event, tuple[PastChange, ...]] = {}
-    for each in events:
-        if each.kind in {"stop", "drop"}:
-            found[each] = changes.before(each.start, slack=SLACK_NS)
-        elif each.kind == "flip":
-            found[each] = changes.before(each.start, without=each.text.rpartition(" ")[0])
-    shown = dict.fromkeys(found, 0)
-    left = _MOST_CHARS
+    changes_of_events: dict[Event, tuple[PastChange, ...]] = {}
+    for event in events:
+        if event.kind in {"stop", "drop"}:
+            changes_of_events[event] = changes.before(event.start, slack=SLACK_NS)
+        elif event.kind == "flip":
+            changes_of_events[event] = changes.before(
+                event.start, without=event.text.rpartition(" ")[0]
+            )
+    counts_shown = _counts_shown(changes_of_events)
+    return [
+        replace(event, before=changes_of_events[event][: counts_shown[event]])
+        if event in changes_of_events
+        else event
+        for event in events
+    ]
+
+
+def _counts_shown(changes_of_events: Mapping[Event, Sequence[PastChange]]) -> dict[Event, int]:
+    """Returns how many of the nearest changes before each event there is room for."""
+    counts_shown = dict.fromkeys(changes_of_events, 0)
+    chars_left = _MOST_CHARS
     # What a goal that was meant begins or ends with matters least.
-    routine = {each: all(map(is_routine, found[each])) for each in found}
+    routine = {event: all(map(is_routine, changes_of_events[event])) for event in changes_of_events}
     ranks = [(is_last, nth) for is_last in (False, True) for nth in range(_MOST_CHANGES)]
     for is_last, nth in ranks:
-        for each, past in found.items():
-            if routine[each] is is_last and len(past) > nth == shown[each]:
+        for event, past in changes_of_events.items():
+            if routine[event] is is_last and len(past) > nth == counts_shown[event]:
                 size = len(past[nth].text) + _CHANGE_CHARS
-                if size <= left:
-                    left -= size
-                    shown[each] += 1
-    return [
-        replace(each, before=found[each][: shown[each]]) if each in found else each
-        for each in events
-    ]
+                if size <= chars_left:
+                    chars_left -= size
+                    counts_shown[event] += 1
+    return counts_shown
 
 
 def _most_important(
@@ -482,13 +535,13 @@ def _most_important(
     """
     ranked = sorted(
         events,
-        key=lambda each: (
-            _KINDS.index(each.kind),
-            0 if each.end is None else each.start - each.end,
+        key=lambda event: (
+            _KINDS.index(event.kind),
+            0 if event.end is None else event.start - event.end,
         ),
     )
     shown = ranked[:most]
-    left_out = counts - Counter(each.kind for each in shown)
+    left_out = counts - Counter(event.kind for event in shown)
     if left_out:
         named = ", ".join(
             counted(left_out[kind], kind if kind != "thing" else "sight of a thing", _PLURALS[kind])
@@ -496,4 +549,4 @@ def _most_important(
             if left_out[kind]
         )
         view.notes.add(f"left out, because there are too many: {named}; ask for a shorter time")
-    return sorted(shown, key=lambda each: (each.start, _KINDS.index(each.kind)))
+    return sorted(shown, key=lambda event: (event.start, _KINDS.index(event.kind)))

@@ -58,7 +58,7 @@ def remember_moment(
             "before the recorder made that: restart it)"
         ) from error
     try:
-        outcome = _awaited(slot, call)
+        outcome = _await_outcome(slot, call)
     finally:
         slot.withdraw()
         slot.close()
@@ -92,14 +92,14 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
         RefusedError: they cannot be listed.
     """
     try:
-        stored = {each.folder.name: each for each in _moments_of(memory)}
+        moments = {moment.folder.name: moment for moment in _moments_of(memory)}
     except OSError as error:
         raise RefusedError(unlisted(error)) from error
-    if name not in stored:
-        near = get_close_matches(name, stored, n=3, cutoff=0.3)
-        hint = f"do you mean {' or '.join(near)}?" if near else f"{len(stored)} moments are saved"
+    if name not in moments:
+        near = get_close_matches(name, moments, n=3, cutoff=0.3)
+        hint = f"do you mean {' or '.join(near)}?" if near else f"{len(moments)} moments are saved"
         raise InvalidArgumentsError(f"there is no moment {abbreviate(name)}; {hint}")
-    return ShownMoment(stored[name], _now(memory, call))
+    return ShownMoment(moments[name], _now(memory, call))
 
 
 def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
@@ -109,7 +109,7 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
         OSError: they cannot be listed; see `unlisted`.
     """
     stored = _moments_of(memory)
-    stored.sort(key=lambda each: (each.moment.request.end, each.folder.name), reverse=True)
+    stored.sort(key=lambda moment: (moment.moment.request.end, moment.folder.name), reverse=True)
     rules = fired_rules(memory.index.bag_dir)
     return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
 
@@ -118,16 +118,20 @@ def _moments_of(memory: Memory) -> list[StoredMoment]:
     """Returns the saved moments; where one recording alone answers, those that hold bags of it."""
     recording = memory.limits.recording
     return [
-        each
-        for each in stored_moments_in(memory.index.bag_dir)
-        if not recording or _holds(each.folder, recording)
+        moment
+        for moment in stored_moments_in(memory.index.bag_dir)
+        if not recording or _has_bags_of(moment.folder, recording)
     ]
 
 
-def _holds(folder: Path, recording: str) -> bool:
+def _has_bags_of(folder: Path, recording: str) -> bool:
     """Whether a moment's folder holds bags of a recording, or is the recording itself."""
-    own = f"{MOMENTS_FOLDER}/{folder.name}"
-    return recording == own or recording.startswith(f"{own}/") or (folder / recording).is_dir()
+    moment_path = f"{MOMENTS_FOLDER}/{folder.name}"
+    return (
+        recording == moment_path
+        or recording.startswith(f"{moment_path}/")
+        or (folder / recording).is_dir()
+    )
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
@@ -143,14 +147,14 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
     return tuple(
         FiredRule(
             name,
-            each.fired,
-            each.moments,
-            each.refused,
-            each.last_fired,
-            each.always_since,
-            each.problem,
+            rule.fired,
+            rule.moments,
+            rule.refused,
+            rule.last_fired,
+            rule.always_since,
+            rule.problem,
         )
-        for name, each in sorted(({} if state is None else state.rules).items())
+        for name, rule in sorted(({} if state is None else state.rules).items())
     )
 
 
@@ -189,7 +193,7 @@ def _require_recorder(memory: Memory) -> None:
         )
 
 
-def _awaited(slot: PendingRequest, call: Call) -> Outcome | None:
+def _await_outcome(slot: PendingRequest, call: Call) -> Outcome | None:
     """Returns what the recorder answers; None where it has not begun in time, and never will."""
     for _ in range(2):
         timeout = Deadline.after(ANSWER_TIMEOUT_S)

@@ -25,7 +25,7 @@ from ros2_memory.history.reverse_search import RowCondition
 from ros2_memory.history.scan import scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -79,7 +79,7 @@ class Block(NamedTuple):
     tested: Callable[[], Tested]
 
 
-class Matching:
+class MatchTester:
     """Tests the messages of the topics of a search.
 
     Attributes:
@@ -112,11 +112,9 @@ class Matching:
             ):
                 block = self._block(topic, rows, window)
                 if waiting is None or block.last < waiting.first:
-                    if waiting is not None:
-                        yield waiting
-                    waiting = block
-                    continue
-                newer, waiting = _parted(waiting, block)
+                    newer, waiting = waiting, block
+                else:
+                    newer, waiting = _merged_and_split(waiting, block)
                 if newer is not None:
                     yield newer
         except QueryTimeoutError:
@@ -130,40 +128,40 @@ class Matching:
         truth = self._test.truth(rows) if rows.may_match else nowhere(len(rows.table))
         self.ruled_out |= truth.is_none
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
-        tested = partial(self._tested, topic, rows, truth)
+        tested = partial(self._test_rows, topic, rows, truth)
         return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
 
-    def _tested(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
+    def _test_rows(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
         """Tests the rows that count: by columns, and by messages where these leave it open."""
         counting = rows.mask()
         self.ruled_out |= not truth.perhaps[counting].all()
-        source = self._numbers_of(topic)[rows.recording, rows.table.channel.type]
+        source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
         sources = np.full(len(rows), source)
-        found = truth.surely[counting].astype(np.uint8)
+        met = truth.surely[counting].astype(np.uint8)
         undecided = np.flatnonzero(truth.unsure[counting])
         if undecided.size:
             # Messages that lie close together are read at once.
             edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
-            for some in np.split(undecided, edges):
-                found[some] = self._read(topic, rows.times[some], sources[some])
-        return Tested(rows.times, found, sources)
+            for together in np.split(undecided, edges):
+                met[together] = self._test_messages(topic, rows.times[together], sources[together])
+        return Tested(rows.times, met, sources)
 
-    def _read(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
+    def _test_messages(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
         """Returns what the messages at some log times, which ascend, are found to be."""
         window = TimeWindow(int(times[0]), int(times[-1]) + 1)
-        numbers = self._numbers_of(topic)
+        numbers = self._source_numbers(topic)
         read: dict[tuple[Ns, int], list[int]] = defaultdict(list)
         # The newest first, as a search reports what it cannot decode.
-        for each in self._view.stream.messages([topic], window, newest_first=True):
-            met = self._search.matches(each)
-            source = numbers[each.bag.recording, each.type]
-            found = read[each.time, source]
-            found.append(UNKNOWN if met is None else int(met))
+        for message in self._view.stream.messages([topic], window, newest_first=True):
+            met = self._search.matches(message)
+            source = numbers[message.bag.recording, message.type]
+            outcomes = read[message.time, source]
+            outcomes.append(UNKNOWN if met is None else int(met))
         # Those of one log time come in the order of the file.
         wanted = zip(times.tolist(), sources.tolist(), strict=True)
         return [read[key].pop() if read[key] else NOT_MET for key in wanted]
 
-    def _numbers_of(self, topic: str) -> dict[tuple[Path, str], int]:
+    def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
         if topic not in self._numbers:
             timeline = self._view.timeline
@@ -173,23 +171,26 @@ class Matching:
         return self._numbers[topic]
 
 
-def _parted(one: Block, other: Block) -> tuple[Block | None, Block]:
-    """Returns two blocks that overlap as those messages that are newer than both can share, if any.
+def _merged_and_split(waiting: Block, reached: Block) -> tuple[Block | None, Block]:
+    """Returns two blocks that overlap as their messages after the end of `reached`, and all others.
 
-    And all others: what comes later in a scan than `other` is no newer than the last of that.
+    The former are None where there are none. No block that a scan reaches later has a message
+    after the end of `reached`.
     """
-    for empty, rest in ((one, other), (other, one)):
-        if not empty.tested().times.size:
-            return None, rest
+    if not waiting.tested().times.size:
+        return None, reached
+    if not reached.tested().times.size:
+        return None, waiting
     # Of one log time and recording what the scan reaches later was written before.
-    joined = stacked([other.tested(), one.tested()])
-    joined = rows_of(joined, np.lexsort((joined.sources, joined.times)))
-    cut = int(np.searchsorted(joined.times, other.last, side="right"))
-    newer, older = rows_of(joined, slice(cut, None)), rows_of(joined, slice(cut))
-    return _of(one.topic, newer) if newer.times.size else None, _of(one.topic, older)
+    both = stacked([reached.tested(), waiting.tested()])
+    ordered = rows_of(both, np.lexsort((both.sources, both.times)))
+    cut = int(np.searchsorted(ordered.times, reached.last, side="right"))
+    older = _block_of(waiting.topic, rows_of(ordered, slice(cut)))
+    newer = rows_of(ordered, slice(cut, None))
+    return (_block_of(waiting.topic, newer) if newer.times.size else None), older
 
 
-def _of(topic: str, tested: Tested) -> Block:
+def _block_of(topic: str, tested: Tested) -> Block:
     first, last = int(tested.times[0]), int(tested.times[-1])
     return Block(topic, first, last, has_match=bool(tested.met.any()), tested=lambda: tested)
 
@@ -215,23 +216,23 @@ class Run:
     begun: bool = True
 
 
-class Runs(NamedTuple):
+class BlockRuns(NamedTuple):
     """Consecutive matches in a block.
 
     Attributes:
-        found: the newest first.
+        runs: the newest first.
         goes_back: whether an earlier match may belong to the oldest.
         goes_on: whether a later match may belong to the newest.
         is_blank: whether it has neither a match nor a message that surely is none.
     """
 
-    found: list[Run]
+    runs: list[Run]
     goes_back: bool = False
     goes_on: bool = False
     is_blank: bool = False
 
 
-def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> Runs:
+def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     """Returns the runs of matches in some messages, of which there is at least one.
 
     A run ends with a message that does not match, and where none comes for longer than
@@ -243,26 +244,26 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> Runs:
     ends = np.cumsum((met == NOT_MET) | begins)
     rows = np.flatnonzero(met == MET)
     if not rows.size:
-        return Runs([], is_blank=int(ends[-1]) == 0)
+        return BlockRuns([], is_blank=int(ends[-1]) == 0)
     new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
     starts = np.flatnonzero(new)
     stops = np.r_[starts[1:], rows.size]
     others = np.flatnonzero(met == NOT_MET)
     until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
     columns = times[rows[starts]], times[rows[stops - 1]], stops - starts, np.minimum(until, after)
-    found = [
+    runs = [
         Run(topic, first, last, messages, None if end == MAX_NS else end)
-        for first, last, messages, end in zip(*(each.tolist() for each in columns), strict=True)
+        for first, last, messages, end in np.stack(columns, axis=1).tolist()
     ]
-    return Runs(
-        found[::-1],
+    return BlockRuns(
+        runs[::-1],
         goes_back=not apart and int(ends[rows[0]]) == 0,
         goes_on=not apart and ends[rows[-1]] == ends[-1],
     )
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class SearchedRuns:
     """What a search found.
 
     Attributes:
@@ -276,7 +277,7 @@ class Found:
     is_over: bool = False
 
 
-class _OfTopic:
+class _TopicRuns:
     """The runs of one topic, from its newest block on."""
 
     def __init__(self, topic: str, *, apart: bool) -> None:
@@ -300,17 +301,17 @@ class _OfTopic:
         if not tested.times.size:
             return
         after, self._begins = self._begins, int(tested.times[0])
-        runs = runs_of(self._topic, tested, after, apart=self._apart)
+        added = runs_of(self._topic, tested, after, apart=self._apart)
         is_near = after - int(tested.times[-1]) <= SILENCE_NS
-        if runs.is_blank:
+        if added.is_blank:
             self._is_open = self._is_open and is_near
             return
-        if self._is_open and is_near and runs.goes_on:
-            newer, older = self.runs.pop(), runs.found.pop(0)
+        if self._is_open and is_near and added.goes_on:
+            newer, older = self.runs.pop(), added.runs.pop(0)
             messages = newer.messages + older.messages
             self.runs.append(replace(newer, first=older.first, messages=messages))
-        self.runs += runs.found
-        self._is_open = runs.goes_back
+        self.runs += added.runs
+        self._is_open = added.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that was not searched.
@@ -327,7 +328,9 @@ class _OfTopic:
         return [*self.runs[:-1], replace(self.runs[-1], begun=False)]
 
 
-def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | None) -> Found:
+def find_runs(
+    view: View, search: ReverseSearch, scope: Scope, *, enough: int | None
+) -> SearchedRuns:
     """Returns the runs of matches in a scope, on all topics of a search; of a log each message.
 
     Args:
@@ -342,55 +345,59 @@ def find_runs(view: View, search: ReverseSearch, scope: Scope, *, enough: int | 
         NoDataError: none of the topics' messages can be decoded.
         QueryTimeoutError: the call's time is over before the first match was found.
     """
-    matching = Matching(view, search)
+    tester = MatchTester(view, search)
     # What lies outside of a scope is not read, and may well be decodable.
-    matching.ruled_out = scope.is_bounded
+    tester.ruled_out = scope.is_bounded
     is_log = view.timeline.is_log
-    topics = {topic: _OfTopic(topic, apart=is_log(topic)) for topic in search.topics}
+    runs_by_topic = {topic: _TopicRuns(topic, apart=is_log(topic)) for topic in search.topics}
     reached = searched = scope.window.stop
     try:
         for window in scope.narrowed():
-            for of_topic in topics.values():
-                of_topic.end_in(view, TimeWindow(window.stop, searched))
+            for topic_runs in runs_by_topic.values():
+                topic_runs.end_in(view, TimeWindow(window.stop, searched))
             searched = window.start
-            for block in _blocks(matching, topics, window):
-                topics[block.topic].add(_counting(block, scope) if scope.is_bounded else block)
-                reached = block.first if len(topics) == 1 else block.last
-                if enough is not None and _has_enough(topics, enough, reached):
-                    search.note_undecodable(_newest_first(topics)[enough - 1].first)
-                    return Found(_newest_first(topics), reached)
+            for block in _merged_blocks(tester, runs_by_topic, window):
+                counted = _scoped(block, scope) if scope.is_bounded else block
+                runs_by_topic[block.topic].add(counted)
+                reached = block.first if len(runs_by_topic) == 1 else block.last
+                if enough is not None and _has_enough(runs_by_topic, enough, reached):
+                    runs = _newest_first(runs_by_topic)
+                    search.note_undecodable(runs[enough - 1].first)
+                    return SearchedRuns(runs, reached)
     except QueryTimeoutError:
-        runs = [run for each in topics.values() for run in each.cut()]
+        runs = [run for topic_runs in runs_by_topic.values() for run in topic_runs.cut()]
         if not runs:
             raise
-        return Found(sorted(runs, key=_by_last), reached, is_over=True)
-    runs = _newest_first(topics)
+        return SearchedRuns(sorted(runs, key=_by_last), reached, is_over=True)
+    runs = _newest_first(runs_by_topic)
     if enough is not None and len(runs) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_undecodable(runs[enough - 1].first)
-        return Found(runs, reached)
-    search.close(scope.window, is_found=bool(runs), ruled_out=matching.ruled_out)
-    return Found(runs)
+        return SearchedRuns(runs, reached)
+    search.close(scope.window, is_found=bool(runs), ruled_out=tester.ruled_out)
+    return SearchedRuns(runs)
 
 
-def _blocks(matching: Matching, topics: dict[str, _OfTopic], window: TimeWindow) -> Iterator[Block]:
+def _merged_blocks(
+    tester: MatchTester, topics: Iterable[str], window: TimeWindow
+) -> Iterator[Block]:
     """Returns the blocks of all topics, the newest first."""
-    sources = (matching.newest_first(topic, window) for topic in topics)
+    sources = (tester.newest_first(topic, window) for topic in topics)
     return heapq.merge(*sources, key=lambda block: -block.last)
 
 
-def _counting(block: Block, scope: Scope) -> Block:
+def _scoped(block: Block, scope: Scope) -> Block:
     """Returns a block in which only those are matches that count in a scope."""
 
     def tested() -> Tested:
-        found = block.tested()
-        matches = np.flatnonzero(found.met == MET)[::-1]
+        messages = block.tested()
         # The newest first, as a scope reads what the other topic said.
-        times = found.times[matches].tolist()
+        matches = np.flatnonzero(messages.met == MET)[::-1]
+        times = messages.times[matches].tolist()
         counts = np.array([scope.holds_at(time) for time in times], np.bool_)
-        met = found.met.copy()
+        met = messages.met.copy()
         met[matches[~counts]] = NOT_MET
-        return replace(found, met=met)
+        return replace(messages, met=met)
 
     return block._replace(tested=tested)
 
@@ -399,28 +406,28 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     """Whether a topic has a message in a time; by the index where that is enough."""
     if gap.empty:
         return False
-    held = view.stream.overlapping_bags([topic], gap)
-    is_alone = len({each.bag.recording for each in held}) == 1
+    bags = view.stream.overlapping_bags([topic], gap)
+    is_alone = len({bag.bag.recording for bag in bags}) == 1
     counts = is_alone and not view.stream.may_be_relatched([topic])
-    if counts and any(gap.contains(each.first) or gap.contains(each.last) for each in held):
+    if counts and any(gap.contains(bag.first) or gap.contains(bag.last) for bag in bags):
         return True
-    return bool(held) and view.stream.first([topic], gap) is not None
+    return bool(bags) and view.stream.first([topic], gap) is not None
 
 
-def _has_enough(topics: dict[str, _OfTopic], enough: int, reached: Ns) -> bool:
+def _has_enough(runs_by_topic: dict[str, _TopicRuns], enough: int, reached: Ns) -> bool:
     """Returns whether no match older than a moment can change the newest runs."""
-    if sum(len(each.runs) for each in topics.values()) <= enough:
+    if sum(len(topic_runs.runs) for topic_runs in runs_by_topic.values()) <= enough:
         return False
-    newest = _newest_first(topics)[:enough]
-    closed = {id(run) for each in topics.values() for run in each.closed}
+    newest = _newest_first(runs_by_topic)[:enough]
+    closed = {id(run) for topic_runs in runs_by_topic.values() for run in topic_runs.closed}
     return newest[-1].last >= reached and all(id(run) in closed for run in newest)
 
 
-def _newest_first(topics: dict[str, _OfTopic]) -> list[Run]:
-    if len(topics) == 1:
-        [only] = topics.values()
-        return only.runs
-    return sorted((run for each in topics.values() for run in each.runs), key=_by_last)
+def _newest_first(runs_by_topic: dict[str, _TopicRuns]) -> list[Run]:
+    return sorted(
+        (run for topic_runs in runs_by_topic.values() for run in topic_runs.runs),
+        key=_by_last,
+    )
 
 
 def _by_last(run: Run) -> Ns:

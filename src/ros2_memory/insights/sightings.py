@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
 
-_Row = TypeVar("_Row", Sighting, Episode)
+_SightingOrEpisode = TypeVar("_SightingOrEpisode", Sighting, Episode)
 _MOST_TRIED: Final = 5
 """Messages before the newest of a sighting that are tried for the place of the thing."""
 _LEFT_TO_SAY_S: Final = 2.0
@@ -114,20 +114,20 @@ def find_matches(
     window = clamped(view, asked)
     scope = Scope(view, window, where, during)
     other = None if beside is None else SaidMeanwhile(view, beside)
-    topics, shown = matching_topics(view, topic), _Shown(limit, oldest_first, frame_id)
+    topics, shown = matching_topics(view, topic), _Selection(limit, oldest_first, frame_id)
     goals = goals_asked(view, topics, condition, scope)
     is_spoken = goals is None and says_episodes(view, topics)
     if goals is not None:
-        rows = _of_goals(view, goals, window, shown)
+        rows = _goal_sightings(view, goals, window, shown)
     elif is_spoken:
-        rows = _of_texts(view, topics[0], condition, scope, shown)
+        rows = _episodes_of_text(view, topics[0], condition, scope, shown)
     else:
         search = ReverseSearch(view, topic, condition)
-        rows = _of_matches(view, search, scope, shown, fields)
-        view.notes.add(*_held_before(view, search, window, scope))
+        rows = _runs_as_sightings(view, search, scope, shown, fields)
+        view.notes.add(*_latched_notes(view, search, window, scope))
     elapsed = elapsed_in(view, rows.searched)
-    sightings = tuple(_finished(each, elapsed, other) for each in rows.sightings)
-    episodes = tuple(_finished(each, elapsed, other) for each in rows.episodes)
+    sightings = tuple(_completed(sighting, elapsed, other) for sighting in rows.sightings)
+    episodes = tuple(_completed(episode, elapsed, other) for episode in rows.episodes)
     shown_rows = len(sightings) + len(episodes)
     note_robots_on(view, topics, rows.searched)
     note_unread(
@@ -141,12 +141,8 @@ def find_matches(
         silences = describe_silences(view, topics, rows.searched)
         view.notes.add(*silences, *unasked_limit(condition, min_score))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
-    start, end = window.asked()
-    first, last = recorded_reach(view.snapshot, window) or (start, end)
-    # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
-    shown_at = [*(each.first for each in sightings), *(each.first for each in episodes)]
-    start = min(max(start, min([first, *shown_at])), end)
-    end = max(min(end, max([last, *shown_at])), start)
+    shown_at = [sighting.first for sighting in sightings] + [episode.first for episode in episodes]
+    start, end = _searched_times(view, window, shown_at)
     return Sightings(
         sightings,
         more=rows.total is None or rows.total > shown_rows,
@@ -162,7 +158,16 @@ def find_matches(
     )
 
 
-class _Shown(NamedTuple):
+def _searched_times(view: View, window: TimeWindow, shown_at: Sequence[Ns]) -> tuple[Ns, Ns]:
+    """Returns from when to when a window was searched (inclusive), and has what is shown."""
+    start, end = window.asked()
+    first, last = recorded_reach(view.snapshot, window) or (start, end)
+    # Also bags of a wrong clock are searched, whose matches lie outside of the others' time.
+    start = min(max(start, min([first, *shown_at])), end)
+    return start, max(min(end, max([last, *shown_at])), start)
+
+
+class _Selection(NamedTuple):
     """How many rows are shown, which of them, and the frame of the robot's positions."""
 
     limit: int
@@ -170,7 +175,7 @@ class _Shown(NamedTuple):
     frame_id: str | None
 
 
-class _Rows(NamedTuple):
+class _FoundRows(NamedTuple):
     """The rows of a reply; `total` is None where the search ended before it had counted all.
 
     `searched` is the part of the window in which all matches are known.
@@ -183,7 +188,9 @@ class _Rows(NamedTuple):
     episodes: tuple[Episode, ...] = ()
 
 
-def _finished(row: _Row, elapsed: Elapsed, other: SaidMeanwhile | None) -> _Row:
+def _completed(
+    row: _SightingOrEpisode, elapsed: Elapsed, other: SaidMeanwhile | None
+) -> _SightingOrEpisode:
     """Returns a row with how much of its time the clock skipped, and what was said meanwhile."""
     return replace(
         row,
@@ -192,45 +199,50 @@ def _finished(row: _Row, elapsed: Elapsed, other: SaidMeanwhile | None) -> _Row:
     )
 
 
-def _of_goals(view: View, goals: list[GoalRun], window: TimeWindow, shown: _Shown) -> _Rows:
+def _goal_sightings(
+    view: View, goals: list[GoalRun], window: TimeWindow, shown: _Selection
+) -> _FoundRows:
+    """Returns the goals that are shown as sightings; `goals` have the last one first."""
     view.notes.retract_outside(window)
-    found = tuple(
-        _goal_sighting(view, each, shown.frame_id)
-        for each in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
-        if view.call.wants(each.last)
+    sightings = tuple(
+        _goal_sighting(view, goal, shown.frame_id)
+        for goal in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
+        if view.call.wants(goal.last)
     )
-    return _Rows(len(goals), window, not goals, sightings=found)
+    return _FoundRows(len(goals), window, not goals, sightings=sightings)
 
 
-def _of_texts(view: View, topic: str, condition: Condition, scope: Scope, shown: _Shown) -> _Rows:
-    texts = find_episodes(
+def _episodes_of_text(
+    view: View, topic: str, condition: Condition, scope: Scope, shown: _Selection
+) -> _FoundRows:
+    result = find_episodes(
         view, topic, condition, scope, limit=shown.limit, oldest_first=shown.oldest_first
     )
     searched = scope.window
-    if texts.since is not None:
-        searched = TimeWindow(texts.since, searched.stop)
+    if result.since is not None:
+        searched = TimeWindow(result.since, searched.stop)
     view.notes.retract_outside(searched)
-    found = tuple(
-        with_robot(view, topic, each, shown.frame_id)
-        for each in texts.episodes
-        if view.call.wants(each.until)
+    episodes = tuple(
+        with_robot(view, topic, episode, shown.frame_id)
+        for episode in result.episodes
+        if view.call.wants(episode.until)
     )
-    return _Rows(texts.total, searched, not texts.episodes, episodes=found)
+    return _FoundRows(result.total, searched, not result.episodes, episodes=episodes)
 
 
-def _of_matches(
-    view: View, search: ReverseSearch, scope: Scope, shown: _Shown, fields: Sequence[str]
-) -> _Rows:
-    found = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
-    if found.is_over:
+def _runs_as_sightings(
+    view: View, search: ReverseSearch, scope: Scope, shown: _Selection, fields: Sequence[str]
+) -> _FoundRows:
+    result = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
+    if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
         view.notes.complete = False
-        reached = unix_text(found.searched_to or MIN_NS)
+        reached = unix_text(result.searched_to or MIN_NS)
         view.notes.add(
             f"the search ran out of time at {reached}: to continue, pass that time as end"
         )
-    runs = found.runs[-shown.limit :][::-1] if shown.oldest_first else found.runs[: shown.limit]
-    searched, is_cut = scope.window, found.searched_to is not None
+    runs = result.runs[-shown.limit :][::-1] if shown.oldest_first else result.runs[: shown.limit]
+    searched, is_cut = scope.window, result.searched_to is not None
     if is_cut:
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
@@ -238,7 +250,7 @@ def _of_matches(
     wanted = [
         (run, newest)
         for run in runs
-        if view.call.wants(run.last) and (newest := _newest(view, run)) is not None
+        if view.call.wants(run.last) and (newest := _newest_match(view, run)) is not None
     ]
     sightings = tuple(
         _sighting(view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id)
@@ -246,7 +258,7 @@ def _of_matches(
     )
     if fields:
         sightings = _with_fields(view, sightings, [newest for _, newest in wanted], fields)
-    return _Rows(None if is_cut else len(found.runs), searched, not runs, sightings=sightings)
+    return _FoundRows(None if is_cut else len(result.runs), searched, not runs, sightings=sightings)
 
 
 def read_sightings(
@@ -259,22 +271,22 @@ def read_sightings(
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
         NoDataError: there is no such topic, or none of its messages can be decoded.
-        QueryTimeoutError: the call's time is over before the first match was found.
+        QueryTimeoutError: the call's time is over before the first match was result.
     """
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        return [(each.first, each.last) for each in reversed(goals)], None
+        return [(goal.first, goal.last) for goal in reversed(goals)], None
     if says_episodes(view, topics):
         return episode_times(view, topics[0], condition, scope)
-    found = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
-    if found.is_over:
+    result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
+    if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    spans = [(run.first, _until(view, run, scope)) for run in reversed(found.runs)]
-    return spans, spans[0][0] if found.is_over else None
+    spans = [(run.first, _lasted_until(view, run, scope)) for run in reversed(result.runs)]
+    return spans, spans[0][0] if result.is_over else None
 
 
-def _held_before(
+def _latched_notes(
     view: View, search: ReverseSearch, window: TimeWindow, scope: Scope
 ) -> Iterator[str]:
     """Yields which latched topics met a condition when a window began, by an earlier message.
@@ -303,27 +315,26 @@ def only_messages_count(topic: str) -> str:
     )
 
 
-def _newest(view: View, run: Run) -> StoredMessage | None:
+def _newest_match(view: View, run: Run) -> StoredMessage | None:
     """Returns the last match; None where its bag was deleted since."""
     at = TimeWindow(run.last, run.last + 1)
     return view.stream.first([run.topic], at, newest_first=True)
 
 
-def _until(view: View, run: Run, scope: Scope) -> Ns:
+def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
     """Returns until when a state lasted: to the message that says otherwise, or the window's end.
 
     To its last match where a silence is next; so does a log entry. What a latched topic states
     lasts through silences. Not beyond the end of a scope.
     """
-    last, until = run.last, run.until
+    last = run.last
     if view.timeline.is_log(run.topic):
         return last
-    end = scope.window.asked()[1]
-    if until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
-        until = held_until(view, run.topic, last, end)
-    else:
-        until = max(last, min(until, end)) if until - last <= SILENCE_NS else last
-    return scope.holds_until(last, until)
+    _, end = scope.window.asked()
+    if run.until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
+        return scope.holds_until(last, held_until(view, run.topic, last, end))
+    is_silent = run.until - last > SILENCE_NS
+    return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
 
 
 def _sighting(
@@ -341,21 +352,25 @@ def _sighting(
     """
     message = view.memory.reader.decode(newest.record)
     value = condition.counted(view.extractor.exact(message, newest.type))
-    seen = detections_of(value, view.extractor.frame(message))
-    thing, labels = _matching(seen, condition), {each.label for each in seen}
+    detections = detections_of(value, view.extractor.frame(message))
+    labels = {detection.label for detection in detections}
+    thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun
     at = run.first if robot_at_first else newest.time
-    own = newest.bag.recording
-    robot = robot_at(view, at, recording_at(view, newest.topic, at, own) or own, frame_id)
+    newest_recording = newest.bag.recording
+    recording = recording_at(view, newest.topic, at, newest_recording) or newest_recording
+    robot = robot_at(view, at, recording, frame_id)
     return Sighting(
         topic=run.topic,
         first=run.first,
         last=run.last,
-        until=_until(view, run, scope) if thing is None else run.last,
+        until=_lasted_until(view, run, scope) if thing is None else run.last,
         messages=run.messages,
         begun=run.begun,
         robot=robot,
-        thing=_spot_of(view, condition, newest, run.first, robot, thing=thing, frame_id=frame_id),
+        thing=_place_of_thing(
+            view, condition, newest, run.first, robot, thing=thing, frame_id=frame_id
+        ),
         matched=tuple(
             named(text) if text in labels else Quoted(text)
             for text in matched_texts(condition, value)
@@ -367,7 +382,7 @@ def _sighting(
 
 def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
     """Returns a goal of an action as a sighting, with where the robot was when it ended."""
-    newest = view.stream.newest(goal.topic, TimeWindow(MIN_NS, goal.last + 1))
+    message = view.stream.newest(goal.topic, TimeWindow(MIN_NS, goal.last + 1))
     return Sighting(
         topic=goal.topic,
         first=goal.first,
@@ -376,8 +391,8 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
         messages=0,
         begun=goal.accepted is not None,
         robot=None
-        if newest is None
-        else robot_at(view, newest.time, newest.bag.recording, frame_id),
+        if message is None
+        else robot_at(view, message.time, message.bag.recording, frame_id),
         thing=None,
         value={"goal": goal.goal, "status": goal.status_word},
     )
@@ -386,7 +401,7 @@ def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
 def _with_fields(
     view: View,
     sightings: Sequence[Sighting],
-    found: Sequence[StoredMessage],
+    newest_messages: Sequence[StoredMessage],
     fields: Sequence[str],
 ) -> tuple[Sighting, ...]:
     """Returns the sightings with the fields of their last messages in place of matched texts.
@@ -396,7 +411,7 @@ def _with_fields(
     """
     extended: list[Sighting] = []
     refused: list[InvalidArgumentsError] = []
-    for sighting, newest in zip(sightings, found, strict=True):
+    for sighting, newest in zip(sightings, newest_messages, strict=True):
         record = newest.record
         message = view.memory.reader.decode(record)
         try:
@@ -412,7 +427,7 @@ def _with_fields(
     return tuple(extended)
 
 
-def _spot_of(
+def _place_of_thing(
     view: View,
     condition: Condition,
     newest: StoredMessage,
@@ -427,13 +442,13 @@ def _spot_of(
     The newest message of all may be newer than the last transform: then one of those just before it
     counts. A note says where none of them can be placed.
     """
-    targets = _targets(view, robot, frame_id)
-    spot = _spot(view, thing, newest, targets)
+    targets = _target_frames(view, robot, frame_id)
+    spot = _place_of_detection(view, thing, newest, targets)
     if spot is None or spot.frame_id in targets:
         return spot
     try:
         near = TimeWindow.around(newest.time, TF_CACHE_NS)
-        if not any(connects(view, (each, spot.frame_id), near) for each in targets):
+        if not any(connects(view, (target, spot.frame_id), near) for target in targets):
             return spot
     except QueryTimeoutError:
         return spot
@@ -441,14 +456,15 @@ def _spot_of(
     window = TimeWindow(first, newest.time)
     extractor = view.extractor
     before = view.stream.messages([topic], window, newest_first=True)
-    for found in islice(before, _MOST_TRIED):
-        message = view.bags.decode(found)
+    for stored in islice(before, _MOST_TRIED):
+        message = view.bags.decode(stored)
         if message is None:
             continue
-        value = condition.counted(extractor.exact(message, found.type))
+        value = condition.counted(extractor.exact(message, stored.type))
         if condition.matches(value):
-            seen = _matching(detections_of(value, extractor.frame(message)), condition)
-            earlier = _spot(view, seen, found, targets)
+            detections = detections_of(value, extractor.frame(message))
+            earlier_thing = _sought_detection(detections, condition)
+            earlier = _place_of_detection(view, earlier_thing, stored, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
@@ -458,7 +474,7 @@ def _spot_of(
     return spot
 
 
-def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str, ...]:
+def _target_frames(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str, ...]:
     """Returns the frames that places are given in, the first that can be had."""
     if frame_id is not None:
         return (frame_id,)
@@ -466,8 +482,8 @@ def _targets(view: View, robot: Pose | None, frame_id: str | None) -> tuple[str,
     return tuple(dict.fromkeys(filter(None, frames)))
 
 
-def _spot(
-    view: View, thing: Detection | None, found: StoredMessage, targets: Sequence[str]
+def _place_of_detection(
+    view: View, thing: Detection | None, message: StoredMessage, targets: Sequence[str]
 ) -> LabelledPlace | None:
     """Returns where the thing of a message was: in one of some frames, or the message's own."""
     if thing is None or thing.place is None:
@@ -475,15 +491,15 @@ def _spot(
     seen = Pose(thing.place, None, thing.frame_id)
     position, frame = thing.place, thing.frame_id
     for target in targets:
-        there = pose_in(view, seen, target, found.time, found.bag.recording)
-        if there is not None:
-            position, frame = there.position, target
+        placed = pose_in(view, seen, target, message.time, message.bag.recording)
+        if placed is not None:
+            position, frame = placed.position, target
             break
     inside = places_at(view.limits.places, frame, *position[:2])
     return LabelledPlace(thing.label, position, frame, inside)
 
 
-def _matching(detections: Sequence[Detection], condition: Condition) -> Detection | None:
+def _sought_detection(detections: Sequence[Detection], condition: Condition) -> Detection | None:
     """Returns the detection that a condition is about: by label or place, or the only one.
 
     Of several it is one with a place, and of these the one with the best score.
@@ -491,14 +507,16 @@ def _matching(detections: Sequence[Detection], condition: Condition) -> Detectio
     test = condition.test
     if isinstance(test, NearPosition):
         about = [
-            each for each in detections if each.place is not None and test.is_near(*each.place)
+            detection
+            for detection in detections
+            if detection.place is not None and test.is_near(*detection.place)
         ]
     else:
-        about = [each for each in detections if test.matches(each.label)]
+        about = [detection for detection in detections if test.matches(detection.label)]
     if not about and len(detections) == 1:
         about = list(detections)
-    return max(about, key=_rank, default=None)
+    return max(about, key=_by_place_and_score, default=None)
 
 
-def _rank(detection: Detection) -> tuple[bool, float]:
+def _by_place_and_score(detection: Detection) -> tuple[bool, float]:
     return detection.place is not None, -math.inf if detection.score is None else detection.score

@@ -36,40 +36,43 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
     A latched topic holds, and is never silent. Nor was one silent where its messages were deleted.
     """
     latching, bag_dir = memory.limits.latching, memory.index.bag_dir
-    latched: dict[str, bool] = {}
-    for each in _all_silences(bag_dir, snapshot):
-        if each.topic not in latched:
-            latched[each.topic] = latching.is_latched(snapshot, each.topic)
-        if not latched[each.topic]:
-            yield from _around_cut(bag_dir, snapshot, each)
+    is_latched: dict[str, bool] = {}
+    for silence in _all_silences(bag_dir, snapshot):
+        if silence.topic not in is_latched:
+            is_latched[silence.topic] = latching.is_latched(snapshot, silence.topic)
+        if not is_latched[silence.topic]:
+            yield from _outside_deleted(bag_dir, snapshot, silence)
 
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
     """Returns those that bags show, and those that deleted bags showed, in order of time."""
     shown: dict[str, list[Silence]] = {}
-    for each in snapshot.silences:
-        shown.setdefault(each.topic, []).append(each)
+    for silence in snapshot.silences:
+        shown.setdefault(silence.topic, []).append(silence)
     deleted = [
-        each
-        for each in map(Silence._make, read_thinned(bag_dir).silences)
+        silence
+        for silence in map(Silence._make, read_thinned(bag_dir).silences)
         # Until its bags are deleted, they show it as well.
-        if all(each.within(one.start, one.end) is None for one in shown.get(each.topic, ()))
+        if all(
+            silence.within(kept.start, kept.end) is None for kept in shown.get(silence.topic, ())
+        )
     ]
     return sorted(
-        [*snapshot.silences, *deleted], key=lambda each: (each.start, each.end, each.topic)
+        [*snapshot.silences, *deleted],
+        key=lambda silence: (silence.start, silence.end, silence.topic),
     )
 
 
-def _around_cut(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
+def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Iterator[Silence]:
     """Yields a silence, or the parts of it before and after messages that were deleted."""
-    gone = cut_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
-    if not gone:
+    deleted = cut_spans(bag_dir, silence.topic, TimeWindow(silence.start + 1, silence.end))
+    if not deleted:
         yield silence
         return
     if silence.length < silence.end - silence.start:
         return  # the robot was off for a while, and which part that was in is not known
-    begins = [silence.start, *(stop for _, stop in gone)]
-    ends = [*(start for start, _ in gone), silence.end]
+    begins = [silence.start, *(stop for _, stop in deleted)]
+    ends = [*(start for start, _ in deleted), silence.end]
     for start, end in zip(begins, ends, strict=True):
         if end - start >= snapshot.shortest_silence(silence.topic):
             goes_on = silence.goes_on and end == silence.end
@@ -80,8 +83,8 @@ def silences_in(view: View, window: TimeWindow) -> Iterator[Silence]:
     """Yields the silences in a window, in order, as far as they are inside."""
     start = window.start + START_SLACK_NS
     end = max(start, window.stop - 1 - AT_OR_BEFORE_SLACK_NS)
-    for each in silences_of(view.memory, view.snapshot):
-        part = each.within(start, end)
+    for silence in silences_of(view.memory, view.snapshot):
+        part = silence.within(start, end)
         if part is not None:
             yield part
 
@@ -91,8 +94,8 @@ def unrecorded_times(view: View, topic: str, window: TimeWindow) -> list[tuple[N
 
     Nothing was recorded, or the topic has a usual rate and was silent.
     """
-    silences = (each for each in silences_in(view, window) if each.topic == topic)
-    silent = ((each.start, each.end) for each in silences)
+    silences = (silence for silence in silences_in(view, window) if silence.topic == topic)
+    silent = ((silence.start, silence.end) for silence in silences)
     return united([*recording_gaps(view, window), *silent])
 
 
@@ -101,29 +104,32 @@ def describe_silences(view: View, topics: Collection[str], window: TimeWindow) -
 
     The longest silences are named. Empty where there was none.
     """
-    found = [each for each in silences_in(view, window) if each.topic in topics]
-    if not found:
+    silences = [silence for silence in silences_in(view, window) if silence.topic in topics]
+    if not silences:
         return ()
-    longest = sorted(found, key=lambda each: each.start - each.end)[:MAX_NAMED]
+    longest = sorted(silences, key=lambda silence: silence.start - silence.end)[:MAX_NAMED]
     names = [
-        f"{each.topic} {unix_text(each.start)} to {unix_text(each.end)} "
-        f"({local_text(each.start)} to {local_text(each.end)})"
-        for each in sorted(longest, key=lambda each: each.start)
+        f"{silence.topic} {unix_text(silence.start)} to {unix_text(silence.end)} "
+        f"({local_text(silence.start)} to {local_text(silence.end)})"
+        for silence in sorted(longest, key=lambda silence: silence.start)
     ]
-    return (f"silent while the robot was on, so not searched: {listed(names, len(found))}",)
+    return (f"silent while the robot was on, so not searched: {listed(names, len(silences))}",)
 
 
 def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
     """Returns silences, in order, with those of several topics at about the same time together."""
     groups: list[list[Silence]] = []
-    for each in silences:
-        for group in reversed(groups):
-            first = group[0]
-            if each.start - first.start > _ALIKE_NS:
-                continue
-            if abs(each.end - first.end) <= _ALIKE_NS:
-                group.append(each)
-                break
+    for silence in silences:
+        alike = [group for group in groups if _is_alike(silence, group[0])]
+        if alike:
+            alike[-1].append(silence)
         else:
-            groups.append([each])
+            groups.append([silence])
     return groups
+
+
+def _is_alike(silence: Silence, earlier: Silence) -> bool:
+    """Whether two topics fell silent together, and returned together."""
+    return (
+        silence.start - earlier.start <= _ALIKE_NS and abs(silence.end - earlier.end) <= _ALIKE_NS
+    )

@@ -63,8 +63,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
     live = heartbeat is not None and heartbeat.is_live(wall)
     # What a live recorder keeps too long while its clock may be wrong, and what no lake has.
     notes = () if heartbeat is None or not live else (heartbeat.age_held, heartbeat.unshipped)
-    heard = _heard(snapshot) if live else latest
-    recorder = ANOTHER if any(each.growing for each in snapshot.active) else None
+    heard = _last_heard(snapshot) if live else latest
+    recorder = ANOTHER if any(bag.growing for bag in snapshot.active) else None
     if heartbeat is not None:
         recorder = state_of(heartbeat, live=live)
     mixed = describe_mixed(memory, call)
@@ -125,16 +125,16 @@ def state_of(heartbeat: Heartbeat, *, live: bool) -> str:
     return str(heartbeat.state) if is_over else DIED
 
 
-def _heard(snapshot: Snapshot) -> Ns | None:
+def _last_heard(snapshot: Snapshot) -> Ns | None:
     """Returns the newest time of a topic that no recorder publishes itself; else of any.
 
     The recorder logs at each split, so its own topics go on when the robot is dead.
     """
     times = [
-        stated.last
+        totals.last
         for topic in snapshot.timeline.topics()
         if topic not in OWN_TOPICS
-        for stated in snapshot.totals(topic)
+        for totals in snapshot.totals(topic)
     ]
     latest = snapshot.dating.latest
     return latest if latest is None or not times else min(max(times), latest)
@@ -202,7 +202,7 @@ def missing_data(view: View) -> Iterator[str]:
     snapshot = view.snapshot
     if snapshot.problem is None and not snapshot.bags:
         yield nothing_here(snapshot)
-    undecided = [each for each in snapshot.active if not each.growing and each.reason != HELD_BACK]
+    undecided = [bag for bag in snapshot.active if not bag.growing and bag.reason != HELD_BACK]
     if undecided:
         files = counted(len(undecided), "file has", "files have")
         yield f"{files} no end yet: being written, or left by a crash"
@@ -226,7 +226,7 @@ def missing_data(view: View) -> Iterator[str]:
     if newest is not None and (alone := view.memory.reader.times_alone(newest.path)):
         topics = counted(len(alone), "topic")
         yield f"of {topics} there are only the times here: {listed(sorted(alone))}"
-    if undecodable := {each.topic for each in undecodable_topics(view)}:
+    if undecodable := {undecodable.topic for undecodable in undecodable_topics(view)}:
         topics = counted(len(undecodable), "topic")
         yield f"{topics} cannot be decoded: {listed(sorted(undecodable))}"
 
@@ -244,12 +244,12 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
     for topic in snapshot.timeline.topics():
         if snapshot.timeline.is_log(topic) or latching.is_latched(snapshot, topic):
             continue
-        stated = snapshot.totals(topic)
-        messages = sum(each.messages for each in stated)
-        last = max((each.last for each in stated), default=begin - 1)
+        totals_by_type = snapshot.totals(topic)
+        messages = sum(totals.messages for totals in totals_by_type)
+        last = max((totals.last for totals in totals_by_type), default=begin - 1)
         if messages < _MIN_MESSAGES or last < begin:
             continue
-        first = min(each.first for each in stated)
+        first = min(totals.first for totals in totals_by_type)
         usual = (last - first) // (messages - 1)
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
         is_long = latest - last > max(SILENT_AFTER_NS, longest)
@@ -304,9 +304,9 @@ def bags_with_remarks(snapshot: Snapshot) -> list[BagFile]:
 
 def nothing_here(snapshot: Snapshot) -> str:
     """Returns the sentence on a bag directory in which no bag answers."""
-    held = [each for each in snapshot.active if each.reason == HELD_BACK]
-    if held:
-        splits = counted(len(held), "split")
+    held_splits = [split for split in snapshot.active if split.reason == HELD_BACK]
+    if held_splits:
+        splits = counted(len(held_splits), "split")
         return f"no bag is served yet: recording.exclude_when has still to be applied to {splits}"
     if snapshot.active:
         return "there is no closed bag yet: the first one is still being written"

@@ -77,24 +77,24 @@ def events_back(
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    return (events for _, events in _timed_back(view, topic, window, reached))
+    return (events for _, events in _timed_events_back(view, topic, window, reached))
 
 
-def _timed_back(
+def _timed_events_back(
     view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
 ) -> Iterator[tuple[Ns, TopicEvents]]:
-    """Yields the same, each with a log time (ns) that none of it is earlier than."""
+    """Yields as `events_back`, each with a log time (ns) that none of it is earlier than."""
     columns = StatedColumns(view.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
 
     def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
         rows = opened.rows(newest_first=True, among=stretch.window)
-        for together in blocks(rows, newest_first=True):
-            first = max(min(one.first for one in together), window.start)
-            is_whole = all(rows.part is not None for rows in together)
+        for overlapping in blocks(rows, newest_first=True):
+            first = max(min(rows.first for rows in overlapping), window.start)
+            is_whole = all(rows.part is not None for rows in overlapping)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                yield first, _events(view, columns, together)
+                yield first, _events_of_tables(view, columns, overlapping)
 
     return joined_back(view, opened, EVENTS, make)
 
@@ -107,14 +107,14 @@ def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterat
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    # What a part has before or after is of it all the same.
-    every = [_timed_back(view, topic, window.widened(PART_NS)) for topic in topics]
-    yield from merge(*((at for at, _ in events) for events in every), reverse=True)
+    # The parts that lie across a bound of the window are made, too.
+    of_topics = [_timed_events_back(view, topic, window.widened(PART_NS)) for topic in topics]
+    yield from merge(*((at for at, _ in timed) for timed in of_topics), reverse=True)
 
 
 def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEvents | None:
     """Returns what messages of one topic report; None without any."""
-    return events_of(_stated_by(view, messages))
+    return events_of(_stated_in_messages(view, messages))
 
 
 def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, TopicEvents]:
@@ -124,21 +124,24 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
         BagError: the bag cannot be read.
     """
     reader, columns = view.memory.reader, StatedColumns(view.extractor)
-    found: dict[str, list[Stated]] = {}
+    stated_of_topics: dict[str, list[Stated]] = {}
     for tables in decoded(reader, bag.path, topics=topics) if topics else ():
         for nth, table in enumerate(tables):
             rows = Rows(BagUnit(bag, table, nth), lambda: None)
-            stated = _stated(view, columns, rows)
-            found.setdefault(table.channel.topic, []).append(stated)
-    events = {topic: events_of(joined_stated(parts)) for topic, parts in found.items()}
-    return {topic: each for topic, each in events.items() if each is not None}
+            stated = _stated_in_rows(view, columns, rows)
+            stated_of_topics.setdefault(table.channel.topic, []).append(stated)
+    return {
+        topic: events
+        for topic, parts in stated_of_topics.items()
+        if (events := events_of(joined_stated(parts))) is not None
+    }
 
 
-def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents:
+def _events_of_tables(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents:
     """Returns the events of tables that overlap in time; those of whole parts are remembered."""
 
     def make() -> TopicEvents:
-        stated = joined_stated([_stated(view, columns, rows) for rows in together])
+        stated = joined_stated([_stated_in_rows(view, columns, rows) for rows in together])
         return events_of(stated) or TopicEvents(1, 0)
 
     parts = tuple(rows.part for rows in together if rows.part is not None)
@@ -146,35 +149,37 @@ def _events(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEv
     return remembered(view, EVENTS, key, make)
 
 
-def _stated(view: View, columns: StatedColumns, rows: Rows) -> Stated:
+def _stated_in_rows(view: View, columns: StatedColumns, rows: Rows) -> Stated:
     """Returns what the messages of some rows state: by their columns, else by reading them."""
-    found = of_columns(view, rows, lambda each: _held(view, columns, each))
-    return _stated_by(view, messages_of(view, rows)) if found is None else joined_stated(found)
+    states = of_columns(view, rows, lambda counting: _stated_by_columns(view, columns, counting))
+    if states is None:
+        return _stated_in_messages(view, messages_of(view, rows))
+    return joined_stated(states)
 
 
-def _held(view: View, columns: StatedColumns, rows: Rows) -> Stated | None:
+def _stated_by_columns(view: View, columns: StatedColumns, rows: Rows) -> Stated | None:
     """Returns what the messages of some rows state; None where all of them have to be read."""
-    found = columns.of(rows.table)
-    if found is None:
+    of_table = columns.of(rows.table)
+    if of_table is None:
         return None
-    stated, to_read = found.stated, found.to_read(rows.index)
-    if rows.index is not None:
-        stated = stated.at(rows.index)
-    stated = stated._replace(times=rows.times)
-    if to_read.size:
-        others = np.setdiff1d(np.arange(len(rows)), to_read)
-        read = _stated_by(view, messages_of(view, rows.some(to_read)))
-        stated = joined_stated([stated.at(others), read])
-    return stated
+    counting = of_table.stated if rows.index is None else of_table.stated.at(rows.index)
+    stated = counting._replace(times=rows.times)
+    to_read = of_table.to_read(rows.index)
+    if not to_read.size:
+        return stated
+    others = np.setdiff1d(np.arange(len(rows)), to_read)
+    read = _stated_in_messages(view, messages_of(view, rows.some(to_read)))
+    return joined_stated([stated.at(others), read])
 
 
-def _stated_by(view: View, messages: Iterable[StoredMessage]) -> Stated:
+def _stated_in_messages(view: View, messages: Iterable[StoredMessage]) -> Stated:
+    """Returns what messages state, in order of log time; nothing of one that is undecodable."""
     states = []
-    for found in messages:
-        value = view.value(found)
-        states.append((found.time, None if value is None else state_of(value, found.type)))
+    for message in messages:
+        value = view.value(message)
+        states.append((message.time, None if value is None else state_of(value, message.type)))
     # Those of a part come bag after bag, in the order in which bags were stored.
-    states.sort(key=lambda each: each[0])
+    states.sort(key=lambda timed_state: timed_state[0])
     return stated_by([time for time, _ in states], [state for _, state in states])
 
 

@@ -76,7 +76,7 @@ def test_every_time_is_in_the_bin_of_its_local_time(
         "weekday": local.strftime("%A"),
         "hour": f"{local.hour:02d}:00",
     }[by]
-    assert bins.names[int(bins.among([when])[0].argmax())] == expected
+    assert bins.names[int(bins.membership([when])[0].argmax())] == expected
     assert bins.day_of is not None
     assert bins.day_of[bins.pieces([when])[0]] == local.date().toordinal() - EPOCH
 
