@@ -24,7 +24,7 @@ from ros2_memory.cli.options import (
     open_memory,
     parse_duration,
     parse_time,
-    present,
+    present_time,
 )
 from ros2_memory.cli.output import print_line, print_reply, spinner, stdout_console
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -128,7 +128,9 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(stdout_console(), _without_waypoints(answer), unix_from_ns(present(memory)))
+        print_reply(
+            stdout_console(), _without_waypoints(answer), unix_from_ns(present_time(memory))
+        )
     if name not in tools:
         print(f"tools: {', '.join(tools)}", file=sys.stderr)
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
@@ -145,7 +147,9 @@ def question_for(
         InvalidArgumentsError: a word is no argument, or a text is no time.
     """
     schemas = {} if tool is None else tool.arguments
-    arguments = with_times(parse_arguments(words, schemas), schemas, unix_from_ns(present(memory)))
+    arguments = with_times(
+        parse_arguments(words, schemas), schemas, unix_from_ns(present_time(memory))
+    )
     if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
         first, last = day_of(memory, None).asked()
         arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}

@@ -304,7 +304,7 @@ def open_memory(
     return memory
 
 
-def present(memory: "Memory") -> Ns:
+def present_time(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
     return memory.now(memory.clock.now(), memory.index.snapshot().dating.latest)
 
@@ -372,7 +372,7 @@ def parse_end(text: str, now: float, start: float) -> float:
 def day_of(memory: "Memory", day: str | None) -> TimeWindow:
     """Returns a day of this machine's calendar, from midnight to midnight; None is the newest."""
     newest = memory.index.snapshot().dating.latest
-    now = present(memory) if day is not None or newest is None else newest
+    now = present_time(memory) if day is not None or newest is None else newest
     at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
     date = datetime.fromtimestamp(at).astimezone().date()
     days = (date, date + timedelta(days=1))
@@ -437,7 +437,7 @@ class Times:
         Raises:
             InvalidArgumentsError: the options contradict each other, or one is not a time.
         """
-        now = unix_from_ns(present(memory))
+        now = unix_from_ns(present_time(memory))
         if self.last is None:
             first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
             until = unix_from_ns(MAX_NS)

@@ -202,11 +202,13 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
     fields = dict(children(node))
     single = scored(fields)
     if single is not None:
-        return Narrowed(_OwnScoreLimit(single.level, single, least, *_inside(fields, depth)), node)
+        return Narrowed(
+            _OwnScoreLimit(single.level, single, least, *_inner_detections(fields, depth)), node
+        )
     results, several = fields.get("results"), hypotheses(fields)
     if isinstance(results, Listing) and several is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
-        texts, has_inner = _inside(others, depth)
+        texts, has_inner = _inner_detections(others, depth)
         best = _BestScoreLimit(
             several.level.parent or several.level, several, least, texts, has_inner
         )
@@ -242,12 +244,16 @@ def _leaves(
     return tuple(node for node in nodes if isinstance(node, Leaf) and takes(node))
 
 
-def _inside(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
-    """Returns the texts in an object that may be JSON, and whether there are detections in it."""
+def _inner_detections(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
+    """Returns the texts in an object that may be JSON, and whether there are detections in it.
+
+    No texts where there are: they decide nothing then.
+    """
     texts: list[Leaf] = []
     for node in fields.values():
-        child = without_low(node, 0.0, depth - 1)
-        for _, leaf, limits in leaves_below(Spot(child)):
+        # Any limit on scores will do: where one is shows where a detection is.
+        limited = without_low(node, 0.0, depth - 1)
+        for _, leaf, limits in leaves_below(Spot(limited)):
             if any(isinstance(limit, _ScoreLimit) for limit in limits):
                 return (), True
             if leaf.json_depth:

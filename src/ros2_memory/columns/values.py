@@ -280,12 +280,14 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
         most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
     source_zone = zone(leaf.level.full(leaf.sources[0]))
-    if source_zone is not None and leaf.is_of_array and leaf.level.parent is not None:
+    if source_zone is None:
+        return None
+    if leaf.is_of_array and leaf.level.parent is not None:
         lengths = zone(leaf.level.parent.full(f"{leaf.level.name}.length"))
         return None if lengths is None else _with_long_arrays(source_zone, lengths)
-    if source_zone is None or leaf.conversion is not Conversion.SECONDS:
-        return source_zone
-    return source_zone.divided(NS_PER_S)
+    if leaf.conversion is Conversion.SECONDS:
+        return source_zone.divided(NS_PER_S)
+    return source_zone
 
 
 def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:

@@ -270,17 +270,15 @@ class Fleet:
         for robot in allowed:
             if robot.name == name:
                 return robot
-        raise InvalidArgumentsError(
-            f"there is no robot {abbreviate(name)}; there {names_of(allowed)}"
-        )
+        raise InvalidArgumentsError(f"there is no robot {abbreviate(name)}; {there_are(allowed)}")
 
 
-def names_of(robots: Iterable[Robot]) -> str:
-    """Returns the names of robots for a sentence."""
+def there_are(robots: Iterable[Robot]) -> str:
+    """Returns a clause that names the robots that there are."""
     names = [robot.name for robot in robots]
     if not names:
-        return "is none"
-    return f"{'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"
+        return "there is none"
+    return f"there {'is' if len(names) == 1 else 'are'} {listed(names, at_most=_MOST_NAMED)}"
 
 
 class FanOut:

@@ -36,7 +36,15 @@ from ros2_memory.core.timebase import (
     unix_from_text,
     unix_rounded_up,
 )
-from ros2_memory.fleet.robots import AT_ONCE, FanOut, Fleet, FromLake, Robot, StoppedClock, names_of
+from ros2_memory.fleet.robots import (
+    AT_ONCE,
+    FanOut,
+    Fleet,
+    FromLake,
+    Robot,
+    StoppedClock,
+    there_are,
+)
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
 from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import to_json_text
@@ -349,7 +357,7 @@ def _only_one(tool: str, robots: Sequence[Robot]) -> Robot:
         return robots[0]
     example = f", e.g. robot={robots[0].name}" if robots else ""
     raise InvalidArgumentsError(
-        f"which robot? {tool} answers for one: pass robot{example}; there {names_of(robots)}"
+        f"which robot? {tool} answers for one: pass robot{example}; {there_are(robots)}"
     )
 
 

@@ -91,7 +91,9 @@ def driven_inside(
     inside = robot_inside(track, region.region, window)
     totals = totals_inside(path.line, inside)
     waypoints = way_inside(path.line, inside, max_waypoints)
-    waypoints = tuple(_as_turned(view, name, path.line, waypoint) for waypoint in waypoints)
+    waypoints = tuple(
+        _with_measured_heading(view, name, path.line, waypoint) for waypoint in waypoints
+    )
     elapsed = elapsed_in(view, window)
     spans = [(stay.start, stay.stop) for stay in inside]
     duration = elapsed.among(spans)
@@ -169,21 +171,24 @@ def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypo
     return waypoints if at_most >= _FEWEST_WAYPOINTS else waypoints[len(waypoints) - at_most :]
 
 
-def _as_turned(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
+def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoint) -> Waypoint:
     """Returns a waypoint with the heading of the newest pose then, where it has quite another.
 
     Between vertices a heading is one between theirs, and the robot may have turned meanwhile
-    without turning off its way.
+    without turning off its way. Without an orientation then, it has no heading.
     """
     if waypoint.yaw_rad is None or np.isin(waypoint.time, line.times):
         return waypoint
     window = TimeWindow(max(waypoint.time - NEWEST_POSE_NS, MIN_NS), waypoint.time + 1)
-    _, pose = newest_pose(view, topic, window) or (None, None)
-    turn = None if pose is None else pose.orientation
-    if turn is None:
+    newest = newest_pose(view, topic, window)
+    pose = None if newest is None else newest[1]
+    orientation = None if pose is None else pose.orientation
+    if orientation is None:
         return dataclasses.replace(waypoint, yaw_rad=None)
-    off = math.remainder(yaw(turn) - waypoint.yaw_rad, math.tau)
-    return dataclasses.replace(waypoint, yaw_rad=yaw(turn)) if abs(off) > _TURNED_RAD else waypoint
+    measured_rad = yaw(orientation)
+    if abs(math.remainder(measured_rad - waypoint.yaw_rad, math.tau)) > _TURNED_RAD:
+        return dataclasses.replace(waypoint, yaw_rad=measured_rad)
+    return waypoint
 
 
 def _part(line: Line, span: Inside) -> Line:

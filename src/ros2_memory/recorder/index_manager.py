@@ -183,12 +183,14 @@ class IndexManager:
 
     def _context(self) -> ScanContext:
         now, heartbeat = self._clock.now(), self.heartbeat()
-        live = heartbeat is not None and heartbeat.is_live(now)
+        open_recordings = None
+        if heartbeat is not None and heartbeat.is_live(now):
+            open_recordings = frozenset(heartbeat.recordings)
         return ScanContext(
             self.bag_dir,
             now,
             self._three_splits,
-            frozenset(heartbeat.recordings) if heartbeat is not None and live else None,
+            open_recordings,
             self._include_active,
             self._trusts_mtime,
         )
