@@ -106,9 +106,9 @@ def test_what_lay_between_recordings_needs_a_folder(
     two_days: Path, tmp_path: Path, exits: Program
 ) -> None:
     span = f"start={BEGIN // S} end={BEGIN // S + DAY_S + 60}"
-    question, proof = f"trajectory_summary {span}", tmp_path / "proof.mcap"
+    question, proof = f"trajectory_summary by=day {span}", tmp_path / "proof.mcap"
     differs = exits(1, "prove", question, "-o", proof, two_days)
-    assert f"over {proof} the answer differs in avg_speed" in differs.err
+    assert f"over {proof} the answer differs in rows, all" in differs.err
     assert f"-o {tmp_path / 'proof'} keeps recordings apart" in differs.err
     folder = tmp_path / "proof"
     proved = exits(0, "prove", question, "-o", folder, two_days, "--json").json

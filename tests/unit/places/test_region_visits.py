@@ -217,7 +217,7 @@ def test_what_two_recorders_of_one_robot_have_is_one_visit(tmp_path: Path, since
     memory = spots(memory_of(tmp_path), spot=Circle(5.0, 0.0, 1.0))
     reply = asked(memory, tmp_path, "visits", where="spot")
     assert (reply["total"], reply["minutes"]) == (1, 0.13)
-    assert "robots" not in str(reply["notes"])
+    assert "robots" not in str(reply.get("notes"))
     span = {"start": BEGIN / S, "end": BEGIN / S + 60}
     assert asked(memory, tmp_path, "recap", where="spot", **span)["inside_s"] == 8.0
 
