@@ -145,7 +145,7 @@ def count_visits(
     binned.add_lengths("placed_s", "duration", placed_spans)
     binned.add_unknown(unknown_times(view, binned.counted, placed_spans, WHEREABOUTS))
     if place is not None and by != "place":
-        stayed = _stays(view, placement.frame_id, place.region, binned.window)
+        stayed = _stays(view, placement.frame_id, place.region, binned.counted)
         if not stayed and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
@@ -154,7 +154,7 @@ def count_visits(
     named = memory.limits.places if place is None else place.places(placement.frame_id)
     places = places_in(view, named, placement, binned.window)
     stays_of_places = [
-        _stays(view, place.frame_id, place.region, binned.window) for place, _ in places
+        _stays(view, place.frame_id, place.region, binned.counted) for place, _ in places
     ]
     if by == "place":
         _add_visits_by_place(binned, stays_of_places)
