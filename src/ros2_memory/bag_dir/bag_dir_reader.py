@@ -285,7 +285,7 @@ class BagDirReader(BagReader):
         return replace(topic, count=topic.count - lost, first=first, last=last)
 
     def _end_of(self, path: Path, topic: TopicSummary, *, newest_first: bool) -> Ns | None:
-        """Returns the first log time of what counts of a topic, or the last; None without any."""
+        """Returns the log time (ns) of the first or last message of a topic that counts, if any."""
         span = TimeWindow(topic.first, topic.last + 1)
         records = self.records(path, [topic.topic], span, newest_first=newest_first)
         of_type = (record.log_time for record in records if record.channel.type == topic.type)

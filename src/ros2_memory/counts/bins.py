@@ -458,7 +458,7 @@ class BinnedWindow:
 
     @property
     def _counted_bounds(self) -> tuple[Ns, Ns]:
-        """Start and stop of what is counted of the window."""
+        """Begin and end (ns) of the part of the window that is counted."""
         start = self.window.start if self._since is None else max(self.window.start, self._since)
         return start, max(start, self.window.stop)
 

@@ -452,9 +452,9 @@ class Notes:
         self._remarks |= {short_name(bag.path): bag.summary.remarks for bag in bags}
 
     def notes_cover_remarks(self, bag: BagFile) -> bool:
-        """Whether the notes on a bag tell all that its summary remarks, so no sentence need do so.
+        """Returns whether the notes on a bag have all remarks of its summary.
 
-        False for one of which sentences have told it already (`add_remarks`).
+        False where a sentence has them (`add_remarks`): then such notes are left out.
         """
         name = short_name(bag.path)
         if name in self._remarks:

@@ -95,11 +95,11 @@ def sha256_of(path: Path) -> str:
 
 
 def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
-    """Returns a digest of what the rows of a bag depend on besides its bytes.
+    """Returns a digest of all inputs of a bag's rows besides its bytes.
 
-    That is which of its messages count, the handovers of its recording, the static transforms in
-    force, what the robot is placed by, the spellings of labels, the settings (`config`) and the
-    topics whose `messages` are shipped.
+    These are the messages that count, the handovers of its recording, the static transforms in
+    force, the pose topic, the spellings of labels, the settings (`config`) and the topics whose
+    `messages` are shipped.
     """
     counted = [
         (topic.topic, topic.type, topic.count, topic.first, topic.last)

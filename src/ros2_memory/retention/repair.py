@@ -256,7 +256,7 @@ def _status(path: Path) -> os.stat_result:
 
 
 def reason_of(error: Exception) -> str:
-    """Returns what a sentence says of an error: its reason, without the path where it has one."""
+    """Returns the reason of an error, without its path."""
     if isinstance(error, BagError):
         return error.reason
     return (error.strerror or str(error)) if isinstance(error, OSError) else str(error)

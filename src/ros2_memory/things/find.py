@@ -156,7 +156,7 @@ class _FoundThing(NamedTuple):
         place: where it was then (m, in the frame of its epoch).
         at_once: how many are there; None where one is.
         is_vague: whether localisation was poor then.
-        also_at: of what moves by itself, where others were in the slice that was seen last.
+        also_at: of people and pets, the places (m) of the others in the newest slice.
         near_m: how far it is from what it was to be near.
     """
 

@@ -275,11 +275,10 @@ def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:
 
 
 def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
-    """Returns the pose of the robot at each message, and how far its detector was turned from it.
+    """Returns the robot's pose at each message, and the yaw of its detector relative to it (rad).
 
-    As `DetectorMessages.robot` has them. Where the poses do not say it, transforms of what carries
-    the detector may. What does not name the frame of its message is taken to be in that of the
-    others.
+    As in `DetectorMessages.robot`. Where there is no pose, transforms of the frames that carry the
+    detector are used. A message without a frame is in the frame of most detections.
     """
     times, pose_frame = detected.times, poses.frames.words[0] if len(poses) else ""
     robot = np.column_stack((_posed_at(poses, times, frames), np.zeros(len(times))))
