@@ -244,8 +244,12 @@ ELSEWHERE: Final = "(elsewhere)"
 UNKNOWN: Final = "(unknown)"
 
 
-def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> TimeBins:
-    """Returns places as bins: when the robot was in each; notes list unknown times.
+def place_bins(
+    view: View, window: TimeWindow, counted: TimeWindow, where: Where | None = None
+) -> TimeBins:
+    """Returns places as bins: when the robot was in each, by its track in what is counted.
+
+    Notes list unknown times.
 
     Raises:
         InvalidArgumentsError: no place is named in the frame of places, or those of the question
@@ -257,7 +261,7 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
     asked_frame = None if where is None else where.frame_id
     placement = map_placement(view, topic, asked_frame)
     named_places = view.limits.places if where is None else where.places(placement.frame_id)
-    places = places_in(view, named_places, placement, window)
+    places = places_in(view, named_places, placement, counted)
     if not places:
         frames = " or ".join(placement.frames)
         raise InvalidArgumentsError(
@@ -268,7 +272,7 @@ def place_bins(view: View, window: TimeWindow, where: Where | None = None) -> Ti
         united((visit.start, visit.stop + 1) for visit in joined.inside(place.region, window))
         for place, joined in places
     ]
-    placed_spans = placed_times(joined_in(view, placement.frame_id, window).track, [])
+    placed_spans = placed_times(joined_in(view, placement.frame_id, counted).track, [])
     edges = _edges_at_spans(window, [*spans_inside, placed_spans])
     in_places = np.array([_lies_in_spans(edges, spans) for spans in spans_inside]).T
     if (np.diff(edges)[in_places.sum(axis=1) > 1] > NS_PER_S).any():
@@ -347,7 +351,9 @@ class BinnedWindow:
         # Up to midnight is no part of the next day; what is at the very end counts to the last bin.
         self.window = TimeWindow(start, max(end, start + 1))
         self.bins: TimeBins = (
-            place_bins(view, self.window, where) if by == "place" else time_bins(self.window, by)
+            place_bins(view, self.window, self.counted, where)
+            if by == "place"
+            else time_bins(self.window, by)
         )
         self._columns: list[tuple[str, BinColumn]] = []
         self._values: list[Values] = []

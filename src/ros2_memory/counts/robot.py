@@ -139,23 +139,23 @@ def count_visits(
     if place is not None:
         place = replace(place, frame_id=asked_frame)
     binned = BinnedWindow(view, asked, by, (topic,), place)
-    joined = joined_in(view, placement.frame_id, binned.window)
+    # All that asks about this window shares its track, and what there was time to know of it.
+    window = binned.counted
+    joined = joined_in(view, placement.frame_id, window)
     binned.count_since(joined.since)
     placed_spans = placed_times(joined.track, mixed_spans)
     binned.add_lengths("placed_s", "duration", placed_spans)
     binned.add_unknown(unknown_times(view, binned.counted, placed_spans, WHEREABOUTS))
     if place is not None and by != "place":
-        stayed = _stays(view, placement.frame_id, place.region, binned.counted)
+        stayed = _stays(view, placement.frame_id, place.region, window)
         if not stayed and asked_frame is None:
             ask = f'ask with frame_id "{placement.pose_frame}"'
             note_other_frame(view, place, placement, binned.window, ask)
         _add_visits(binned, stayed)
         return binned.answer()
     named = memory.limits.places if place is None else place.places(placement.frame_id)
-    places = places_in(view, named, placement, binned.window)
-    stays_of_places = [
-        _stays(view, place.frame_id, place.region, binned.counted) for place, _ in places
-    ]
+    places = places_in(view, named, placement, window)
+    stays_of_places = [_stays(view, place.frame_id, place.region, window) for place, _ in places]
     if by == "place":
         _add_visits_by_place(binned, stays_of_places)
         return binned.answer()
