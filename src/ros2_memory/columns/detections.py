@@ -37,7 +37,6 @@ from ros2_memory.messages.detections import (
     POSITIONS,
     Detection,
     detections_of,
-    looks_like_json,
 )
 from ros2_memory.storage.base import Definition
 
@@ -45,7 +44,6 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.values import Floats, Ints, Level, Mask
-    from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
 
 Point: TypeAlias = tuple[Leaf, Leaf, Leaf]
@@ -419,7 +417,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     texts = texts_of(values, source.leaf)
     parsed = values.table.remember(
         f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
-        lambda: detections_by([_parsed(word, source.depth) for word in texts.words]),
+        lambda: detections_by([detections_of(word, depth=source.depth) for word in texts.words]),
         lambda detections: 1000 + 100 * detections.rows.size,
     )
     if not parsed.rows.size:
@@ -435,15 +433,6 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
         parsed.places[nth],
         or_else(Texts(parsed.frames.codes[nth], parsed.frames.words), outer_frames),
     )
-
-
-def _parsed(word: str, depth: int) -> tuple[Detection, ...]:
-    if not looks_like_json(word):
-        return ()
-    value: JsonValue = word
-    for _ in range(MAX_DEPTH - depth):
-        value = {"": value}
-    return detections_of(value)
 
 
 def _best_hypotheses(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:

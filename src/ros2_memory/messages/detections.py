@@ -49,10 +49,15 @@ class Detection(NamedTuple):
     score: float | None = None
 
 
-def detections_of(value: JsonValue, frame_id: str = "") -> tuple[Detection, ...]:
-    """Returns the detections in an extracted value, in order; `frame_id` is the message's own."""
+def detections_of(
+    value: JsonValue, frame_id: str = "", depth: int = MAX_DEPTH
+) -> tuple[Detection, ...]:
+    """Returns the detections in an extracted value, in order; `frame_id` is the message's own.
+
+    They are looked for `depth` lists, objects and texts deep.
+    """
     detections: list[Detection] = []
-    _walked(value, frame_id, MAX_DEPTH, None, detections)
+    _walked(value, frame_id, depth, None, detections)
     return tuple(detections)
 
 

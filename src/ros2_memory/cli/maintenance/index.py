@@ -43,7 +43,7 @@ _BATCH: Final = 4096
 """Bags stored before the program looks which others closed meanwhile, among all that wait."""
 _FOLLOWED: Final = 256
 """Bags stored before what follows from them is made."""
-_CACHE_MB: Final = 8
+_CACHE_MB: Final = 32
 _BAR_WIDTH: Final = 40
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
@@ -124,7 +124,7 @@ def _fill_for_server(settings: Settings, server: int) -> None:
 
 
 def _cache_mb(settings: Settings) -> int:
-    """Returns what a cache may take, in MiB: little, since each bag is read and unpacked once."""
+    """Returns what a cache may take, in MiB: of ten minutes at a time all is read together."""
     return min(_CACHE_MB, settings.reader.chunk_cache_mb)
 
 
