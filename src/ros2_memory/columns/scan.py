@@ -176,17 +176,7 @@ class Scan:
         Raises:
             QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
         """
-        sources = self._sources if among is None else self._sources_in(among)
-        if newest_first:
-            sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window = self._request.window
-        # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
-        sources = [s for s in sources if window.overlaps(s.first, s.last)]
-        ruled_out = self._ruled_out(sources)
-        if not self._request.may_not_match:
-            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
-        if (within := self._request.within) is not None:
-            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
+        sources, ruled_out = self._asked_sources(newest_first=newest_first, among=among)
         ahead = together = 1
         waiting: list[Rows] = []
         for nth, source in enumerate(sources):
@@ -208,6 +198,23 @@ class Scan:
                 rows = waiting.pop(0)
                 if self._request.may_be_empty or len(rows):
                     yield rows
+
+    def _asked_sources(
+        self, *, newest_first: bool, among: TimeWindow | None
+    ) -> tuple[Sequence[_Source], set[int]]:
+        """Returns the sources that are asked for, in their order; and the parts without a match."""
+        sources = self._sources if among is None else self._sources_in(among)
+        if newest_first:
+            sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
+        window = self._request.window
+        # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
+        sources = [s for s in sources if window.overlaps(s.first, s.last)]
+        ruled_out = self._ruled_out(sources)
+        if not self._request.may_not_match:
+            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
+        if (within := self._request.within) is not None:
+            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
+        return sources, ruled_out
 
     def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
         """Returns the numbers of the parts that have no wanted row, by their zones."""

@@ -18,7 +18,7 @@ from ros2_memory.results.things import SHORT_THING, compared, listed_things, thi
 from ros2_memory.tools.reply_size import largest, to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -145,16 +145,22 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
         }
         row |= {key: value for key, value in body.items() if key not in {*shared, *_OF_WINDOW}}
         rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
-    whole: JsonObject = {}
-    if any("at_least" in body for body in answered):
-        answered = [{"at_least": body.get("total"), **body, "total": None} for body in answered]
-    for key in _SUMMED:
-        values = [body.get(key) for body in answered]
-        numbers = [value for value in values if isinstance(value, int | float)]
-        if numbers:
-            whole[key] = round(sum(numbers), 3)
+    whole = _added_up(answered)
     total: JsonObject = {"all": whole} if whole else {}
     return with_notes({**total, **shared, "windows": rows}, [*answer.notes, *common])
+
+
+def _added_up(replies: Sequence[JsonObject]) -> JsonObject:
+    """Returns the sums over replies; `at_least` so many where one of them has no total."""
+    if any("at_least" in reply for reply in replies):
+        replies = [{"at_least": reply.get("total"), **reply, "total": None} for reply in replies]
+    sums: JsonObject = {}
+    for key in _SUMMED:
+        values = [reply.get(key) for reply in replies]
+        numbers = [value for value in values if isinstance(value, int | float)]
+        if numbers:
+            sums[key] = round(sum(numbers), 3)
+    return sums
 
 
 def _notes_in(reply: JsonObject) -> list[str]:

@@ -251,33 +251,41 @@ class SplitSearch:
         be read of it is reported as a problem of the rules.
         """
         yield _Event(max(bag.start, part.window.start), "", part.recording, None)
-        latched = {topic.topic for topic in bag.summary.topics if topic.latched}
-        watched = {topic.topic: self._rules_of(topic.topic) for topic in bag.summary.topics}
-        read: list[str] = []
-        times: list[tuple[Ns, str]] = []
+        topics = [topic.topic for topic in bag.summary.topics]
+        watched = {topic: rules for topic in topics if (rules := self._rules_of(topic))}
         try:
-            for topic, rules in watched.items():
-                if topic in latched or any(rule.condition is not None for rule in rules):
-                    read += [topic] if rules else []
-                elif rules:
-                    batches = self._reader.batches(bag.path, [topic], part.window, bare=[topic])
-                    for batch in batches:
-                        times += ((time, topic) for time in batch.log_times.tolist())
-            records = self._reader.records(bag.path, read, part.window) if read else ()
-            yield from heapq.merge(
-                (
-                    _Event(record.log_time, record.channel.topic, part.recording, record)
-                    for record in records
-                ),
-                (_Event(time, topic, part.recording, None) for time, topic in sorted(times)),
-                key=lambda event: event.time,
-            )
+            yield from self._messages(bag, part, watched)
         except BagError as error:
             if isinstance(error, BagUnreachableError) and self._failing.may_recover(bag.path):
                 raise
             problem = f"not all could be searched: {bag.path.name}: {error.reason}"
             for rule in {rule.name for rules in watched.values() for rule in rules}:
                 state.rules[rule].problem = problem
+
+    def _messages(
+        self, bag: BagFile, part: SearchPart, watched: Mapping[str, Sequence[Rule]]
+    ) -> Iterator[_Event]:
+        """Yields the messages of topics that rules watch; their times alone where these suffice.
+
+        Raises:
+            BagError: the bag cannot be read.
+        """
+        latched = {topic.topic for topic in bag.summary.topics if topic.latched}
+        read: list[str] = []
+        times: list[tuple[Ns, str]] = []
+        for topic, rules in watched.items():
+            if topic in latched or any(rule.condition is not None for rule in rules):
+                read.append(topic)
+                continue
+            for batch in self._reader.batches(bag.path, [topic], part.window, bare=[topic]):
+                times += ((time, topic) for time in batch.log_times.tolist())
+        records = self._reader.records(bag.path, read, part.window) if read else ()
+        with_records = (
+            _Event(record.log_time, record.channel.topic, part.recording, record)
+            for record in records
+        )
+        bare = (_Event(time, topic, part.recording, None) for time, topic in sorted(times))
+        yield from heapq.merge(with_records, bare, key=lambda event: event.time)
 
 
 def _receive(record: Record, recording: str, state: TriggerState) -> bool:

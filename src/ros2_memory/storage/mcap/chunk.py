@@ -201,7 +201,6 @@ def pairs_in(
     heads = gathered(region, _INDEX, at)
     sizes = heads["size"].astype(np.int64)
     after = at + _INDEX.itemsize + sizes
-    order = np.argsort(at)
     if (
         (heads["opcode"] != _INDEX_OPCODE).any()
         or (heads["channel"] != stated["channel"]).any()
@@ -210,10 +209,7 @@ def pairs_in(
         or sizes.max() > MAX_CHUNK_MESSAGES * _PAIR.itemsize
         or (at < begins[number]).any()
         or (after > ends[number]).any()
-        # Together they fill what lies behind the chunks: there is no other index.
-        or at[order[0]] != 0
-        or after[order[-1]] != len(region)
-        or (at[order[1:]] != after[order[:-1]]).any()
+        or not _fill(at, after, len(region))
     ):
         raise UnreadableError(_OTHER_INDEX)
     channels = heads["channel"].astype(np.int64)
@@ -235,6 +231,13 @@ def pairs_in(
     return Pairs(
         np.repeat(channels[is_kept], counts), times, np.ascontiguousarray(pairs["place"]), chunk_of
     )
+
+
+def _fill(begins: IntArray, ends: IntArray, size: int) -> bool:
+    """Returns whether records follow each other from the begin of a region to its end."""
+    order = np.argsort(begins)
+    begins, ends = begins[order], ends[order]
+    return bool(begins[0] == 0 and ends[-1] == size and (begins[1:] == ends[:-1]).all())
 
 
 def index_bytes(indexes: int, messages: int) -> int:
