@@ -40,8 +40,7 @@ ELSEWHERE: Final = {
     "tools.md",  # test_reference.py
     "errors.md",
     "files.md",
-    "metrics.md/Scraping",  # test_metrics_page.py
-    "metrics.md/Alerts",
+    "metrics.md/Scraping",  # a configuration of Prometheus
     "tls.md/nginx",  # tests/integration/test_proxy.py
     "tls.md/Caddy",
 }

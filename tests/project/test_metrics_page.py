@@ -1,4 +1,4 @@
-"""docs/how-to/metrics.md asks for series that the server shows, and names what spans contain."""
+"""The page on metrics and the alerts ask for series that there are; what spans contain."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from ros2_memory.observability.opentelemetry import SERVICE, _attributes
 from ros2_memory.observability.prometheus import MemoryGauges, Metrics
 
 PAGE = (ROOT / "docs/how-to/metrics.md").read_text(encoding="utf-8")
-_, RULES = (yaml.safe_load(each) for each in re.findall(r"```yaml\n(.*?)```", PAGE, re.DOTALL))
+RULES = yaml.safe_load((ROOT / "deploy/ros2-memory.rules.yml").read_text(encoding="utf-8"))
 QUERIES = [
     *(rule["expr"] for rule in RULES["groups"][0]["rules"]),
     *re.findall(r"^\| [^|]+ \| `(.*?)` \|$", PAGE, re.MULTILINE),
