@@ -6,9 +6,9 @@ Of a part that nothing needs not even the times are unpacked.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 import numpy as np
 
@@ -46,10 +46,10 @@ _HEAD_BYTES: Final = 400
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
-_FETCHED_BYTES: Final = 2 << 20
-"""How much compressed columns may take in memory that a scan wants next."""
+_FETCHED_BYTES: Final = 1 << 20
+"""How much of compressed columns that a scan wants next is read at once."""
 DECODED_BYTES: Final = 8 << 20
-"""How much the tables of bags that are not stored may take in memory."""
+"""How much of a bag that is not stored is remembered, at most."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
 """Of windows up to this long, only the parts of the days that they touch are looked up."""
 _DROPPED: Final = "beyond the share of the store (store.max_share)"
@@ -122,22 +122,21 @@ class Caches:
 
     read: ByteLru[object]
     packed: ByteLru[Packed]
-    fetched: ByteLru[bytes] = field(default_factory=lambda: ByteLru(_FETCHED_BYTES))
-    zones: ByteLru[tuple[Zones, int]] = field(default_factory=lambda: ByteLru(32 << 20))
-    heads: ByteLru[_Heads] = field(default_factory=lambda: ByteLru(16 << 20))
-    decoded: ByteLru[list[list[Table]]] = field(default_factory=lambda: ByteLru(DECODED_BYTES))
-    pairs: ByteLru[frozenset[Pair]] = field(default_factory=lambda: ByteLru(4 << 20))
-    clock_steps: ByteLru[tuple[ClockStep, ...]] = field(default_factory=lambda: ByteLru(1 << 20))
-    statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]] = field(
-        default_factory=lambda: ByteLru(1 << 20)
-    )
-    sights: ByteLru[bytes] = field(default_factory=lambda: ByteLru(16 << 20))
-    things: ByteLru[tuple[Timeline, object]] = field(default_factory=lambda: ByteLru(64 << 20))
+    fetched: ByteLru[bytes]
+    zones: ByteLru[tuple[Zones, int]]
+    heads: ByteLru[_Heads]
+    decoded: ByteLru[list[list[Table]]]
+    pairs: ByteLru[frozenset[Pair]]
+    clock_steps: ByteLru[tuple[ClockStep, ...]]
+    statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]]
+    sights: ByteLru[bytes]
+    things: ByteLru[tuple[Timeline, object]]
 
     @classmethod
     def of(cls, cache_mb: int = 64) -> Caches:
-        """Returns caches; columns and fragments take so much memory in them, in MiB."""
-        return cls(ByteLru(cache_mb << 20), ByteLru((cache_mb << 20) // 5))
+        """Returns caches that take so much memory together, in MiB."""
+        whole = ByteLru[Any](cache_mb << 20)
+        return cls(**{cache.name: whole.namespace() for cache in fields(cls)})
 
     def namespace(self) -> Caches:
         """Returns caches with keys of their own, within the capacities of these."""
@@ -434,7 +433,7 @@ class Scanner:
             nth = numbers.index(head.number) if head.number in numbers else 0
             goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
             numbers = numbers[nth:] if goes_on else [head.number]
-            fetched = self.store.part_data(numbers, path, _FETCHED_BYTES // 2)
+            fetched = self.store.part_data(numbers, path, _FETCHED_BYTES)
             for number, data in fetched.items():
                 self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
             stored = fetched.get(head.number)

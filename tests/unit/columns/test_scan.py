@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.columns.scanner import Scanner
+from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
@@ -158,3 +158,11 @@ def test_a_store_that_fails_while_it_is_asked_hides_no_row(
         assert check_rows(world, "/odom") == 40
     assert not failing
     assert check_rows(world, "/odom") == 40
+
+
+def test_what_is_remembered_of_any_kind_makes_room_for_the_newest() -> None:
+    caches = Caches.of(cache_mb=1)
+    caches.sights.put("older", b"", 700 << 10)
+    caches.namespace().fetched.put("newer", b"", 700 << 10)
+    assert caches.sights.get("older") is None
+    assert caches.read.get("newer") is None
