@@ -306,8 +306,11 @@ def _spans_of_flag(
 
 
 def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
-    """Returns the gaps in the recording, each until the first message of a topic after it."""
-    bags = binned.view.stream.overlapping_bags([topic], binned.counted)
+    """Returns the gaps in the recording, each until it is known what a topic says after it."""
+    view = binned.view
+    if view.limits.latching.is_latched(view.snapshot, topic):
+        return binned.gaps
+    bags = view.stream.overlapping_bags([topic], binned.counted)
     # Within a bag that has the topic before and after it, a gap ends where it does.
     return [
         (begin, min((max(bag.first, end) for bag in bags if bag.last >= end), default=end))

@@ -135,7 +135,6 @@ def find_matches(
         rows.searched,
         nothing=rows.is_nothing,
         search=True,
-        gaps=rows.is_nothing or not is_spoken,
     )
     if rows.is_nothing:
         silences = describe_silences(view, topics, rows.searched)
