@@ -102,9 +102,13 @@ def count_labels(
             f'label as value ("{ANY_LABEL}" for all), and no field'
         )
     topics = matching_topics(view, topic)
-    least_score = condition.least_score if condition.min_score > 0 else -np.inf
-    reader = _LabelReader(view, scope, least_score)
+    reader = LabelReader(view, scope, condition)
     reader.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
+    if reader.since is not None:
+        view.notes.add_lack(
+            f"not all before {unix_text(reader.since)} is counted: "
+            f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
+        )
     window = scope.window if reader.since is None else replace(scope.window, start=reader.since)
     table, elapsed = united(reader.visible), elapsed_in(view, window)
     rows = _label_rows(table, reader.most_at_once, elapsed)
@@ -154,8 +158,8 @@ class _DetectionBlock(NamedTuple):
         return int(self.detected.log_times[-1])
 
 
-class _LabelReader:
-    """Reads what counts, the newest first.
+class LabelReader:
+    """Reads what counts, the newest first: detections in a scope, of a condition's least score.
 
     Attributes:
         visible: when labels were in view.
@@ -164,14 +168,14 @@ class _LabelReader:
         since: back to when all was read, where the time was over before; else None.
     """
 
-    def __init__(self, view: View, scope: Scope, least_score: float) -> None:
+    def __init__(self, view: View, scope: Scope, condition: Condition) -> None:
         self.visible: list[IntervalTable] = []
         self.most_at_once: Counter[str] = Counter()
         self.most_at_once_of_all = 0
         self.since: Ns | None = None
         self._view = view
         self._scope = scope
-        self._least_score = least_score
+        self._least_score = condition.least_score if condition.min_score > 0 else -np.inf
 
     def read(self, topics: Sequence[str], wanted: Callable[[str], bool]) -> None:
         """Reads the detections of topics whose labels are wanted."""
@@ -193,10 +197,6 @@ class _LabelReader:
                 raise
             self._add_intervals(parts)
             self.since = reached
-            self._view.notes.add_lack(
-                f"not all before {unix_text(reached)} is counted: "
-                f"{self._view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
-            )
 
     def _add_intervals(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
         self.visible += [joined(parts_of_topic[::-1]).visible for parts_of_topic in parts.values()]
@@ -269,7 +269,7 @@ def _row(
 
 
 def _row_of_all(
-    reader: _LabelReader, table: IntervalTable, elapsed: Elapsed
+    reader: LabelReader, table: IntervalTable, elapsed: Elapsed
 ) -> tuple[float | None, ...]:
     """Returns the values of all labels together: for how long any of them was in view."""
     intervals = table.intervals()

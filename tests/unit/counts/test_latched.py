@@ -95,16 +95,28 @@ def test_a_latched_text_or_number_lasts_into_the_window(tmp_path: Path, *, recal
 
 
 @each_way
-@pytest.mark.parametrize("by", [{}, {"by": "day"}])
-def test_it_is_said_that_a_latched_topic_in_a_scope_counts_by_its_messages(
-    bag_dir: Path, by: dict[str, str], *, recalls: bool
+def test_it_is_said_that_a_latched_topic_in_a_scope_is_found_by_its_messages(
+    bag_dir: Path, *, recalls: bool
 ) -> None:
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
-    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **by, **{"while": bumped})
+    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **{"while": bumped})
     assert "ask about the other topic, with /docked in while" in " ".join(answer["notes"])
     docked = {**bumped, "topic": DOCKED}
-    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **by, **{"while": docked})
+    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **{"while": docked})
     assert not any("in while" in note for note in answer.get("notes", ()))
+
+
+@each_way
+def test_a_latched_boolean_in_a_scope_is_counted_by_when_it_held(
+    bag_dir: Path, *, recalls: bool
+) -> None:
+    """It is true from 100 to 400 s and from 700 s on; it bumped from 700 s on, too."""
+    for bumped, seconds in ((True, 250), (False, 300)):
+        during = {"while": {"topic": BUMPER, "condition_type": "equals", "value": bumped}}
+        answer = matches(bag_dir, DOCKED, 0, 950, recalls=recalls, by="day", **during)
+        whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+        assert (whole["seconds"], whole["count"]) == (seconds, 1)
+        assert "notes" not in answer
 
 
 @each_way
