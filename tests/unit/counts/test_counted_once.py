@@ -145,3 +145,21 @@ def test_a_text_beside_json_detections_counts_by_hour_as_it_is_found(
     memory = memory_of(tmp_path, recalls=recalls)
     assert label_counts(memory, "/vlm", '"room": "hall"') == [1, 60]
     assert label_counts(memory, "/vlm", "cup") == [1, 119]
+
+
+@each_way
+def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+    both, butter = ["Knife", "butter knife"], ["butter knife"]
+    seen = [both if at < 20 else butter for at in range(40)]
+    messages = [
+        text((T + at) * NS_PER_S, json.dumps({"objects": [{"label": label} for label in labels]}))
+        for at, labels in enumerate(seen)
+    ]
+    write_splits(tmp_path, messages, 10)
+    memory = memory_of(tmp_path, recalls=recalls)
+    for kind, value in (("equals", "knife"), ("contains_word", "knife -butter")):
+        sought = {"topic": "/chatter", "condition_type": kind, "value": value}
+        answer = asked(memory, tmp_path, "find_matches", **sought)
+        assert [each["count"] for each in answer["sightings"]] == [20]
+        newest = asked(memory, tmp_path, "find_last_match", **sought)
+        assert newest["timestamp"] == T + 19
