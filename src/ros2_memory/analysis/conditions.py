@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
-from ros2_memory.messages.detections import without_low_scores
+from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -63,7 +63,8 @@ class Contains:
     would match. Elsewhere its digits are searched as a string.
 
     With `whole` it must stand there as whole words: `pot` is in "the pot", not in "potato". Words
-    behind it that begin with a minus must not stand there: `knife -butter`.
+    behind it that begin with a minus must not stand there: `knife -butter`. Of a string that is
+    JSON it is enough that this is so of a label of its detections.
     """
 
     needle: Scalar
@@ -114,18 +115,21 @@ class Contains:
         """Returns whether a string of the value contains the needle, or a boolean equals it."""
         for leaf in leaves(value):
             if isinstance(leaf, str):
-                if self._is_in(leaf.casefold()):
+                if self._is_in(leaf):
                     return True
             elif isinstance(leaf, bool) and leaf is self.boolean:
                 return True
         return False
 
     def _is_in(self, text: str) -> bool:
+        folded = text.casefold()
         if not self.whole:
-            return self.folded is not None and self.folded in text
-        if not self.folded or not _has_words(text, self.folded):
+            return self.folded is not None and self.folded in folded
+        if not self.folded or not _has_words(folded, self.folded):
             return False
-        return not any(_has_words(text, other) for other in self.others)
+        if not any(_has_words(folded, other) for other in self.others):
+            return True
+        return any(map(self._is_in, _labels_in_json(text)))
 
     def has_element(self, target: JsonValue) -> bool:
         """Returns whether the target of a field is equal, or is a list with such an element.
@@ -145,7 +149,8 @@ class Equals:
 
     1 and 0 equal true and false. A number equals itself, and a float that a float32 field stores of
     it. Strings are compared without regard to case; one that spells a boolean or a number equals
-    that too, since planners put values in quotes.
+    that too, since planners put values in quotes. Of a string that is JSON the labels of its
+    detections are compared, too.
     """
 
     value: Scalar
@@ -188,7 +193,18 @@ class Equals:
         if isinstance(leaf, int | float):
             numbers = self.numbers if isinstance(leaf, float) else self.integers
             return any(leaf == number for number in numbers)
-        return isinstance(leaf, str) and leaf.casefold() == self.folded
+        if not isinstance(leaf, str) or self.folded is None:
+            return False
+        folded = leaf.casefold()
+        return folded == self.folded or (
+            self.folded in folded
+            and any(label.casefold() == self.folded for label in _labels_in_json(leaf))
+        )
+
+
+def _labels_in_json(text: str) -> list[str]:
+    """Returns the labels of the detections in a text, if it is JSON."""
+    return [seen.label for seen in detections_of(text)] if looks_like_json(text) else []
 
 
 @dataclass(frozen=True, slots=True)

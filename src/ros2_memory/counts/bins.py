@@ -400,15 +400,17 @@ class BinnedWindow:
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
     def add_held(self, held: TrueIntervals) -> None:
-        """Adds how often something began, how long it held, and its first and last time."""
+        """Adds how often something began, its first and last time, and how long it held.
+
+        That is without gaps, in which it may have held on, or begun and ended.
+        """
         inside = (held.stops >= self.counted.start) & (held.starts < self.counted.stop)
         starts = held.starts[inside].clip(*self._counted_bounds)
         stops = held.stops[inside].clip(*self._counted_bounds)
         begins = starts[held.begun[inside]]
         self.add_counts("count", begins)
-        self.add_lengths(
-            "seconds", "duration", united(zip(starts.tolist(), stops.tolist(), strict=True))
-        )
+        lasting = united(zip(starts.tolist(), stops.tolist(), strict=True))
+        self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
         last = self._last_held(starts, stops)
         self.add("last", "time", last, max(stops.tolist(), default=None))

@@ -25,11 +25,20 @@ from ros2_memory.analysis.intervals import (
     visible_in,
 )
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.spans import united as united_spans
+from ros2_memory.core.spans import without
 from ros2_memory.core.text import Quoted, counted, listed, named, shortened
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.coverage import note_edges, note_unread, recorded_reach, unix_text
+from ros2_memory.history.coverage import (
+    note_edges,
+    note_unread,
+    recorded_reach,
+    recording_gaps,
+    unix_text,
+)
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.held_values import Held, HeldValues
 from ros2_memory.history.no_data import matching_topics, no_data_between, seconds
@@ -41,7 +50,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
-    from ros2_memory.core.model import JsonValue, TimeWindow
+    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
@@ -92,9 +102,13 @@ def count_labels(
             f'label as value ("{ANY_LABEL}" for all), and no field'
         )
     topics = matching_topics(view, topic)
-    least_score = condition.least_score if condition.min_score > 0 else -np.inf
-    reader = _LabelReader(view, scope, least_score)
+    reader = LabelReader(view, scope, condition)
     reader.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
+    if reader.since is not None:
+        view.notes.add_lack(
+            f"not all before {unix_text(reader.since)} is counted: "
+            f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
+        )
     window = scope.window if reader.since is None else replace(scope.window, start=reader.since)
     table, elapsed = united(reader.visible), elapsed_in(view, window)
     rows = _label_rows(table, reader.most_at_once, elapsed)
@@ -144,8 +158,8 @@ class _DetectionBlock(NamedTuple):
         return int(self.detected.log_times[-1])
 
 
-class _LabelReader:
-    """Reads what counts, the newest first.
+class LabelReader:
+    """Reads what counts, the newest first: detections in a scope, of a condition's least score.
 
     Attributes:
         visible: when labels were in view.
@@ -154,14 +168,14 @@ class _LabelReader:
         since: back to when all was read, where the time was over before; else None.
     """
 
-    def __init__(self, view: View, scope: Scope, least_score: float) -> None:
+    def __init__(self, view: View, scope: Scope, condition: Condition) -> None:
         self.visible: list[IntervalTable] = []
         self.most_at_once: Counter[str] = Counter()
         self.most_at_once_of_all = 0
         self.since: Ns | None = None
         self._view = view
         self._scope = scope
-        self._least_score = least_score
+        self._least_score = condition.least_score if condition.min_score > 0 else -np.inf
 
     def read(self, topics: Sequence[str], wanted: Callable[[str], bool]) -> None:
         """Reads the detections of topics whose labels are wanted."""
@@ -183,10 +197,6 @@ class _LabelReader:
                 raise
             self._add_intervals(parts)
             self.since = reached
-            self._view.notes.add_lack(
-                f"not all before {unix_text(reached)} is counted: "
-                f"{self._view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
-            )
 
     def _add_intervals(self, parts: Mapping[str, Sequence[IntervalPart]]) -> None:
         self.visible += [joined(parts_of_topic[::-1]).visible for parts_of_topic in parts.values()]
@@ -259,7 +269,7 @@ def _row(
 
 
 def _row_of_all(
-    reader: _LabelReader, table: IntervalTable, elapsed: Elapsed
+    reader: LabelReader, table: IntervalTable, elapsed: Elapsed
 ) -> tuple[float | None, ...]:
     """Returns the values of all labels together: for how long any of them was in view."""
     intervals = table.intervals()
@@ -292,7 +302,7 @@ def count_values(
 ) -> Bins:
     """Returns a row for each value that held at some time of a window, that of the longest first.
 
-    What lies outside of the window counts to no length. An empty text is no value.
+    What lies outside of the window, or in a gap, counts to no length. An empty text is no value.
 
     Args:
         view: the call's.
@@ -323,7 +333,8 @@ def count_values(
         view.notes.add_lack(f"{error}: only what is after {unix_text(start)} is counted")
     if not values_held:
         raise no_data_between(view, (topic,), asked)
-    tallies = _tallies_of(values_held, elapsed_in(view, asked), (start, stop), condition)
+    outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
+    tallies = _tallies_of(values_held, elapsed_in(view, asked), united_spans(outside), condition)
     rows = sorted(tallies, key=lambda tally: (-tally.length, tally.first))
     if len(rows) > _MOST_VALUES:
         more = counted(len(rows) - _MOST_VALUES, "value")
@@ -354,11 +365,10 @@ def count_values(
 def _tallies_of(
     values: Sequence[Held],
     elapsed: Elapsed,
-    window: tuple[Ns, Ns],
+    outside: Spans,
     condition: Condition | None,
 ) -> list[_Tally]:
-    """Returns a tally for each value that counts, whose length is that in a window (ns)."""
-    start, stop = window
+    """Returns a tally for each value that counts, whose length leaves out some times."""
     tallies: dict[str, _Tally] = {}
     uncounted: set[str] = set()
     for value in values:
@@ -372,7 +382,7 @@ def _tallies_of(
             tallies[value.word] = _Tally(_shown_value(value), 0, 0, value.start, value.stop)
         tally = tallies[value.word]
         tally.count += 1
-        tally.length += elapsed.between(max(value.start, start), min(value.stop, stop))
+        tally.length += elapsed.among(without([(value.start, value.stop)], outside))
         tally.last = value.stop
     return [*tallies.values()]
 

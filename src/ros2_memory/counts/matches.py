@@ -6,9 +6,10 @@ What counts as once:
   back, or until nothing is recorded. It counts where it is seen to toggle.
 - A text on a topic of detections is a label. A thing is in view as in a recap: it may be missed
   for `FLICKER_NS`, since detectors miss things now and then, and it is gone after `SILENCE_NS`
-  without a message. These and booleans are counted by the topic's events, unless a least score is
-  asked for.
-- Any other condition holds in sightings, as `find_matches` returns them; these are read.
+  without a message. These and booleans are counted by the topic's events; labels in a scope, or of
+  a least score, by its detections.
+- Any other condition, also a text that is no label, holds in sightings, as `find_matches` returns
+  them; these are read.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
-from ros2_memory.analysis.facts import FLAG, has_events
-from ros2_memory.analysis.intervals import IntervalPart, joined, united
+from ros2_memory.analysis.facts import FLAG, has_errors, has_events
+from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
 from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
 from ros2_memory.counts.bins import BinnedWindow, By, TrueIntervals
-from ros2_memory.counts.held import ANY_LABEL, BY_LABEL, count_labels, count_values
+from ros2_memory.counts.held import ANY_LABEL, BY_LABEL, LabelReader, count_labels, count_values
 from ros2_memory.history.context import READING_S, Call, Memory
 from ros2_memory.history.coverage import reached
-from ros2_memory.history.held_values import held_at, held_until
+from ros2_memory.history.held_values import held_at, held_until, is_text
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
@@ -93,21 +94,17 @@ def count_matches(
         places, where = parse_where(memory.limits, where), None
     binned = BinnedWindow(view, asked, by, topics, places)
     note_robots_on(view, topics, binned.counted)
-    held, since, unknown = None, None, []
-    is_one_topic = where is None and not during and len(topics) == 1
-    # Events have labels without scores.
-    can_be_event = isinstance(condition.test, Contains | Equals) and not condition.min_score
-    if is_one_topic and can_be_event:
-        held, since = _held_by_events(binned, topics[0], condition, value)
+    scope = Scope(view, binned.counted, where, during)
+    held, since = None, None
+    if isinstance(condition.test, Contains | Equals):
+        held, since = _held_by_events(binned, topics, condition, value, scope)
     if held is None:
-        scope = Scope(view, binned.counted, where, during)
         spans, since = read_sightings(view, topic, condition, scope)
         lasting = _held_at_begin(binned, topics, condition, scope)
         held = TrueIntervals.of([*lasting, *((first, last, True) for first, last in spans)])
-        unknown = scope.unknown
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
-    binned.add_unknown(unknown)
+    binned.add_unknown(scope.unknown)
     binned.add_held(held)
     return binned.answer()
 
@@ -135,26 +132,51 @@ def _by_value(
 
 
 def _held_by_events(
-    binned: BinnedWindow, topic: str, condition: Condition, value: JsonValue
+    binned: BinnedWindow,
+    topics: Sequence[str],
+    condition: Condition,
+    value: JsonValue,
+    scope: Scope,
 ) -> tuple[TrueIntervals | None, Ns | None]:
-    """Returns when a condition held, by the events of a topic, and since when these are known.
+    """Returns when a boolean or a label held in a scope, and since when that is known.
 
-    None where events do not show it.
+    None where the condition is on neither.
     """
-    view = binned.view
-    if not any(map(has_events, view.timeline.types_of(topic))):
+    view, topic = binned.view, topics[0]
+    types = {name for topic in topics for name in view.timeline.types_of(topic)}
+    if not any(map(has_events, types)):
         return None, None
     wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
-    if wanted is None and (condition.field is not None or not isinstance(value, str)):
-        return None, None
-    if wanted is not None and condition.field is None and _has_lists(view, topic):
+    if wanted is None:
+        if condition.field is not None or not isinstance(value, str) or any(map(has_errors, types)):
+            return None, None
+        return _label_held(binned, topics, condition, scope)
+    if len(topics) > 1 or (condition.field is None and _has_lists(view, topic)):
         return None, None  # booleans in lists are no events
     parts, since = _events_in_order(view, topic, binned.counted)
+    before = _met_before(binned, topic, condition) if since is None else None
+    spans = _flag_held(binned, topic, parts, condition, before, wanted=wanted)
+    if spans is None:
+        return None, None
     _note_uncounted(view, topic, parts)
-    if wanted is not None:
-        before = _met_before(binned, topic, condition) if since is None else None
-        return _flag_held(binned, topic, parts, condition, before, wanted=wanted), since
-    return _label_held(parts, condition), since
+    counted, end = _in_scope(spans, scope)
+    return TrueIntervals.of(counted), since if end is None else end
+
+
+def _in_scope(
+    spans: Sequence[tuple[Ns, Ns, bool]], scope: Scope
+) -> tuple[list[tuple[Ns, Ns, bool]], Ns | None]:
+    """Returns the parts of spans in a scope, and since when they are known, if time is over."""
+    counted: list[tuple[Ns, Ns, bool]] = []
+    try:
+        for start, stop, is_begun in reversed(spans):
+            parts = scope.parts_of(start, stop)
+            counted += [(first, last, is_begun and first == start) for first, last in parts]
+    except QueryTimeoutError:
+        if not counted:
+            raise
+        return sorted(counted), min(start for start, _, _ in counted)
+    return sorted(counted), None
 
 
 def _has_lists(view: View, topic: str) -> bool:
@@ -203,24 +225,42 @@ def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> Non
         view.notes.add_lack(f"messages of {topic} that could not be decoded: {undecodable}")
 
 
-def _label_held(parts: Sequence[TopicEvents], condition: Condition) -> TrueIntervals | None:
-    """Returns when a thing with a label was in view; None where there are no labels at all."""
-    if not any(part.visible.labels for part in parts):
-        return None
-    parts_of_labels = [
-        IntervalPart(
-            part.first,
-            part.last,
-            part.visible.without(
-                [label for label in part.visible.labels if not condition.test.matches(label)]
-            ),
+def _label_held(
+    binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
+) -> tuple[TrueIntervals | None, Ns | None]:
+    """Returns when a thing with a label was in view; None where no label meets a condition."""
+    view, matches = binned.view, condition.test.matches
+    if scope.is_bounded or condition.min_score or len(topics) > 1:
+        reader = LabelReader(view, scope, condition)
+        reader.read(topics, matches)
+        visible, since = united(reader.visible), reader.since
+    else:
+        events, since = _events_in_order(view, topics[0], binned.counted)
+        parts = [
+            IntervalPart(
+                part.first,
+                part.last,
+                part.visible.without(
+                    [label for label in part.visible.labels if not matches(label)]
+                ),
+            )
+            for part in events
+            if part.first <= part.last
+        ]
+        visible = joined(parts).visible if parts else IntervalTable()
+        if visible.size:
+            _note_uncounted(view, topics[0], events)
+    if not visible.size:
+        return None, None
+    texts = [topic for topic in topics if is_text(view, topic)]
+    if texts:
+        view.notes.add(
+            f"{listed(texts)} has detections as JSON: by counts their labels, and no other texts"
         )
-        for part in parts
-        if part.first <= part.last
-    ]
     # Each label's first: only of one label it is known whether a message lay between.
-    intervals = united([joined(parts_of_labels).visible.under_one_label("")]).intervals()
-    return TrueIntervals.of([(interval.first, interval.last, True) for interval in intervals])
+    intervals = united([visible.under_one_label("")]).intervals()
+    held = [(interval.first, interval.last, True) for interval in intervals]
+    return TrueIntervals.of(held), since
 
 
 def _flag_held(
@@ -231,8 +271,8 @@ def _flag_held(
     before: bool | None,
     *,
     wanted: bool,
-) -> TrueIntervals | None:
-    """Returns when a boolean held; None where it is not clear which boolean is meant.
+) -> list[tuple[Ns, Ns, bool]] | None:
+    """Returns when a boolean held, in order; None where it is not clear which boolean is meant.
 
     `before`: whether it held when the window began, where an earlier message says so.
     """
@@ -251,7 +291,7 @@ def _flag_held(
         if before is not None:
             spans = _with_time_before(spans, meant[0], start, before=before, wanted=wanted)
     gaps = _gaps_for_topic(binned, topic)
-    return TrueIntervals.of([part for span in sorted(spans) for part in _without_gaps(*span, gaps)])
+    return [part for span in sorted(spans) for part in _without_gaps(*span, gaps)]
 
 
 def _with_time_before(
@@ -306,8 +346,11 @@ def _spans_of_flag(
 
 
 def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
-    """Returns the gaps in the recording, each until the first message of a topic after it."""
-    bags = binned.view.stream.overlapping_bags([topic], binned.counted)
+    """Returns the gaps in the recording, each until it is known what a topic says after it."""
+    view = binned.view
+    if view.limits.latching.is_latched(view.snapshot, topic):
+        return binned.gaps
+    bags = view.stream.overlapping_bags([topic], binned.counted)
     # Within a bag that has the topic before and after it, a gap ends where it does.
     return [
         (begin, min((max(bag.first, end) for bag in bags if bag.last >= end), default=end))

@@ -1,8 +1,9 @@
 """What a topic said, and until when: a value holds until a message says another one.
 
 So do the texts that say what a robot does (`std_msgs/msg/String`): nothing of them is known to have
-ended only because a topic is silent. Where nothing was recorded, a value is known until then alone;
-of a topic that is usually heard often, also where it falls silent for `SILENCE_NS`.
+ended only because a topic is silent, or because nothing was recorded for a while. Where another run
+of the recorder begins, only what a latched topic said is known to hold on; of a topic that is
+usually heard often, no value where it falls silent for `SILENCE_NS`.
 """
 
 from __future__ import annotations
@@ -104,8 +105,7 @@ class HeldValues:
         self._topic = topic
         self._field = field
         self._holds_on = is_text(view, topic) or holds_on(view, [topic])
-        gaps = {start for start, _ in view.gaps(TimeWindow.everything())}
-        self._gaps = sorted(gaps.union(_ends_of_clocks(view)))
+        self._breaks = _breaks(view, topic)
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
@@ -208,7 +208,7 @@ class HeldValues:
         texts = joined_texts([part_texts for _, part_texts in parts]).rows(order)
         times, codes = times[order], texts.codes
         breaks = np.diff(codes) != 0
-        breaks |= np.diff(np.searchsorted(self._gaps, times)) > 0
+        breaks |= np.diff(np.searchsorted(self._breaks, times)) > 0
         if not self._holds_on:
             breaks |= np.diff(times) > SILENCE_NS
         firsts = np.append(0, np.flatnonzero(breaks) + 1)
@@ -254,12 +254,20 @@ class HeldValues:
         following = MAX_NS if after is None else after.first
         if not self._holds_on and following - run.last > SILENCE_NS:
             return run.last, False
-        nth = bisect_left(self._gaps, run.last)
-        if nth < len(self._gaps) and self._gaps[nth] < following:
-            return self._gaps[nth], False
+        nth = bisect_left(self._breaks, run.last)
+        if nth < len(self._breaks) and self._breaks[nth] < following:
+            return self._breaks[nth], False
         if after is None:
             return max(run.last, self._view.snapshot.latest or run.last), False
         return following, True
+
+
+def _breaks(view: View, topic: str) -> list[Ns]:
+    """Returns the moments from which on what a topic said before is not known to hold, in order."""
+    breaks = set(_ends_of_clocks(view))
+    if not view.limits.latching.is_latched(view.snapshot, topic):
+        breaks.update(start for start, _ in view.snapshot.breaks)
+    return sorted(breaks)
 
 
 def _ends_of_clocks(view: View) -> Iterator[Ns]:
@@ -290,16 +298,16 @@ def is_text(view: View, topic: str) -> bool:
 def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
     """Returns until when what a message at `last` stated held, at most until `end`.
 
-    On a latched topic to its next message, or until nothing was recorded. On another one to its
-    next message, too, and not at all after `last` where that comes later than `SILENCE_NS`.
+    On a latched topic to its next message, or as far as something is recorded. On another one to
+    its next message, too, and not at all after `last` where that comes later than `SILENCE_NS`.
     """
     lasting = view.limits.latching.is_latched(view.snapshot, topic)
     stop = end if lasting else last + SILENCE_NS
     following = view.stream.first([topic], TimeWindow(last + 1, stop + 1))
     if lasting:
-        gaps = [begin for begin, _ in view.gaps(TimeWindow(last, end + 1)) if begin >= last]
-        ends = [end, *gaps, *([] if following is None else [following.time])]
-        return max(last, min(ends))
+        ends = [moment for moment in _breaks(view, topic) if moment >= last]
+        ends += [end, view.snapshot.latest or end]
+        return max(last, min([*ends, *([] if following is None else [following.time])]))
     return last if following is None else max(last, min(following.time, end))
 
 
@@ -308,7 +316,8 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     if not view.limits.latching.is_latched(view.snapshot, topic):
         return None
     before = view.stream.first([topic], TimeWindow(MIN_NS, moment), newest_first=True)
-    if before is None or held_until(view, topic, before.time, moment) < moment:
+    breaks = _breaks(view, topic)
+    if before is None or any(before.time <= at < moment for at in breaks):
         return None
     return before
 

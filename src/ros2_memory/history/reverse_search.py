@@ -39,7 +39,7 @@ from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.scan import decoded_rows, scan
 from ros2_memory.history.transforms import connects
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.messages.levels import level_number, unknown_name_hint
+from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -83,8 +83,9 @@ def condition_of(
     """Returns the condition of a question; without a `min_score` of its own the configured one.
 
     `pattern` is the name or glob of the topics. Where all of these are of one type, the field may
-    be a full path in its messages, and the level of a log or status may be named (WARN), as may a
-    constant of the message definition where the field is a number.
+    be a full path in its messages, and the level of a log or status may be named (WARN), also
+    without a field where it is to be equal, as may a constant of the message definition where the
+    field is a number.
 
     Raises:
         NoDataError: no such topic is recorded.
@@ -95,8 +96,10 @@ def condition_of(
     least = limits.min_score if min_score is None else min_score
     timeline = view.timeline
     types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
-    if field and len(types) == 1:
-        (type_name,) = types
+    type_name = next(iter(types)) if len(types) == 1 else ""
+    if not field and condition_type == "equals":
+        field = level_path(value, type_name)
+    if field and type_name:
         field = memory.extractor.own_path(field.strip(), type_name)
         value = level_number(value, field, type_name)
         value = _constant_number(view, value, field, type_name)

@@ -195,6 +195,13 @@ class Snapshot:
         return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self._pauses)})
 
     @cached_property
+    def breaks(self) -> Sequence[tuple[Ns, Ns]]:
+        """Those gaps after which another run of a recorder began."""
+        pauses = [*self._rhythm.gaps(self._pauses)]
+        within_runs = {(pause.start, pause.end) for pause in pauses if pause.ran_on}
+        return [gap for gap in self.gaps if gap not in within_runs]
+
+    @cached_property
     def shortest_gap(self) -> Ns:
         """How long a pause between two recordings may be without being one of `gaps`."""
         return self._rhythm.shortest_gap

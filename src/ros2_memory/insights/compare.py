@@ -84,9 +84,12 @@ def compare(
         raise InvalidArgumentsError(f"with_start and with_end: {error}") from error
     reach = min(max(asked.stop, other.stop), memory.clock.now())
     view = open_view(memory, call, reach)
-    for window in (asked, other):
+    # What is not listed there is not known, rather than 0.
+    unlisted: list[float | None] = [0.0, 0.0]
+    for nth, window in enumerate((asked, other)):
         if gap_around(view, window) is not None:
             note_unrecorded(view, window)
+            unlisted[nth] = None
     windows = clamped(view, asked), clamped(view, other)
     frame, things = _compare_things(view, windows, region)
     drives = [drive_in(view, window) for window in windows]
@@ -123,8 +126,8 @@ def compare(
         things=things,
         way=_differing(*path_numbers, least=_LEAST),
         places=_differing(*places, least=_LEAST_MINUTES),
-        errors=_differing(*errors, least=_LEAST_COUNT),
-        silences=_differing(*silences, least=_LEAST_SILENT_S),
+        errors=_differing(*errors, least=_LEAST_COUNT, unlisted=unlisted),
+        silences=_differing(*silences, least=_LEAST_SILENT_S, unlisted=unlisted),
         way_frame_id=apart.frame_id,
         stood=apart.stood,
         farthest=apart.farthest,
@@ -334,14 +337,16 @@ def _differing(
     other: Mapping[str, float | None],
     *,
     least: Mapping[str, float] | float,
+    unlisted: Sequence[float | None] = (0.0, 0.0),
 ) -> tuple[tuple[str, Pair], ...]:
     """Returns the numbers that differ, those that differ most first.
 
-    A name that one side lacks is 0 there; a number that is not known on one side is listed.
+    A name that one side lacks is `unlisted` there; a number that is not known on one side is
+    listed.
     """
     differing: list[tuple[float, str, Pair]] = []
     for name in dict.fromkeys([*this, *other]):
-        one, two = this.get(name, 0.0), other.get(name, 0.0)
+        one, two = this.get(name, unlisted[0]), other.get(name, unlisted[1])
         floor = least if isinstance(least, float) else least[name]
         if one is None or two is None:
             if one is not two:

@@ -238,7 +238,7 @@ def topic_changes(
             f"the first {max_samples} of {len(spells)} changes: to continue, ask again with "
             f"start={unix_text(spells[max_samples].first)}"
         )
-    note_unread(view, window, gaps=len(spells) > max_samples)
+    note_unread(view, window)
     note_edges(view, window)
     note_robots(view, topic, window)
     types = view.timeline.types_of(topic)

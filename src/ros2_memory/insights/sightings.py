@@ -118,7 +118,7 @@ def find_matches(
     goals = goals_asked(view, topics, condition, scope)
     is_spoken = goals is None and says_episodes(view, topics)
     if goals is not None:
-        rows = _goal_sightings(view, goals, window, shown)
+        rows = _goal_sightings(view, goals, scope, shown)
     elif is_spoken:
         rows = _episodes_of_text(view, topics[0], condition, scope, shown)
     else:
@@ -135,7 +135,6 @@ def find_matches(
         rows.searched,
         nothing=rows.is_nothing,
         search=True,
-        gaps=rows.is_nothing or not is_spoken,
     )
     if rows.is_nothing:
         silences = describe_silences(view, topics, rows.searched)
@@ -200,16 +199,16 @@ def _completed(
 
 
 def _goal_sightings(
-    view: View, goals: list[GoalRun], window: TimeWindow, shown: _Selection
+    view: View, goals: list[GoalRun], scope: Scope, shown: _Selection
 ) -> _FoundRows:
     """Returns the goals that are shown as sightings; `goals` have the last one first."""
-    view.notes.retract_outside(window)
+    view.notes.retract_outside(scope.window)
     sightings = tuple(
-        _goal_sighting(view, goal, shown.frame_id)
+        _goal_sighting(view, goal, scope, shown.frame_id)
         for goal in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
         if view.call.wants(goal.last)
     )
-    return _FoundRows(len(goals), window, not goals, sightings=sightings)
+    return _FoundRows(len(goals), scope.window, not goals, sightings=sightings)
 
 
 def _episodes_of_text(
@@ -276,7 +275,7 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        return [(goal.first, goal.last) for goal in reversed(goals)], None
+        return [(goal.first, _goes_on_until(view, goal, scope)) for goal in reversed(goals)], None
     if says_episodes(view, topics):
         return episode_times(view, topics[0], condition, scope)
     result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
@@ -380,14 +379,24 @@ def _sighting(
     )
 
 
-def _goal_sighting(view: View, goal: GoalRun, frame_id: str | None) -> Sighting:
+def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
+    """Returns until when a goal went on; one that has not ended until another run of a recorder."""
+    if goal.ended is not None or goal.is_lost:
+        return goal.last
+    _, end = scope.window.asked()
+    breaks = [start for start, _ in view.snapshot.breaks if start >= goal.last]
+    until = min([end, view.snapshot.latest or end, *breaks])
+    return scope.holds_until(goal.last, max(goal.last, until))
+
+
+def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None) -> Sighting:
     """Returns a goal of an action as a sighting, with where the robot was when it ended."""
     message = view.stream.newest(goal.topic, TimeWindow(MIN_NS, goal.last + 1))
     return Sighting(
         topic=goal.topic,
         first=goal.first,
         last=goal.last,
-        until=goal.last,
+        until=_goes_on_until(view, goal, scope),
         messages=0,
         begun=goal.accepted is not None,
         robot=None

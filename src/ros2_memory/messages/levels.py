@@ -48,6 +48,15 @@ def level_number(value: JsonValue, field: str | None, type_name: str) -> JsonVal
     return number
 
 
+def level_path(value: JsonValue, type_name: str) -> str | None:
+    """Returns the path of the level in messages of a type, where a value is the name of one."""
+    names = _BY_TYPE.get(type_name, {})
+    word = value.strip().upper() if isinstance(value, str) else ""
+    if not names or word not in {"WARNING", *names}:
+        return None
+    return f"status.{FIELD}" if type_name.endswith("/DiagnosticArray") else FIELD
+
+
 def unknown_name_hint(value: JsonValue, field: str | None, types: Collection[str]) -> str:
     """Returns the end of the sentence on a condition that needs a number and got a level's name.
 

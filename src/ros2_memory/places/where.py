@@ -342,6 +342,18 @@ class Scope:
             end = state.holds_until(time, end)
         return end
 
+    def parts_of(self, first: Ns, last: Ns) -> Spans:
+        """Returns the parts of a time (inclusive, as they are) in which matches count, in order."""
+        inside = [(first, last + 1)] if self._inside is None else self._inside
+        parts = [
+            (max(first, start), min(last, stop - 1))
+            for start, stop in inside
+            if start <= last and first < stop
+        ]
+        for state in self._states:
+            parts = [part for span in parts for part in state.parts_of(*span)]
+        return parts
+
 
 def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
     """Returns when any robot was in a region, in order; raises as `joined_in_region`."""
@@ -418,15 +430,33 @@ class _ConditionStates:
         """Returns until when the condition is known to be met from a moment on; at most `end`."""
         while time < end and self.holds_at(time):
             number = bisect_right(self._times, time)
-            last, later = self._times[number - 1], self._times[number:]
-            if not later:
-                window = TimeWindow(self._known.stop, end + 1)
-                message = self._view.stream.first(self._search.topics, window)
-                later = [MAX_NS if message is None else message.time]
-            if not self._holds_on and min(later[0], end) - last > SILENCE_NS:
+            last, following = self._times[number - 1], self._next_after(time, end)
+            if not self._holds_on and min(following, end) - last > SILENCE_NS:
                 return max(time, last)
-            time = later[0]
+            time = following
         return min(time, end)
+
+    def parts_of(self, first: Ns, last: Ns) -> Iterator[tuple[Ns, Ns]]:
+        """Yields the parts of a time (inclusive) in which the condition is met, in order."""
+        time = first
+        while time <= last:
+            until = time
+            if self.holds_at(time):
+                until = self.holds_until(time, last)
+                yield time, until
+            time = MAX_NS if until == last else self._next_after(until, last)
+
+    def _next_after(self, time: Ns, end: Ns) -> Ns:
+        """Returns the log time of the first message after a moment that was read around.
+
+        `MAX_NS` where none comes until `end`.
+        """
+        number = bisect_right(self._times, time)
+        if number < len(self._times):
+            return self._times[number]
+        window = TimeWindow(self._known.stop, end + 1)
+        message = self._view.stream.first(self._search.topics, window)
+        return MAX_NS if message is None else message.time
 
     def _read_around(self, time: Ns) -> None:
         """Reads the messages of the bags that may hold the newest one at a moment."""

@@ -2,20 +2,36 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import TYPE_CHECKING, Any, Final
 
 from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, battery, detections, make, typestore, write_mcap
-from tests.support.memories import asked, memory_of
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    detections,
+    make,
+    odom,
+    text,
+    typestore,
+    write_mcap,
+    write_splits,
+)
+from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
     from pathlib import Path
 
+    from ros2_memory.history.context import Memory
+
 T: Final = 1_790_000_000
+SCENE: Final = "/vision/scene/scene_objects"
+X: Final = "pose.pose.position.x"
 
 
 def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
@@ -79,3 +95,71 @@ def test_a_number_that_is_none_at_last_is_a_value_like_others(tmp_path: Path) ->
     assert [change["value"] for change in reply["changes"]] == [0.5, None, 0.7, None]
     reply = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
     assert {row[0]: row[1] for row in reply["rows"]} == {"0.5": 1, "0.7": 1, "null": 2}
+
+
+def label_counts(memory: Memory, topic: str, value: object, **given: object) -> list[object]:
+    kind = "equals" if isinstance(value, bool) else "contains"
+    sought = {"topic": topic, "condition_type": kind, "value": value, "by": "hour", **given}
+    answer = asked(memory, memory.index.bag_dir, "find_matches", **sought)
+    whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+    return [whole["count"], whole["seconds"]]
+
+
+@each_way
+def test_what_is_once_does_not_depend_on_a_scope_that_always_holds(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """A cup that every fourth message misses; a boolean that is said each 15 s."""
+    messages = [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
+    messages += [boolean((T + at) * NS_PER_S, data=True, topic="/on") for at in range(120)]
+    labels = [[] if at % 4 == 3 else ["cup"] for at in range(120)]
+    messages += [detections((T + at) * NS_PER_S, seen) for at, seen in enumerate(labels)]
+    messages += [
+        boolean((T + at) * NS_PER_S, at % 40 >= 20, "/docked") for at in (*range(0, 120, 15), 119)
+    ]
+    write_splits(tmp_path, messages, 30)
+    memory = memory_of(tmp_path, recalls=recalls)
+    everywhere = {"where": {"x": [-9, 9], "y": [-9, 9]}}
+    always = {"while": {"topic": "/on", "condition_type": "equals", "value": True}}
+    for topic, value in ((SCENE, "cup"), ("/docked", True), ("/docked", False)):
+        counts = label_counts(memory, topic, value)
+        for scope in (everywhere, always, {"min_score": 0.1}):
+            assert label_counts(memory, topic, value, **scope) == counts, (topic, scope)
+    assert label_counts(memory, SCENE, "cup") == [1, 118]
+    half = {"while": {"topic": "/odom", "condition_type": "below", "value": 0.7, "field": X}}
+    assert label_counts(memory, "/docked", True, **half) == [2, 25]
+
+
+@each_way
+def test_a_text_beside_json_detections_counts_by_hour_as_it_is_found(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    objects = [{"label": "cup", "score": 0.8}]
+    rooms = ["hall" if at < 60 else "kitchen" for at in range(120)]
+    messages = [
+        text((T + at) * NS_PER_S, json.dumps({"room": room, "objects": objects}), "/vlm")
+        for at, room in enumerate(rooms)
+    ]
+    messages += [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
+    write_splits(tmp_path, messages, 30)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert label_counts(memory, "/vlm", '"room": "hall"') == [1, 60]
+    assert label_counts(memory, "/vlm", "cup") == [1, 119]
+
+
+@each_way
+def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+    both, butter = ["Knife", "butter knife"], ["butter knife"]
+    seen = [both if at < 20 else butter for at in range(40)]
+    messages = [
+        text((T + at) * NS_PER_S, json.dumps({"objects": [{"label": label} for label in labels]}))
+        for at, labels in enumerate(seen)
+    ]
+    write_splits(tmp_path, messages, 10)
+    memory = memory_of(tmp_path, recalls=recalls)
+    for kind, value in (("equals", "knife"), ("contains_word", "knife -butter")):
+        sought = {"topic": "/chatter", "condition_type": kind, "value": value}
+        answer = asked(memory, tmp_path, "find_matches", **sought)
+        assert [each["count"] for each in answer["sightings"]] == [20]
+        newest = asked(memory, tmp_path, "find_last_match", **sought)
+        assert newest["timestamp"] == T + 19

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from tests.support.bags import McapLayout, Msg, boolean, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, battery, boolean, odom, text, write_mcap
 from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
@@ -95,16 +95,28 @@ def test_a_latched_text_or_number_lasts_into_the_window(tmp_path: Path, *, recal
 
 
 @each_way
-@pytest.mark.parametrize("by", [{}, {"by": "day"}])
-def test_it_is_said_that_a_latched_topic_in_a_scope_counts_by_its_messages(
-    bag_dir: Path, by: dict[str, str], *, recalls: bool
+def test_it_is_said_that_a_latched_topic_in_a_scope_is_found_by_its_messages(
+    bag_dir: Path, *, recalls: bool
 ) -> None:
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
-    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **by, **{"while": bumped})
+    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **{"while": bumped})
     assert "ask about the other topic, with /docked in while" in " ".join(answer["notes"])
     docked = {**bumped, "topic": DOCKED}
-    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **by, **{"while": docked})
+    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **{"while": docked})
     assert not any("in while" in note for note in answer.get("notes", ()))
+
+
+@each_way
+def test_a_latched_boolean_in_a_scope_is_counted_by_when_it_held(
+    bag_dir: Path, *, recalls: bool
+) -> None:
+    """It is true from 100 to 400 s and from 700 s on; it bumped from 700 s on, too."""
+    for bumped, seconds in ((True, 250), (False, 300)):
+        during = {"while": {"topic": BUMPER, "condition_type": "equals", "value": bumped}}
+        answer = matches(bag_dir, DOCKED, 0, 950, recalls=recalls, by="day", **during)
+        whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+        assert (whole["seconds"], whole["count"]) == (seconds, 1)
+        assert "notes" not in answer
 
 
 @each_way
@@ -122,3 +134,51 @@ def test_what_a_slow_topic_states_lasts_to_the_end_of_a_scope(
         assert dict(zip(answer["columns"][1:], answer["all"], strict=True))["seconds"] == 102
     else:
         assert [each["duration_s"] for each in answer["sightings"]] == [2, 100]
+
+
+@each_way
+def test_what_still_holds_lasts_as_far_as_something_is_recorded(
+    bag_dir: Path, *, recalls: bool
+) -> None:
+    memory = memory_of(bag_dir, recalls=recalls)
+    given = {"topic": DOCKED, "condition_type": "equals", "value": True}
+    for window in ({}, {"start": T0 / S}, {"start": T0 / S, "end": T0 / S + 9_000}):
+        newest, _ = asked(memory, bag_dir, "find_matches", **given, **window)["sightings"]
+        assert newest["duration_s"] == 300
+
+
+@each_way
+def test_what_a_latched_topic_said_holds_on_through_a_pause_of_the_recording(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """True since 10 s; nothing is recorded from 100 to 103 s."""
+    beats = [odom(T0 + at * S // 10, 0.0, 0.0) for at in (*range(1000), *range(1030, 2001))]
+    beats += [battery(T0 + at * S + 1, 0.5) for at in (*range(100), *range(103, 200))]
+    said = [boolean(T0 + at * S, value, DOCKED) for at, value in ((0, False), (10, True))]
+    messages = sorted([*beats, *said], key=at_log_time)
+    layout = McapLayout(latched=frozenset({DOCKED}))
+    for nth in range(4):
+        split = [each for each in messages if min((each.log_time - T0) // (50 * S), 3) == nth]
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", split, layout)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"topic": DOCKED, "start": T0 / S, "end": T0 / S + 200}
+    is_true = {**window, "condition_type": "equals", "value": True}
+    recorded_s = 200 - 10 - 3.1
+    for by in ("hour", "value"):
+        answer = asked(memory, tmp_path, "find_matches", **is_true, by=by)
+        whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+        assert (whole["seconds"], whole["count"]) == (recorded_s, 1)
+    answers = [
+        asked(memory, tmp_path, "find_matches", **is_true),
+        asked(memory, tmp_path, "get_topic_in_range", **window, changes=True),
+    ]
+    assert answers[0]["sightings"][0]["duration_s"] == 190
+    assert answers[1]["changes"][-1]["seconds"] == 190
+    for answer in answers:
+        assert any("nothing was recorded from" in note for note in answer["notes"])
+    later = {"topic": "/battery_state", "condition_type": "above", "value": 0.1}
+    while_true = {"while": {"topic": DOCKED, "condition_type": "equals", "value": True}}
+    answer = asked(
+        memory, tmp_path, "find_matches", **later, field="percentage", by="hour", **while_true
+    )
+    assert dict(zip(answer["columns"][1:], answer["all"], strict=True))["seconds"] > 180

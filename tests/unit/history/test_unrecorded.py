@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from ros2_memory.history.context import Memory, QuerySettings
-from tests.support.bags import boolean, detections, odom, write_mcap
+from tests.support.bags import boolean, detections, log_entry, odom, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of, with_store
 
@@ -44,7 +44,9 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gap")
     for name, seconds in (("a", range(40)), ("b", range(140, 150))):
         messages = [odom(T0 + at * S, 0.1 * at, 0.0) for at in seconds]
-        messages += [boolean(T0 + seconds[0] * S, True), detections(T0 + seconds[0] * S, ["cup"])]
+        begin = T0 + seconds[0] * S
+        messages += [boolean(begin, True), detections(begin, ["cup"])]
+        messages.append(log_entry(begin, 40, "motor", "too hot"))
         write_mcap(folder / name / f"{name}_0.mcap", messages)
     return folder
 
@@ -99,3 +101,5 @@ def test_recap_and_compare_say_first_that_nothing_was_recorded(
     assert reply["notes"][0] == note
     assert "things are not compared: there is nothing to compare them with" in reply["notes"]
     assert (reply["things"], reply["things_unchanged"]) == ({}, 0)
+    [error] = reply["errors"].values()
+    assert (error["this"], error["with"]) == (None, 1)

@@ -122,9 +122,16 @@ def test_a_reply_whose_window_touches_a_gap_names_it(
 def test_a_gap_is_not_named_where_all_messages_are_returned(tmp_path: Path) -> None:
     memory = memory_with(tmp_path, at_rates(20, STALLS[:1]))
     window = {"start": BEGIN + 6, "end": BEGIN + 13}
-    for more in ({}, {"fields": ["data"]}, {"changes": True}):
+    for more in ({}, {"fields": ["data"]}):
         reply = ask(memory, "get_topic_in_range", topic="/chatter", **window, **more)
         assert not [note for note in reply.get("notes", []) if "nothing was recorded" in note]
+
+
+def test_a_gap_through_which_a_text_holds_is_named(tmp_path: Path) -> None:
+    memory = memory_with(tmp_path, at_rates(20, STALLS[:1]))
+    window = {"start": BEGIN + 6, "end": BEGIN + 13}
+    reply = ask(memory, "get_topic_in_range", topic="/chatter", **window, changes=True)
+    assert [note for note in reply["notes"] if "nothing was recorded" in note]
 
 
 def test_a_step_of_the_clock_within_a_bag_is_no_gap(tmp_path: Path) -> None:

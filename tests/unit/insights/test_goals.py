@@ -18,7 +18,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.results import Event
-from tests.support.bags import Msg, goals, write_mcap
+from tests.support.bags import Msg, goals, odom, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import memory_of, replied, with_store
 
@@ -236,3 +236,25 @@ def test_the_state_before_a_moment_has_no_goal_that_its_server_lost(tmp_path: Pa
         for given in [{"around": BEGIN / S + at, "seconds_before": 25}]
     ]
     assert states == [{"/drive goal": "active"}, {"/drive goal": "listed no more"}]
+
+
+def test_a_goal_that_goes_on_lasts_as_far_as_something_is_recorded(tmp_path: Path) -> None:
+    """Nothing says how it ended; then another recording begins, in which it is not said either."""
+    goes_on = history((10, {1: 2}), (30, {1: 4}), (50, {1: 4, 2: 2}))
+    beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(100)]
+    messages = sorted([*goes_on, *beats], key=lambda message: message.log_time)
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    asked = {"topic": TOPIC, "condition_type": "equals", "value": "executing"}
+    for later in (0, 1):
+        for nth in range(later):
+            beats = [odom(BEGIN + at * S, 0.0, 0.0) for at in range(900, 950)]
+            write_mcap(tmp_path / "next" / f"next_{nth}.mcap", beats)
+        memory = memory_of(tmp_path)
+        for end, lasted in ((60, 10), (2_000, 49)):
+            given = {**asked, "start": BEGIN / S, "end": BEGIN / S + end}
+            reply = json.loads(replied(memory, tmp_path, "find_matches", given).text)
+            assert [row["duration_s"] for row in reply["sightings"]] == [lasted]
+            reply = json.loads(
+                replied(memory, tmp_path, "find_matches", given | {"by": "day"}).text
+            )
+            assert dict(zip(reply["columns"][1:], reply["all"], strict=True))["seconds"] == lasted

@@ -465,10 +465,16 @@ def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
 
     assert texts("above", 20) == texts("above", "info") == ["slow", "lost", "slow"]
     assert texts("equals", "Warning") == texts("equals", 30) == ["slow", "slow"]
+    for level, message in (("WARN", "slow"), ("Error", "lost")):
+        named = {"topic": "/rosout", "condition_type": "equals", "value": level}
+        newest = asked(memory, tmp_path, "find_last_match", **named)
+        assert newest["value"]["msg"] == message
     slow = find_matches(memory, Call(), "/rosout", "contains", "lo", oldest_first=True)
     assert [each.messages for each in slow.sightings] == [1, 1, 1]
     warned = {"condition_type": "equals", "value": "WARN", "field": "status.level"}
     assert asked(memory, tmp_path, "find_last_match", topic="/diagnostics", **warned) is not None
+    bare = {"condition_type": "equals", "value": "WARN", "topic": "/diagnostics"}
+    assert asked(memory, tmp_path, "find_last_match", **bare) is not None
     refused = asked(
         memory, tmp_path, "find_last_match", topic="/rosout", **warned | {"value": "OK"}
     )
