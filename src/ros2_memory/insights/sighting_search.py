@@ -194,6 +194,7 @@ class Run:
         messages: how many there are.
         until: of the next message, which is no match; None where that is not known.
         begun: whether what came before the first match is known.
+        later: how many matches have the log time of the last one, and come after it.
     """
 
     topic: str
@@ -202,6 +203,7 @@ class Run:
     messages: int
     until: Ns | None
     begun: bool = True
+    later: int = 0
 
 
 class BlockRuns(NamedTuple):
@@ -238,10 +240,12 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     stops = np.r_[starts[1:], rows.size]
     others = np.flatnonzero(met == NOT_MET)
     until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
-    columns = times[rows[starts]], times[rows[stops - 1]], stops - starts, np.minimum(until, after)
+    firsts, lasts = times[rows[starts]], times[rows[stops - 1]]
+    later = np.searchsorted(times[rows], lasts, side="right") - stops
+    columns = firsts, lasts, stops - starts, np.minimum(until, after), later
     runs = [
-        Run(topic, first, last, messages, None if end == MAX_NS else end)
-        for first, last, messages, end in np.stack(columns, axis=1).tolist()
+        Run(topic, first, last, messages, None if end == MAX_NS else end, later=later_matches)
+        for first, last, messages, end, later_matches in np.stack(columns, axis=1).tolist()
     ]
     return BlockRuns(
         runs[::-1],
