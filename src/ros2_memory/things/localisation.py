@@ -25,7 +25,7 @@ _KNOWN_NS: Final = 60 * NS_PER_S
 
 
 def poorly_localised(sights: Sights) -> tuple[Flags, Flags]:
-    """Returns which spots and which looks have some of a time when localisation was poor."""
+    """Returns which spots and which looks are of a slice in which localisation was poor."""
     fixes = sights.fixes
     time = fixes[:, Fix.TIME]
     after = np.diff(time, append=time[-1:])
@@ -45,10 +45,11 @@ def poorly_localised(sights: Sights) -> tuple[Flags, Flags]:
         return poor
 
     spots, looks = sights.spots, sights.looks
-    return (
-        are_poor(spots[:, Spot.FIRST], spots[:, Spot.LAST]),
-        are_poor(looks[:, Look.FIRST], looks[:, Look.LAST]),
-    )
+    poor_spots = are_poor(spots[:, Spot.FIRST], spots[:, Spot.LAST])
+    poor_looks = are_poor(looks[:, Look.FIRST], looks[:, Look.LAST])
+    # Whole slices: else a look from beside would miss what a spot that is left out has seen.
+    slices = np.union1d(spots[poor_spots, Spot.SLICE], looks[poor_looks, Look.SLICE])
+    return np.isin(spots[:, Spot.SLICE], slices), np.isin(looks[:, Look.SLICE], slices)
 
 
 def _sigma_said(sigma: Ints, after: Ints) -> Ints:

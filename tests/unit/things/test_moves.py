@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.sights import fixes_of
+from ros2_memory.analysis.sights import Look, fixes_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.things.localisation import poorly_localised
 from ros2_memory.things.moves import Sightings, stays_in
@@ -271,6 +271,19 @@ def test_fixes_of_two_robots_in_turn_are_no_jumps_of_the_map() -> None:
 
 
 NOT_SAID: Final = np.full(30, math.nan)
+
+
+def test_a_slice_in_which_localisation_was_poor_is_poor_as_a_whole() -> None:
+    """A look from beside would miss what is left out of what another has seen."""
+    begin = BEGIN // 10 * 10  # of a slice of ten seconds
+    places = {0: (0, 0, 0), 4: (3, 0, 0), 8: (0, 3, 0), 12: (3, 3, 0)}
+    seen = [Message("/detections", (begin + at) * S, place, []) for at, place in places.items()]
+    said = fixes_of(np.array([begin - 1, begin + 1]) * S, np.zeros((2, 3)), np.array([2.0, 0.05]))
+    sights, _ = joined([packed(sights_of_messages(seen).with_fixes(said))])
+    _, looks = poorly_localised(sights)
+    slices = sights.looks[:, Look.SLICE]
+    assert len(looks) == 4
+    assert looks.tolist() == (slices == slices.min()).tolist()
 
 
 def test_a_thing_that_was_only_seen_while_localisation_was_poor_is_listed(tmp_path: Path) -> None:

@@ -78,6 +78,10 @@ _ELSEWHERE: Final = 3.0
 """Poses so many standard deviations from a place are elsewhere."""
 _CLEARLY: Final = 2.0
 """Those that are so many nearer are clearly there."""
+_OWN_BENDS: Final = 4
+"""Poses of a slot that give its noise by themselves."""
+_SPARSE_NS: Final[Ns] = 11 * NS_PER_S // 10
+"""Over longer a bend shows how the robot turned, rather than noise."""
 _PLACE_SLOTS: Final = 4
 """Slots that give the place at an end of a standstill."""
 _OUTWARDS: Final = SILENCE_NS // SLOT_NS + 1
@@ -306,13 +310,19 @@ class _Slots:
 
     @cached_property
     def _bends(self) -> tuple[Floats, Ints, Ints]:
-        """Squares (m2) of the second differences inside of slots, and where each slot's lie."""
+        """Squares (m2) of the second differences of poses, and where each slot's lie.
+
+        Inside of slots; where most have too few poses for that, also across them: a bend is then
+        in the slot of its middle pose.
+        """
         bends = self.positions[:-2] - 2 * self.positions[1:-1] + self.positions[2:]
         slot = np.repeat(np.arange(len(self)), self.counts)
-        inside = slot[2:] == slot[:-2]
-        counts = np.maximum(self.counts - 2, 0)
+        is_counted = slot[2:] == slot[:-2]
+        if np.median(self.counts) < _OWN_BENDS:
+            is_counted |= self.times[2:] - self.times[:-2] <= _SPARSE_NS
+        counts = np.bincount(slot[1:-1][is_counted], minlength=len(self))
         stops = np.cumsum(counts)
-        return row_sums(bends * bends)[inside], stops - counts, stops
+        return row_sums(bends * bends)[is_counted], stops - counts, stops
 
     @cached_property
     def noises(self) -> Floats:

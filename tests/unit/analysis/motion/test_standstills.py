@@ -122,6 +122,24 @@ def test_noise_moves_the_ends_of_a_standstill_by_less_than_a_second(
         assert found == pytest.approx(made.standing[0], abs=0.8)
 
 
+@pytest.mark.parametrize("hz", [2, 3, 4, 5, 7])
+@pytest.mark.parametrize("noise", [0.001, 0.003])
+def test_few_poses_a_second_with_noise_show_where_the_robot_stood(hz: int, noise: float) -> None:
+    made = world([(25.0, 0.4), (120.0, 0.0), (25.0, 0.4)], hz=hz, begin=100, noise=noise)
+    [found] = spans(standstills_of(made.poses))
+    assert found == pytest.approx(made.standing[0], abs=0.8)
+
+
+@pytest.mark.parametrize("hz", [2, 4, 5])
+@pytest.mark.parametrize(("radius", "speed"), [(0.1, 0.06), (0.3, 0.1), (1.0, 0.4)])
+def test_a_robot_that_turns_in_circles_with_few_poses_does_not_stand(
+    hz: int, radius: float, speed: float
+) -> None:
+    angles = [speed * n / hz / radius for n in range(60 * hz)]
+    at = [(radius * math.cos(angle), radius * math.sin(angle), 0.0) for angle in angles]
+    assert standstills_of([(n * S // hz, place) for n, place in enumerate(at)]) == ()
+
+
 @settings(max_examples=examples(150), deadline=None)
 @given(st.one_of(worlds(), worlds(noise=0.01)), SLICES)
 def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
