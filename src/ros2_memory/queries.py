@@ -807,15 +807,28 @@ class _Shown(NamedTuple):
 
 
 def _show_each(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
-    """Returns messages as a reply shows them. None is in memory when the next one is read."""
+    """Returns messages as a reply shows them. None is in memory when the next one is read.
+
+    Those without one of the fields, as of another type, are left out with a note.
+
+    Raises:
+        InvalidArgumentsError: none has them.
+    """
     shown: list[_Shown] = []
+    lacking: Counter[str] = Counter()
     for message in picked:
         type_name = message.type
         try:
             shown.append(_Shown(message.time, type_name, _decode_shown(view, message, fields)[1]))
         except NoDataError as error:
             shown.append(_Shown(message.time, type_name, None, error.detail))
+        except InvalidArgumentsError as error:
+            lacking[str(error)] += 1
         del message
+    for detail, count in lacking.items():
+        if all(message.shown is None for message in shown):
+            raise InvalidArgumentsError(detail)
+        view.notes.add(f"{count} samples left out: {detail}")
     return shown
 
 

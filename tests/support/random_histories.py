@@ -56,6 +56,7 @@ class _Robot:
     """What is published, before any recorder stamps it."""
 
     draw: Random
+    tick: int
     latched: list[Msg] = field(default_factory=list)
 
     def between(self, start: int, stop: int) -> list[Msg]:
@@ -65,7 +66,9 @@ class _Robot:
 
     def _moments(self, start: int, stop: int) -> list[int]:
         count = self.draw.randint(2, 14)
-        return sorted(self.draw.randrange(start, stop) // MS * MS for _ in range(count))
+        return sorted(
+            self.draw.randrange(start, stop) // self.tick * self.tick for _ in range(count)
+        )
 
     def _message(self, at: int) -> Msg:  # noqa: PLR0911 - one for each kind
         draw = self.draw
@@ -120,10 +123,13 @@ def _state(at: int, draw: Random) -> Msg:
     return command(at, draw.choice([0.0, 0.3]), draw.choice([0.0, -0.0, 0.5]))
 
 
-def write_history(bag_dir: Path, draw: Random) -> Written:
-    """Recordings of one robot, one after another or overlapping, some of them ended badly."""
+def write_history(bag_dir: Path, draw: Random, tick: int = MS) -> Written:
+    """Recordings of one robot, one after another or overlapping, some of them ended badly.
+
+    With a long `tick` many messages share a log time, as with a simulated clock.
+    """
     written = Written()
-    robot = _Robot(draw)
+    robot = _Robot(draw, tick)
     now = draw.choice([0, 1_700_000_000 * S])
     before: tuple[str, list[Msg]] | None = None
     for number in range(draw.randint(1, 4)):

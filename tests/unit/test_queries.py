@@ -19,6 +19,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.bags import (
     Msg,
     boolean,
+    command,
     detections,
     odom,
     text,
@@ -97,6 +98,19 @@ def test_a_path_of_which_nothing_can_be_decoded_has_no_answer(tmp_path: Path) ->
     with pytest.raises(NoDataError) as caught:
         queries.trajectory_summary(memory_of(tmp_path), Call(), span(0, 10))
     assert caught.value.reason is NoDataReason.UNDECODABLE
+
+
+def test_a_field_that_one_type_of_a_topic_has_is_shown_of_its_messages(tmp_path: Path) -> None:
+    poses = [odom(T0 + n * S, n, 0.0) for n in range(3)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", poses)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [command(T0 + 9 * S, 0.5, topic="/odom")])
+    window = {"topic": "/odom", "start": T0 / 1e9, "end": T0 / 1e9 + 9}
+    memory = memory_of(tmp_path)
+    told = asked(memory, tmp_path, "get_topic_in_range", **window, fields=["position.x"])
+    assert [x for _, x in told["rows"]] == [0, 1, 2]
+    assert any("1 samples left out: geometry_msgs/msg/Twist has no" in n for n in told["notes"])
+    told = asked(memory, tmp_path, "get_topic_in_range", **window, fields=["nothing"])
+    assert told["error"] == "invalid_arguments"
 
 
 def test_a_window_that_reaches_past_the_memory_at_either_end_says_so(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
+from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
@@ -483,11 +484,14 @@ def _descend(node: JsonValue, segment: str) -> Iterator[JsonValue]:
 def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
     """Yields everything at any depth that is neither a list nor an object.
 
-    Without `in_objects` nothing inside an object: the value itself, or the elements of a list.
+    Without `in_objects` nothing inside an object: the value itself, or the elements of a list. Of a
+    summary its texts: its sizes are not what the array holds.
     """
     waiting = [value]
     while waiting:
         node = waiting.pop()
+        if isinstance(node, Summary):
+            node = [part for part in node.values() if isinstance(part, str) and in_objects]
         if isinstance(node, dict):
             if in_objects:
                 waiting.extend(node.values())
@@ -580,7 +584,11 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
         return _refusal_for_position(value)
-    return _refusal_for_number(condition, targets) or _refusal_for_text(condition, targets)
+    return (
+        _refusal_for_summary(condition, targets)
+        or _refusal_for_number(condition, targets)
+        or _refusal_for_text(condition, targets)
+    )
 
 
 def _refusal_for_position(value: JsonValue) -> str:
@@ -593,6 +601,16 @@ def _refusal_for_position(value: JsonValue) -> str:
         "the values have no position: near_position needs a topic that does, "
         "or a field that leads to an object with x and y"
     )
+
+
+def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns why a number is not known to be in none of these; None where it is, or no number."""
+    field = condition.field
+    summary = next((target for target in targets if isinstance(target, Summary)), None)
+    if field is None or summary is None or _plain_text(condition.test) is not None:
+        return None
+    keys = ", ".join(f"{field}.{key}" for key in summary)
+    return f"field {field!r} is only summarised, and its numbers are not searched: ask about {keys}"
 
 
 def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> str | None:

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.columns.shown import (
-    Group,
     Limits,
-    Message,
     Node,
     Spot,
     UnknownShapeError,
@@ -27,8 +25,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Floats, Ints
     from ros2_memory.extract import SchemaExtractor
 
-_SUMMARY: Final = frozenset({"bytes", "numbers"})
-"""Keys of the summary that an answer has in place of an array."""
 _LARGEST_INT64: Final = 2**63 - 1
 
 
@@ -130,9 +126,6 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
 def _leaves(value: Node | None) -> Iterator[tuple[Leaf, Limits]]:
     """Yields the numbers of a field; not those of a summary."""
     for spot in () if value is None else opened(Spot(value)):
-        node = spot.node
-        if isinstance(node, Message | Group) and _SUMMARY.issuperset(node.names()):
-            continue
         for _, leaf, limits in leaves_below(spot):
             if leaf.kind in {Kind.INTEGER, Kind.REAL}:
                 yield leaf, limits

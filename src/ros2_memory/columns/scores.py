@@ -214,7 +214,8 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
         )
         kept = Narrowed(_HypothesisLimit(best), results.element)
         return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
-    return Group({name: without_low(child, least, depth - 1) for name, child in fields.items()})
+    kept_fields = {name: without_low(child, least, depth - 1) for name, child in fields.items()}
+    return replace(node, fields=kept_fields) if isinstance(node, Group) else Group(kept_fields)
 
 
 def hypotheses(fields: Mapping[str, Node]) -> Scored | None:

@@ -160,10 +160,17 @@ class Message:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
-    """An object that the conversions make. `turned`: the message, of a quaternion."""
+    """An object that the conversions make.
+
+    Attributes:
+        fields: its parts.
+        turned: the message, of a quaternion.
+        is_summary: whether it is a `messages.conversions.Summary`.
+    """
 
     fields: Mapping[str, Node]
     turned: Message | None = None
+    is_summary: bool = False
 
     def names(self) -> list[str]:
         """Returns the names of its fields."""
@@ -360,11 +367,12 @@ class Shape:
 
         count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
         if kind == "CompressedImage":  # as markers have them
-            return Group({"bytes": count, "encoding": leaf(Kind.TEXT, "format")})
+            parts = {"bytes": count, "encoding": leaf(Kind.TEXT, "format")}
+            return Group(parts, is_summary=True)
         if kind != "OccupancyGrid":
             raise UnknownShapeError("images and clouds are no columns")
         shape = tuple(leaf(Kind.INTEGER, "info", name) for name in ("height", "width"))
-        return Group({"bytes": count, "shape": Items(shape)})
+        return Group({"bytes": count, "shape": Items(shape)}, is_summary=True)
 
     def _message(self) -> Node:
         return self.shown(Place(ROWS, "", self.definition, None, 0))
@@ -394,7 +402,8 @@ class Shape:
             counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
             longer = LongerThan(level, path, count, is_longer=True)
             shorter = LongerThan(level, path, count, is_longer=False)
-            cases = (Narrowed(longer, Group({key: counted})), Narrowed(shorter, listing))
+            summary = Group({key: counted}, is_summary=True)
+            cases = (Narrowed(longer, summary), Narrowed(shorter, listing))
             return Choice(cases, listing)
         size = length or 0
         array: Node = listing
@@ -405,7 +414,7 @@ class Shape:
         if size <= count:
             return array
         constant = Leaf(level, (), Kind.INTEGER, Conversion.CONSTANT, size)
-        return Choice((Group({key: constant}),), array)
+        return Choice((Group({key: constant}, is_summary=True),), array)
 
     def _converted(self, name: str, node: Node) -> Node:
         """Returns the value of a name of the schema map: an array as the point or turn it is."""
@@ -523,6 +532,8 @@ def opened(spot: Spot) -> Iterator[Spot]:
 def leaves_below(root: Spot) -> Iterator[tuple[str, Leaf, Limits]]:
     """Yields the leaves at or below a spot, with their dot-paths in the value.
 
+    Below a summary these are its texts, as in `analysis.conditions.leaves`.
+
     Raises:
         UnknownShapeError: there are more than `MAX_LEAVES`, or it depends on the message.
     """
@@ -541,9 +552,11 @@ def leaves_below(root: Spot) -> Iterator[tuple[str, Leaf, Limits]]:
             elif isinstance(node, Items):
                 waiting.extend((path, Spot(item, limits)) for item in reversed(node.items))
             elif isinstance(node, Message | Group):
+                is_summary = isinstance(node, Group) and node.is_summary
                 waiting.extend(
                     (f"{path}.{key}" if path else key, Spot(child, limits))
                     for key, child in reversed(children(node))
+                    if not is_summary or (isinstance(child, Leaf) and child.kind is Kind.TEXT)
                 )
 
 

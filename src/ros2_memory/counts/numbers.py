@@ -48,8 +48,6 @@ if TYPE_CHECKING:
 _LARGEST: Final = sys.float_info.max
 SUM_SCALE: Final = 2.0**-64
 """What sums are scaled by: those of the largest floats are finite then, and no digit is lost."""
-_SUMMARY: Final = frozenset({"bytes", "numbers"})
-"""The keys of a summary in place of numbers that are too many to show."""
 LEAST: Final = 1
 GREATEST: Final = -1
 """The greatest number is the least one of their negatives."""
@@ -476,8 +474,6 @@ def _numbers_of_samples(samples: Sequence[Sequence[float]]) -> FieldNumbers:
 
 def numbers_in(value: JsonValue) -> Iterator[float]:
     """Yields the numbers of a field; not those of a summary in place of an array."""
-    if isinstance(value, dict) and value.keys() <= _SUMMARY:
-        return  # its numbers are counts, not the field's values
     for leaf in leaves(value):
         if isinstance(leaf, bool) or not isinstance(leaf, int | float):
             continue

@@ -500,7 +500,10 @@ class ReverseSearch:
             except UndecodableError as error:
                 # A copy: the raised error keeps its traceback alive, and the message with it.
                 alone = UndecodableError(error.topic, error.type_name, error.reason)
-                self._failures.setdefault((channel.topic, channel.type), (alone, stored.time))
+                key = channel.topic, channel.type
+                # The newest is reported, in whatever order messages are tested.
+                if key not in self._failures or self._failures[key][1] < stored.time:
+                    self._failures[key] = alone, stored.time
                 return None
 
     def note_undecodable(self, since: Ns = MIN_NS) -> None:

@@ -1,14 +1,14 @@
 """Recordings of several robots that are answered together, as one history.
 
 Recordings that hold a topic at the same time are of one robot where a handover joins them, or where
-messages of one are in the other too. At other times they are of several where a frame has one
+most messages of one are in the other too. At other times they are of several where a frame has one
 parent here and another one there.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from itertools import chain, combinations, islice
+from itertools import chain, combinations, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -41,8 +41,8 @@ _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
 _SLOW_NS: Final[Ns] = 600 * NS_PER_S
 """As far where recordings overlap at that time: some topics have a message in minutes."""
-_TRIED: Final = 3
-"""How many messages are looked for in the other recording: a subscriber may miss one."""
+_TRIED: Final = 7
+"""How many messages are looked for in the other recording: a subscriber may miss some."""
 _MAX_PAIRS: Final = 20
 """Pairs of recordings of which messages are compared."""
 _MAX_TOPICS: Final = 3
@@ -437,7 +437,7 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
-    """Whether two recordings hold messages in a window, and the other none of the one's."""
+    """Whether two recordings hold messages in a window, and each lacks most of the other's."""
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
@@ -463,17 +463,32 @@ def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
 def _bags_differ(
     view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
 ) -> bool:
-    """Whether two lists of bags hold messages in a window, and the second none of the first's."""
-    first_spans, other = bags
-    if next(_merged_messages(view, topic, other, both), None) is None:
-        return False
-    tried = list(islice(_merged_messages(view, topic, first_spans, both), _TRIED))
-    for stored in tried:
-        near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
-        key = copy_key(stored.record)
-        if any(copy_key(copy.record) == key for copy in _merged_messages(view, topic, other, near)):
-            return False
-    return bool(tried)
+    """Whether two lists of bags hold messages in a window, and each lacks most of the other's.
+
+    Two runs of a simulation share some, as those of a robot that has not moved yet.
+    """
+    first, other = bags
+    return _lacks_most(view, topic, (first, other), both) and _lacks_most(
+        view, topic, (other, first), both
+    )
+
+
+def _lacks_most(
+    view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
+) -> bool:
+    """Whether the second lacks most of some messages that the first has all over a window."""
+    first, other = bags
+    length = both.stop - both.start
+    edges = [both.start + length * nth // _TRIED for nth in range(_TRIED + 1)]
+    tried, lacking = 0, 0
+    for start, stop in pairwise(edges):
+        stored = next(_merged_messages(view, topic, first, TimeWindow(start, stop)), None)
+        if stored is not None:
+            near, key = TimeWindow.around(stored.time, COPY_HORIZON_NS), copy_key(stored.record)
+            copies = _merged_messages(view, topic, other, near)
+            tried += 1
+            lacking += all(copy_key(copy.record) != key for copy in copies)
+    return 2 * lacking > tried
 
 
 def _merged_messages(

@@ -233,14 +233,21 @@ def of_columns(view: View, rows: Rows, read: Callable[[Rows], V | None]) -> list
 
 def messages_of(view: View, rows: Rows) -> Iterator[StoredMessage]:
     """Yields the messages of some rows, read from their bags: bag after bag, in log-time order."""
+    return (stored for _, stored in messages_at(view, rows))
+
+
+def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
+    """Does as `messages_of`, each with the position of its row among those that count."""
     times, ranks, channel = rows.times, rows.ranks, rows.table.channel
     for bag, positions in rows.bag_rows():
         wanted = times[positions]
         window = TimeWindow(int(wanted[0]), int(wanted[-1]) + 1)
-        counting = {*zip(wanted.tolist(), ranks[positions].tolist(), strict=True)}
+        keys = zip(wanted.tolist(), ranks[positions].tolist(), strict=True)
+        position_of = dict(zip(keys, positions.tolist(), strict=True))
         met = Counter[Ns]()
         for stored in view.bags.read(bag, [channel.topic], window):
             if stored.type == channel.type:
-                if (stored.time, met[stored.time]) in counting:
-                    yield stored
+                position = position_of.get((stored.time, met[stored.time]))
+                if position is not None:
+                    yield position, stored
                 met[stored.time] += 1

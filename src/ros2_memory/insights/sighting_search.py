@@ -7,7 +7,6 @@ Where a scope does not hold, a match counts as no match.
 from __future__ import annotations
 
 import heapq
-from collections import defaultdict
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -22,7 +21,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.reverse_search import RowCondition
-from ros2_memory.history.scan import scan
+from ros2_memory.history.scan import messages_at, scan
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -143,23 +142,12 @@ class MatchTester:
             # Messages that lie close together are read at once.
             edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
             for together in np.split(undecided, edges):
-                met[together] = self._test_messages(topic, rows.times[together], sources[together])
+                # What cannot be read is no match; a note reports it.
+                met[together] = NOT_MET
+                for nth, message in messages_at(self._view, rows.some(together)):
+                    is_match = self._search.matches(message)
+                    met[together[nth]] = UNKNOWN if is_match is None else int(is_match)
         return Tested(rows.times, met, sources)
-
-    def _test_messages(self, topic: str, times: IntArray, sources: IntArray) -> list[int]:
-        """Returns what the messages at some log times, which ascend, are found to be."""
-        window = TimeWindow(int(times[0]), int(times[-1]) + 1)
-        numbers = self._source_numbers(topic)
-        read: dict[tuple[Ns, int], list[int]] = defaultdict(list)
-        # The newest first, as a search reports what it cannot decode.
-        for message in self._view.stream.messages([topic], window, newest_first=True):
-            met = self._search.matches(message)
-            source = numbers[message.bag.recording, message.type]
-            outcomes = read[message.time, source]
-            outcomes.append(UNKNOWN if met is None else int(met))
-        # Those of one log time come in the order of the file.
-        wanted = zip(times.tolist(), sources.tolist(), strict=True)
-        return [read[key].pop() if read[key] else NOT_MET for key in wanted]
 
     def _source_numbers(self, topic: str) -> dict[tuple[Path, str], int]:
         """Returns numbers of the recordings and types of a topic, in the order of `Rows.order`."""
@@ -206,6 +194,7 @@ class Run:
         messages: how many there are.
         until: of the next message, which is no match; None where that is not known.
         begun: whether what came before the first match is known.
+        later: how many matches have the log time of the last one, and come after it.
     """
 
     topic: str
@@ -214,6 +203,7 @@ class Run:
     messages: int
     until: Ns | None
     begun: bool = True
+    later: int = 0
 
 
 class BlockRuns(NamedTuple):
@@ -250,10 +240,12 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     stops = np.r_[starts[1:], rows.size]
     others = np.flatnonzero(met == NOT_MET)
     until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
-    columns = times[rows[starts]], times[rows[stops - 1]], stops - starts, np.minimum(until, after)
+    firsts, lasts = times[rows[starts]], times[rows[stops - 1]]
+    later = np.searchsorted(times[rows], lasts, side="right") - stops
+    columns = firsts, lasts, stops - starts, np.minimum(until, after), later
     runs = [
-        Run(topic, first, last, messages, None if end == MAX_NS else end)
-        for first, last, messages, end in np.stack(columns, axis=1).tolist()
+        Run(topic, first, last, messages, None if end == MAX_NS else end, later=later_matches)
+        for first, last, messages, end, later_matches in np.stack(columns, axis=1).tolist()
     ]
     return BlockRuns(
         runs[::-1],

@@ -249,7 +249,7 @@ def _runs_as_sightings(
     wanted = [
         (run, newest)
         for run in runs
-        if view.call.wants(run.last) and (newest := _newest_match(view, run)) is not None
+        if view.call.wants(run.last) and (newest := _newest_match(view, search, run)) is not None
     ]
     sightings = tuple(
         _sighting(view, search.condition, run, newest, scope=scope, frame_id=shown.frame_id)
@@ -314,10 +314,11 @@ def only_messages_count(topic: str) -> str:
     )
 
 
-def _newest_match(view: View, run: Run) -> StoredMessage | None:
+def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage | None:
     """Returns the last match; None where its bag was deleted since."""
     at = TimeWindow(run.last, run.last + 1)
-    return view.stream.first([run.topic], at, newest_first=True)
+    at_once = view.stream.messages([run.topic], at, newest_first=True)
+    return next(islice(filter(search.matches, at_once), run.later, None), None)
 
 
 def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:

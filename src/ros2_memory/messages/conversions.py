@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence, Sized
 from enum import Enum, auto
 from functools import lru_cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import numpy as np
 
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import Quaternion, Vector3
 
 Array: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.generic[object]]]"
+
+V = TypeVar("V")
 
 ABSENT: Final = object()
 """The result of a step or a path where there is no such field."""
@@ -225,6 +227,12 @@ def view(node: object, name: str) -> object:
     return summaries[name](node, value) if name in summaries else value
 
 
+class Summary(dict[str, V]):
+    """What a value has in place of an array: how large it is, not what it holds."""
+
+    __slots__ = ()
+
+
 def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], object]]:
     """Returns, by field, the function that summarizes a message and the value of that field."""
     return _SUMMARIES.get(table.type, _NONE)
@@ -343,7 +351,7 @@ def _image(message: object, data: object) -> object:
     encoding = field_of(message, "encoding")
     channels = channels_of(str(encoding))
     shape = [*_shape(message), channels] if channels is not None else _shape(message)
-    return {**_bytes(data), "encoding": _or_null(encoding), "shape": shape}
+    return Summary({**_bytes(data), "encoding": _or_null(encoding), "shape": shape})
 
 
 def _shape(message: object, *path: str) -> list[int]:
@@ -362,16 +370,16 @@ def channels_of(encoding: str) -> int | None:
 
 
 def _compressed_image(message: object, data: object) -> object:
-    return {**_bytes(data), "encoding": _or_null(field_of(message, "format"))}
+    return Summary({**_bytes(data), "encoding": _or_null(field_of(message, "format"))})
 
 
 def _point_cloud(message: object, data: object) -> object:
     shape = _shape(message)
-    return {**_bytes(data), "points": math.prod(shape), "shape": shape}
+    return Summary({**_bytes(data), "points": math.prod(shape), "shape": shape})
 
 
 def _occupancy_grid(message: object, data: object) -> object:
-    return {**_bytes(data), "shape": _shape(message, "info")}
+    return Summary({**_bytes(data), "shape": _shape(message, "info")})
 
 
 def _magnetic_field(_message: object, field: object) -> object:

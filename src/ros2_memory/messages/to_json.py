@@ -21,6 +21,7 @@ from ros2_memory.messages.conversions import (
     Degrees,
     FieldTable,
     Metric,
+    Summary,
     ValueKind,
     euler,
     field_table_of,
@@ -220,8 +221,9 @@ class ExactJson:
         if isinstance(node, list | tuple):
             return [self.value(element, path, depth) for element in self._elements(node, path)]
         if isinstance(node, dict):
-            entries = self._entries(node, path)
-            return {name: self.value(node, _join(path, name), depth) for name, node in entries}
+            entries, is_summary = self._entries(node, path), isinstance(node, Summary)
+            rendered = {name: self.value(node, _join(path, name), depth) for name, node in entries}
+            return Summary(rendered) if is_summary else rendered
         table = field_table_of(node)
         if table is None:
             return self._text(f"<{type(node).__name__}>", path)
@@ -259,7 +261,7 @@ class ExactJson:
         if array.ndim == 0:
             return self.value(array[()], path, MAX_DEPTH - 1)
         if array.dtype == np.uint8 and array.size > self._limit:
-            return {"bytes": int(array.size)}
+            return Summary({"bytes": int(array.size)})
         if array.ndim > 1 or array.dtype.kind not in "biuf":
             return [self.value(row, path, depth) for row in self._elements(list(array), path)]
         return self._numbers(array, path)
@@ -280,7 +282,7 @@ class ExactJson:
 
     def _numbers(self, array: Array, _path: str, /) -> JsonValue:
         if array.size > MAX_EXACT_NUMBERS:
-            return {"numbers": int(array.size)}
+            return Summary({"numbers": int(array.size)})
         numbers: JsonValue = _at_most_64_bits(array).tolist()
         return numbers
 

@@ -11,9 +11,9 @@ import pytest
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.table import MAX_NUMBERS
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, header, make, write_mcap
+from tests.support.bags import Msg, header, make, point, quaternion, stamp, write_mcap
 from tests.support.column_worlds import World
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -97,3 +97,42 @@ def test_a_sequence_whose_columns_were_dropped_is_read_from_its_bag(tmp_path: Pa
         condition = {"condition_type": "above", "field": "poses.position.x", "value": value}
         found = asked(world.memory, tmp_path, "find_last_match", topic="/poses", **condition)
         assert (found or {}).get("timestamp") == expected
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("condition", "number"),
+    [("above", 50), ("below", 0), ("equals", 100), ("equals", -1), ("contains", 10)],
+)
+def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
+    tmp_path: Path, condition: str, number: int, *, recalls: bool
+) -> None:
+    def found(**where: str) -> Any:
+        asks = {"topic": "/*", "condition_type": condition, "value": number}
+        return asked(memory, tmp_path, "find_last_match", **asks, **where)
+
+    origin = make("geometry_msgs/msg/Pose", position=point(0.0, 0.0), orientation=quaternion(0.0))
+    info = make(
+        "nav_msgs/msg/MapMetaData",
+        map_load_time=stamp(0),
+        resolution=0.05,
+        width=10,
+        height=10,
+        origin=origin,
+    )
+    unknown = np.full(100, -1, np.int8)
+    grid, octets = "nav_msgs/msg/OccupancyGrid", "std_msgs/msg/UInt8MultiArray"
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    bodies = {
+        grid: make(grid, header=header(0, "map"), info=info, data=unknown),
+        octets: make(octets, layout=layout, data=np.full(100, 7, np.uint8)),
+    }
+    for type_name, body in bodies.items():
+        folder = tmp_path / type_name.rpartition("/")[2]
+        write_mcap(folder / "rec" / "rec_0.mcap", [Msg("/data", type_name, T0, body)])
+        memory = memory_of(folder, recalls=recalls)
+        assert "ask about data.bytes" in found(field="data")["detail"]
+        if condition == "equals":  # in the whole message
+            assert found() is None
+    if number == 100:
+        assert found(field="data.bytes")["value"] is not None

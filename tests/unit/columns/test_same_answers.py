@@ -27,7 +27,7 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import LONG, examples
 from tests.support.memories import memory_of, with_store
-from tests.support.random_histories import S, write_history
+from tests.support.random_histories import MS, S, write_history
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -115,16 +115,18 @@ def answer(memory: Memory, ask: Callable[[Memory, Call], object]) -> str:
     size=st.sampled_from([1, 2, 4, SEGMENT]),
     share=st.sampled_from([1.0, 0.0]),
     anew=st.booleans(),
+    tick=st.sampled_from([MS, MS, 5 * S]),
 )
-@example(clock="auto", seed=572545084, part=1.0, size=SEGMENT, share=1.0, anew=False)
-@example(clock="stamp", seed=246, part=1.0, size=SEGMENT, share=1.0, anew=False)
-@example(clock="auto", seed=11445, part=1.0, size=SEGMENT, share=1.0, anew=False)
+@example(clock="auto", seed=572545084, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
+@example(clock="stamp", seed=246, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
+@example(clock="auto", seed=11445, part=1.0, size=SEGMENT, share=1.0, anew=False, tick=MS)
 def test_every_question_is_answered_as_without_a_store(
     clock: str,
     seed: int,
     part: float,
     size: int,
     share: float,
+    tick: int,
     monkeypatch: pytest.MonkeyPatch,
     *,
     anew: bool,
@@ -134,7 +136,7 @@ def test_every_question_is_answered_as_without_a_store(
     draw = random.Random(seed)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
-        moments = write_history(bag_dir, draw).moments
+        moments = write_history(bag_dir, draw, tick).moments
         limits = QuerySettings(tf_clock=clock)  # type: ignore[arg-type]
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
         recalled = with_store(plain, bag_dir, part=part, share=share)
@@ -143,7 +145,7 @@ def test_every_question_is_answered_as_without_a_store(
         # Who fills a store reads all of a bag, and so knows of its damage earlier.
         monkeypatch.setattr(Scanner, "damaged_parts", lambda *_: [])
         for asked, ask in questions(moments, draw):
-            assert answer(recalled, ask) == answer(plain, ask), (seed, part, size, asked)
+            assert answer(recalled, ask) == answer(plain, ask), (seed, part, size, tick, asked)
 
 
 @settings(max_examples=examples(30), deadline=None, suppress_health_check=[HealthCheck.too_slow])

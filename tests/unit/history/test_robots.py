@@ -126,6 +126,20 @@ def test_a_way_over_both_robots_is_not_known(both: Path, asks: dict[str, object]
     assert "distance_m" not in compared.get("way", {})
 
 
+@pytest.mark.parametrize("resting", [1, 20])
+def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
+    tmp_path: Path, resting: int
+) -> None:
+    for speed in (1.0, 2.0):
+        name, times = f"run_{speed:.0f}", range(NS_PER_S, 61 * NS_PER_S, NS_PER_S)
+        poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
+    memory = memory_of(tmp_path)
+    assert differing(memory) == [(("run_1", "run_2"), "/odom")]
+    told = asked(memory, tmp_path, "trajectory_summary", start=0, end=61)
+    assert told["reason"] == "mixed"
+
+
 @pytest.mark.parametrize(
     "asks", [{}, {"where": {"x": 0, "y": 0, "radius_m": 9}}, {"by": "hour"}, {"by": "place"}]
 )
@@ -195,9 +209,10 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     "other",
     [
         [*(each for n, each in enumerate(drive(0.0, delay=3_000_000)) if n != 1), text(T0, "b")],
+        drive(0.0, delay=3_000_000)[5::10],
         [text(T0 + n * NS_PER_S, str(n)) for n in range(60)],
     ],
-    ids=["two recorders of one robot", "different topics"],
+    ids=["two recorders of one robot", "one that recorded a tenth", "different topics"],
 )
 def test_recordings_without_messages_of_their_own_on_a_topic_are_not(
     tmp_path: Path, other: list[Msg]

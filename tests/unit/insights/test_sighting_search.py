@@ -6,15 +6,15 @@ from random import Random
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.sightings import find_matches
-from tests.support.bags import Msg, detections, write_mcap
+from tests.support.bags import Msg, detections, log_entry, make, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of, with_store
+from tests.support.memories import each_way, memory_of, with_store
 
 if TYPE_CHECKING:
     from ros2_memory.results import Sightings
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 S = 10**9
 BEGIN = 1_784_000_000 * S
 TOPIC = "/vision/scene/scene_objects"
+FLOAT = "std_msgs/msg/Float64"
 LATEST = QuerySettings(now="latest")
 LABELS = ("cup", "teacup", "fork")
 
@@ -103,3 +104,62 @@ def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit
                     assert asked(known, limit, span, oldest_first=oldest_first) == answer
                 if oldest_first and span == (None, None):
                     assert answer.total == count_of(messages)
+
+
+@settings(deadline=None, max_examples=examples(20), suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]))
+# One split, all of which is stored.
+@example(seed=4, part=1.0)
+def test_messages_of_one_log_time_are_told_apart(seed: int, part: float) -> None:
+    """With simulated time many share one; stored numbers are rounded, which bags have to settle."""
+    draw = Random(seed)
+    thirds = [draw.randint(0, 8) / 3 for _ in range(draw.randint(2, 40))]
+    messages = [
+        Msg("/load", FLOAT, BEGIN + nth // 3 * S, make(FLOAT, data=third))
+        for nth, third in enumerate(thirds)
+    ]
+    with TemporaryDirectory() as folder:
+        bags = Path(folder)
+        write(bags, messages, draw)
+        plain = memory_of(bags, limits=LATEST)
+        for memory in (plain, with_store(plain, bags, part=part)):
+            for asked_for in {*thirds[:3]}:
+                found = find_matches(memory, Call(), "/load", "equals", asked_for, limit=50)
+                assert sum(each.messages for each in found.sightings) == thirds.count(asked_for)
+
+
+@each_way
+def test_a_sighting_shows_its_own_message_of_those_of_one_log_time(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    entries = [
+        log_entry(BEGIN, 30, "planner", "a stuck wheel"),
+        log_entry(BEGIN, 30, "planner", "all is well"),
+        log_entry(BEGIN, 30, "planner", "stuck again"),
+        log_entry(BEGIN, 30, "planner", "all is well"),
+    ]
+    loads = [
+        Msg("/load", FLOAT, BEGIN + at * S, make(FLOAT, data=load))
+        for at, load in [(0, 7.0), (1, 8.0), (1, 1.0), (1, 9.0), (1, 9.5), (1, 2.0)]
+    ]
+    write_mcap(tmp_path / "a" / "a_0.mcap", [*entries, *loads])
+    memory = memory_of(tmp_path, limits=LATEST, recalls=recalls)
+    for oldest_first in (False, True):
+        order = -1 if oldest_first else 1
+        found = find_matches(
+            memory, Call(), "/rosout", "contains", "stuck", oldest_first=oldest_first
+        )
+        texts = [each.matched for each in found.sightings]
+        assert texts[::order] == [("stuck again",), ("a stuck wheel",)]
+        found = find_matches(
+            memory,
+            Call(),
+            "/load",
+            "above",
+            5,
+            field="value",
+            fields=("value",),
+            oldest_first=oldest_first,
+        )
+        loads_shown = [each.value for each in found.sightings]
+        assert loads_shown[::order] == [{"value": 9.5}, {"value": 8}]
