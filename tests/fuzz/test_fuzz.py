@@ -1,6 +1,6 @@
 """A few mutants of every class, the same in each run; more of those whose indexes lie.
 
-EPISODIC_LONG=1 tries a hundred times as many; so does `python -m tests.fuzz`, with a table.
+EPISODIC_LONG=1 tries over a hundred times as many; so does `python -m tests.fuzz`, with a table.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from tests.fuzz.oracle import Readable
 
 SEED: Final = 1
-OF_EACH: Final = 200 if LONG else 2
+OF_EACH: Final = 300 if LONG else 2
 OF_INDEXES: Final = 1200 if LONG else 8
 _INDEXES: Final = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
 UNKNOWN: Final = "no_such_class"

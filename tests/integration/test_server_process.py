@@ -173,9 +173,7 @@ async def replies(client: Client) -> list[tuple[str, str, bool]]:
     return [(name, str(result.content), bool(result.is_error)) for name, result in results]
 
 
-async def test_everything_is_answered_alike_over_every_transport(
-    bag_dir: Path, tmp_path: Path
-) -> None:
+async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: Path) -> None:
     program, *arguments = command("logging.level=debug")
     alone = StdioServerParameters(command=program, args=arguments, env=environment(bag_dir))
     with (tmp_path / "stdio").open("w", encoding="utf-8") as log:
