@@ -123,7 +123,8 @@ class _Asker:
     # Questions
 
     def _listed(self, nth: int) -> Question:
-        day = nth * 3 + self._draw.randrange(3) if nth else 5  # a late task reaches into day 5
+        each = DAYS // EACH
+        day = nth * each + self._draw.randrange(each) if nth else 5  # a late task reaches into it
         texts = [each.text for each in self._during(day)]
         return Question(LISTED, f"What did you do on {date_of(day)}?", texts, day=day)
 

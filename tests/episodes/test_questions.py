@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import time
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from tests.episodes.asking import answer_of, call_for
-from tests.episodes.questions import EXACT, date_of, questions
+from tests.episodes.questions import questions
 from tests.episodes.recording import write_month
 from tests.episodes.world import NOW
 from tests.support.clocks import SettableClock
@@ -65,15 +64,6 @@ def is_true(found: Any, truth: Any) -> bool:
     if isinstance(truth, float) and isinstance(found, float | int):
         return abs(found - truth) <= 0.06
     return bool(found == truth) and type(found) is type(truth)
-
-
-@pytest.mark.parametrize("seed", [1, 119])
-def test_what_began_in_the_evening_before_did_not_begin_on_the_day(seed: int) -> None:
-    """The truth of "when did you begin (time n)" counts what began on that day alone."""
-    for question in questions(seed):
-        if question.kind == EXACT and not question.at and question.day is not None:
-            begun = datetime.fromtimestamp(question.answer, UTC).date()
-            assert begun.isoformat() == date_of(question.day), question
 
 
 def test_all_hundred_are_right_in_one_call_each_from_the_store(folder: Path) -> None:

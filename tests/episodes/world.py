@@ -1,23 +1,26 @@
 """What a robot did in a month: 1,500 tasks and 20,000 actions, which two topics say in texts.
 
+Only in a long run is it a whole month, else ten days, which are more than a reply holds, too.
 A text holds until the next one. An empty text ends it, or another text takes its place; some are
 said again while they hold. A night is not recorded, unless a task goes on past midnight.
 """
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import cache
 from random import Random
 from typing import Final, NamedTuple
 
+from tests.support.examples import LONG
+
 TASK: Final = "/task"
 ACTION: Final = "/action"
-DAYS: Final = 30
+DAYS: Final = 30 if LONG else 10
 TASKS_A_DAY: Final = 50
-ACTIONS: Final = 20_000
+ACTIONS: Final = DAYS * 2000 // 3
 FIRST_DAY: Final = datetime(2026, 11, 1, tzinfo=UTC)
-NOW: Final = datetime(2026, 12, 1, 9, tzinfo=UTC)
+NOW: Final = FIRST_DAY + timedelta(days=DAYS, hours=9)
 """When questions are asked."""
 DAY_S: Final = 86_400
 US_PER_S: Final = 1_000_000

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-KILLS = 100 if LONG else 3
+KILLS = 100 if LONG else 2
 SPANNED = {"get_topic_in_range", "find_matches"}
 ROWS = 12 * 21 + 120
 # Not forked: SQLite must not have a file open across that.

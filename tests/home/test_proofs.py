@@ -20,7 +20,10 @@ __all__ = ["exits"]
 
 pytestmark = pytest.mark.xdist_group("home")
 
-DAY: Final = "start=2026-03-02 end=2026-03-02"
+FROM, UNTIL = ("", "") if LONG else ("T10:00", "T12:00")
+"""A long run asks about whole days, another one about the outing before noon of each."""
+DAY: Final = f"start=2026-03-02{FROM} end=2026-03-02{UNTIL}"
+OTHER_DAY: Final = f"with_start=2026-03-03{FROM} with_end=2026-03-03{UNTIL}"
 SEEN: Final = "topic=*/scene_objects condition_type=contains value=mug"
 QUESTIONS: Final = {
     "list_recorded_topics": "",
@@ -41,10 +44,10 @@ QUESTIONS: Final = {
     "trajectory_summary": f'{DAY} farthest_from={{"x": 0, "y": 0}}',
     "recent_trajectory_summary": "seconds=10m where=kitchen",
     "find_matches": f"{SEEN} limit=20",
-    "find_things": 'near={"label": "table", "radius_m": 2}',
-    "compare": f"{DAY} with_start=2026-03-03 with_end=2026-03-03",
+    "find_things": f'near={{"label": "table", "radius_m": 2}} {DAY}',
+    "compare": f"{DAY} {OTHER_DAY}",
     "recap": DAY,
-    "visits": "where=kitchen",
+    "visits": f"where=kitchen {DAY}",
     "memory_status": "",
 }
 

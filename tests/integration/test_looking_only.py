@@ -8,11 +8,12 @@ import os
 import shutil
 import sqlite3
 import subprocess
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import closing, redirect_stderr, redirect_stdout
 from typing import TYPE_CHECKING, Final
 from unittest.mock import patch
 
+import anyio
 import pytest
 from mcp import Client
 
@@ -23,9 +24,8 @@ from tests.integration.test_retention_process import state
 from tests.integration.test_server_process import Served, serving
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
 from tests.support.column_worlds import store_file
-from tests.support.forked_commands import forked_commands
 from tests.support.housekeepers import recorded_before
-from tests.support.processes import PATIENCE_S, until
+from tests.support.processes import until
 from tests.support.robot_run import T0, ask_everything, write_run
 
 if TYPE_CHECKING:
@@ -45,7 +45,6 @@ COMMANDS: Final = {
     "config": ["config", "show"],
 }
 STORAGES: Final = ("mcap", "rosbag2")
-Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 @pytest.fixture
@@ -71,14 +70,8 @@ def strangers(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with forked_commands(tmp_path_factory.mktemp("commands")) as folder:
-        yield folder
-
-
 @pytest.fixture
-def env(tmp_path: Path, commands: Path) -> dict[str, str]:
+def env(tmp_path: Path) -> dict[str, str]:
     """The shipped defaults, and a `ros2` that leaves a log with every run, as the real one does."""
     programs = tmp_path / "bin"
     programs.mkdir()
@@ -86,23 +79,12 @@ def env(tmp_path: Path, commands: Path) -> dict[str, str]:
     ros2.write_text('#!/bin/sh\nmkdir -p "$ROS_LOG_DIR" && date > "$ROS_LOG_DIR/ros2.log"\n')
     ros2.chmod(0o755)
     kept = {name: text for name, text in os.environ.items() if not name.startswith("MEMORY_")}
-    path = f"{programs}:{commands}:{os.environ['PATH']}"
+    path = f"{programs}:{os.environ['PATH']}"
     return {**kept, "PATH": path, "XDG_CACHE_HOME": str(tmp_path / "cache")}
 
 
 def run(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["ros2-memory", *command],
-        env={**env, "MEMORY_BAG_DIR": str(bag_dir)},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-
-
-def run_here(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.CompletedProcess[str]:
-    """As `run`, in this process."""
+    """What the program does with these words, in this process."""
     out, err = io.StringIO(), io.StringIO()
     here = {**env, "MEMORY_BAG_DIR": str(bag_dir)}
     with patch.dict(os.environ, here, clear=True), redirect_stdout(out), redirect_stderr(err):
@@ -110,9 +92,9 @@ def run_here(env: dict[str, str], bag_dir: Path, *command: str) -> subprocess.Co
     return subprocess.CompletedProcess(command, code, out.getvalue(), err.getvalue())
 
 
-@pytest.mark.parametrize(("storage", "run"), [("mcap", run), ("rosbag2", run_here)])
+@pytest.mark.parametrize("storage", STORAGES)
 def test_no_command_that_only_looks_writes_beside_strangers_bags(
-    strangers: Path, tmp_path: Path, env: dict[str, str], storage: str, run: Run
+    strangers: Path, tmp_path: Path, env: dict[str, str], storage: str
 ) -> None:
     before = state(strangers)
     env = {**env, "MEMORY_CONFIG_OVERRIDES": f"storage={storage}"}
@@ -124,14 +106,18 @@ def test_no_command_that_only_looks_writes_beside_strangers_bags(
     assert [*(tmp_path / "cache").rglob(FILE)]
 
 
+async def asked_everything(served: Served) -> None:
+    async with Client(served.url("/mcp")) as client:
+        await ask_everything(client, of_several_robots=True)
+
+
 @pytest.mark.parametrize("storage", STORAGES)
 async def test_no_server_with_the_shipped_defaults_writes_beside_strangers_bags(
     strangers: Path, tmp_path: Path, env: dict[str, str], storage: str
 ) -> None:
     before = state(strangers)
     with serving(strangers, tmp_path / "log", f"storage={storage}", **env) as served:
-        async with Client(served.url("/mcp")) as client:
-            await ask_everything(client, of_several_robots=True)
+        await asked_everything(served)
         until(lambda: is_full(served))
         assert state(strangers) == before
     assert state(strangers) == before
@@ -159,7 +145,7 @@ def numbered(file: Path) -> dict[str, int]:
         return dict(base.execute("SELECT path, id FROM bag WHERE size >= 0").fetchall())
 
 
-async def test_when_a_recorder_comes_the_store_goes_beside_the_bags_with_all_it_holds(
+def test_when_a_recorder_comes_the_store_goes_beside_the_bags_with_all_it_holds(
     strangers: Path, tmp_path: Path, env: dict[str, str]
 ) -> None:
     beside = store_file(strangers)
@@ -172,8 +158,7 @@ async def test_when_a_recorder_comes_the_store_goes_beside_the_bags_with_all_it_
         until(lambda: str(beside) in moved_to(served))
         assert numbered(beside) == known
         assert times_stored(served) == len(known)
-        async with Client(served.url("/mcp")) as client:
-            await ask_everything(client, of_several_robots=True)
+        anyio.run(asked_everything, served)
         assert times_stored(served) == len(known)
     # Started where there is one already, it takes over what the cache holds just the same.
     shutil.rmtree(beside.parent)

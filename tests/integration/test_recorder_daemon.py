@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import signal
@@ -10,12 +11,13 @@ import subprocess
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
@@ -23,6 +25,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.recorder.__main__ import main
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
@@ -102,6 +105,13 @@ class Site:
             "PATH": f"{programs}:{os.environ['PATH']}",
             "STUB_PERIOD_MS": str(PERIOD_NS // 10**6),
         }
+        self.settings = (
+            f"recording.bag_dir={self.bag_dir}",
+            f"recording.topics_file={self.topics}",
+            "recording.split_duration_s=1",
+            "recording.session_duration_s=3600",
+            "retention.min_free_gb=0",
+        )
 
     def run(self, *overrides: str, wait: bool = True, **options: Any) -> Daemon:
         log = self.folder / f"log{len(self.daemons)}"
@@ -111,11 +121,7 @@ class Site:
                     sys.executable,
                     "-m",
                     "ros2_memory.recorder",
-                    f"recording.bag_dir={self.bag_dir}",
-                    f"recording.topics_file={self.topics}",
-                    "recording.split_duration_s=1",
-                    "recording.session_duration_s=3600",
-                    "retention.min_free_gb=0",
+                    *self.settings,
                     *overrides,
                 ],
                 env=self.env,
@@ -133,6 +139,16 @@ class Site:
         """Exit code and output of a daemon that does not begin."""
         daemon = self.run(*overrides, wait=False)
         return daemon.process.wait(PATIENCE_S), daemon.log.read_text()
+
+    def refusal_here(self, *overrides: str) -> tuple[object, str]:
+        """The same in this process, of one that is refused before it takes the lock."""
+        said = io.StringIO()
+        with patch.dict(os.environ, self.env, clear=True), redirect_stderr(said):
+            try:
+                code: object = main([*self.settings, *overrides])
+            except SystemExit as ended:
+                code = ended.code
+        return code, said.getvalue()
 
 
 @contextmanager
@@ -397,7 +413,7 @@ def test_old_bags_are_cleared_only_when_that_is_asked_for(site: Site) -> None:
 class TestRefusals:
     def test_an_invalid_topic_stops_it_with_exit_code_2(self, site: Site) -> None:
         site.topics.write_text("topics: [odom]\n")
-        code, message = site.refusal()
+        code, message = site.refusal_here()
         assert code == 2
         assert f"{site.topics}: 'odom' cannot be recorded" in message
 
@@ -406,14 +422,14 @@ class TestRefusals:
         old.parent.mkdir(parents=True)
         old.write_bytes(b"old")
         site.topics.write_text("topics: []\n")
-        code, _ = site.refusal("recording.clear_on_startup=true")
+        code, _ = site.refusal_here("recording.clear_on_startup=true")
         assert code == 2
         assert [path.name for path in site.bag_dir.rglob("*")] == ["rec_old", old.name]
 
     def test_nothing_is_written_where_clearing_is_refused(self, site: Site) -> None:
         site.bag_dir.mkdir(parents=True)
         site.env["HOME"] = str(site.bag_dir)
-        code, message = site.refusal("recording.clear_on_startup=true")
+        code, message = site.refusal_here("recording.clear_on_startup=true")
         assert code == 1
         assert "refuses to delete bags" in message
         assert list(site.bag_dir.iterdir()) == []
@@ -434,7 +450,7 @@ class TestRefusals:
 
     def test_a_bag_directory_that_cannot_be_made_is_named(self, site: Site) -> None:
         site.bag_dir.write_text("a file")
-        code, message = site.refusal()
+        code, message = site.refusal_here()
         assert code == 1
         assert "recording.bag_dir" in message
 
@@ -447,11 +463,11 @@ def test_recorder_none_says_so_and_touches_nothing(site: Site) -> None:
     site.bag_dir.mkdir()
     (site.bag_dir / "rec_0.mcap").write_bytes(b"kept")
     site.bag_dir.chmod(0o555)
-    before = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
-    code, message = site.refusal("recorder=none", "recording.clear_on_startup=true")
+    before = {path: path.stat() for path in site.folder.rglob("*")}
+    code, message = site.refusal_here("recorder=none", "recording.clear_on_startup=true")
     assert code == 0
     assert "recorder=none" in message
-    after = {path: path.stat() for path in site.folder.rglob("*") if path.name != "log0"}
+    after = {path: path.stat() for path in site.folder.rglob("*")}
     assert {p: s.st_mtime_ns for p, s in after.items() if p != site.folder} == {
         p: s.st_mtime_ns for p, s in before.items() if p != site.folder
     }
@@ -469,7 +485,7 @@ def test_recorder_none_names_what_set_it_and_is_no_failure_to_the_service_manage
             "MEMORY_DEPLOYMENT": "robot",
             "MEMORY_CONFIG_OVERRIDES": "recorder=none",
         }
-        code, message = site.refusal()
+        code, message = site.refusal_here()
         # An exit with 0 before it is ready would be a failure that is tried again for ever.
         assert (code, manager.recv(100)) == (0, b"READY=1")
     assert "set by MEMORY_CONFIG_OVERRIDES" in message

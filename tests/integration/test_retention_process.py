@@ -1,6 +1,6 @@
 """Retention while a recorder records and questions are asked; and none where nothing is recorded.
 
-30 splits; EPISODIC_LONG=1 makes it 200.
+20 splits; EPISODIC_LONG=1 makes it 200.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
 ROOT: Final = Path(__file__).resolve().parents[2]
-SPLITS: Final = 200 if LONG else 30
+SPLITS: Final = 200 if LONG else 20
 KEPT_SPLITS: Final = 6
 SLACK: Final = 8192
 """Bytes of the heartbeat, of metadata and of carried messages that are about to be counted."""

@@ -31,21 +31,6 @@ def bag_dir(tmp_path: Path) -> Path:
     return tmp_path / "bags"
 
 
-def refused(bag_dir: Path, **env: str) -> str:
-    """What a server says that does not start."""
-    ended = subprocess.run(
-        command("server.transport=sse", "server.port=0"),
-        env=environment(bag_dir, **env),
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=PATIENCE_S,
-    )
-    assert ended.returncode == 2
-    assert ended.stdout == ""
-    return ended.stderr
-
-
 def status(served: Served, method: str, path: str, headers: dict[str, str]) -> tuple[int, bytes]:
     connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=PATIENCE_S)
     try:
@@ -56,27 +41,19 @@ def status(served: Served, method: str, path: str, headers: dict[str, str]) -> t
         connection.close()
 
 
-@pytest.mark.parametrize("host", [EVERYWHERE, "::", "192.0.2.1"])
-def test_it_does_not_start_without_a_token_where_others_can_reach_it(
-    bag_dir: Path, host: str
-) -> None:
-    output = refused(bag_dir, MCP_HOST=host)
-    assert "MEMORY_API_TOKEN: missing" in output
-    assert repr(host) in output
-    assert len(output.splitlines()) == 2
-
-
-def test_it_does_not_start_with_one_that_is_empty_or_cannot_be_used(
-    bag_dir: Path, tmp_path: Path
-) -> None:
-    assert "missing" in refused(bag_dir, MCP_HOST=EVERYWHERE, MEMORY_API_TOKEN="")
-    for token in ("sEcReT7", "sEcReT7 sEcReT7 sEcReT7"):
-        output = refused(bag_dir, MEMORY_API_TOKEN=token)
-        assert output.splitlines()[1].startswith("MEMORY_API_TOKEN: the API token")
-        assert "sEcReT7" not in output
-    (tmp_path / "token").touch()
-    output = refused(bag_dir, MEMORY_API_TOKEN_FILE=str(tmp_path / "token"))
-    assert "is empty" in output
+def test_it_does_not_start_without_a_token_where_others_can_reach_it(bag_dir: Path) -> None:
+    ended = subprocess.run(
+        command("server.transport=sse", "server.port=0"),
+        env=environment(bag_dir, MCP_HOST=EVERYWHERE),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=PATIENCE_S,
+    )
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert "MEMORY_API_TOKEN: missing" in ended.stderr
+    assert repr(EVERYWHERE) in ended.stderr
+    assert len(ended.stderr.splitlines()) == 2
 
 
 async def test_whoever_shows_the_token_is_answered_and_nobody_else(

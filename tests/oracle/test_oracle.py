@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 pytestmark = pytest.mark.xdist_group("heavy")
 
-QUESTIONS: Final = 2000 if LONG else 50
+QUESTIONS: Final = 2000 if LONG else 25
 SEEDS: Final = range(5) if LONG else range(1)
 
 

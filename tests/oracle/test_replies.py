@@ -10,14 +10,11 @@ import pytest
 from tests.oracle.replies.comparison import Comparison, differing
 from tests.oracle.replies.fixture import Record, path_of
 from tests.oracle.replies.recording import compare, sample
-from tests.oracle.replies.robot_day import Rates, write_robot_day
 from tests.oracle.replies.worlds import WORLDS
 from tests.support.examples import LONG
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from pathlib import Path
-
 
 pytestmark = pytest.mark.xdist_group("heavy")
 
@@ -78,17 +75,6 @@ def test_the_sample_asks_every_tool_and_way_in_every_kind_of_world() -> None:
 
 def test_every_world_that_short_runs_ask_is_recorded() -> None:
     assert set(records()) >= {name for name, world in WORLDS.items() if not world.long}
-
-
-def test_a_world_that_is_made_twice_has_the_same_bytes(tmp_path: Path) -> None:
-    for name in ("one", "two"):
-        write_robot_day(tmp_path / name, 5, Rates(0.01, 5))
-    files = sorted(
-        path.relative_to(tmp_path / "one") for path in (tmp_path / "one").rglob("*.mcap")
-    )
-    assert len(files) == 4
-    for path in files:
-        assert (tmp_path / "one" / path).read_bytes() == (tmp_path / "two" / path).read_bytes()
 
 
 @pytest.mark.parametrize(

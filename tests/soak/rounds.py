@@ -22,11 +22,14 @@ SHORT: Final[tuple[Habit, ...]] = (
     clients.many_calls_at_once,
     clients.hostile,
     clients.too_large,
-    clients.never_reading,
     clients.leaving,
     clients.coming_and_going,
 )
-SLOW: Final[tuple[Habit, ...]] = (clients.slow_loris, clients.endless_bodies)
+SLOW: Final[tuple[Habit, ...]] = (
+    clients.slow_loris,
+    clients.endless_bodies,
+    clients.never_reading,
+)
 """What the server lets go on for seconds."""
 
 
@@ -60,7 +63,7 @@ async def soaked(
     slow: tuple[Habit, ...] = SLOW,
 ) -> Soak:
     """Runs rounds for so long, at least two after the first, which only warms the server up."""
-    await _round(served, Soak(served.held()), SHORT)
+    await _round(served, Soak(served.held()), (*SHORT, clients.never_reading))
     await clients.crowd(served.port)
     soak = Soak(await asyncio.to_thread(_settled, served))
     begun = time.monotonic()
@@ -73,7 +76,8 @@ async def soaked(
         if waited_for.done():
             await waited_for
             await _one(served, soak, clients.crowd)
-            waited_for = asyncio.ensure_future(_round(served, soak, slow))
+            if time.monotonic() - begun < seconds:
+                waited_for = asyncio.ensure_future(_round(served, soak, slow))
     await waited_for
     watch.cancel()
     soak.end = await asyncio.to_thread(served.came_back_to, soak.start)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from tests.soak.clients import slow_loris
+from tests.soak.clients import never_reading, slow_loris
 from tests.soak.rounds import SHORT, soaked
 from tests.soak.server import serving
 from tests.support.robot_run import write_run
@@ -13,6 +13,8 @@ from tests.timing import in_time
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+SLOW = (slow_loris, never_reading)
 
 SECONDS = 2.0
 """Of rounds, besides the one that warms the server up and the slow requests that it waits for."""
@@ -31,7 +33,7 @@ def test_bad_clients_leave_no_files_threads_or_memory_behind(tmp_path: Path) -> 
 
 def soak_once(tmp_path: Path) -> None:
     with serving(tmp_path / "bags", tmp_path / "log") as served:
-        soak = asyncio.run(soaked(served, SECONDS, slow=(slow_loris,)))
+        soak = asyncio.run(soaked(served, SECONDS, slow=SLOW))
         events = list(served.events())
     assert soak.end is not None
     assert soak.most is not None
@@ -39,6 +41,6 @@ def soak_once(tmp_path: Path) -> None:
     assert soak.end.threads <= soak.start.threads <= MOST_THREADS
     assert soak.growth_mb < GROWTH_MB
     assert soak.end.rss_mb - soak.start.rss_mb < GROWTH_MB
-    assert {habit.__name__ for habit in (*SHORT, slow_loris)} <= soak.seen.keys()
+    assert {habit.__name__ for habit in (*SHORT, *SLOW)} <= soak.seen.keys()
     assert [each for each in events if each.get("outcome") == "cancelled"]
     assert not [each for each in events if each["level"] in {"error", "critical"}]

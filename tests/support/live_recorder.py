@@ -348,7 +348,8 @@ def await_answerable(served: Served, moment: int) -> None:
 
 def await_moment(moment: int) -> None:
     """Returns at this moment (ns), or at once where it is past."""
-    wait_for(lambda: time.time_ns() >= moment, "a moment")
+    while (left_ns := moment - time.time_ns()) > 0:
+        time.sleep(left_ns / NS_PER_S)
 
 
 class Tick(NamedTuple):

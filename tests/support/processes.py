@@ -30,8 +30,13 @@ LONGEST_PAUSE_S: Final = 0.05
 """Between two looks at a condition that is waited for."""
 
 
-def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
+def until(what: Callable[[], T | None], name: str = "", *, timeout_s: float = PATIENCE_S) -> T:
     """The first result of `what` that is neither None nor False.
+
+    Args:
+        what: is asked again and again.
+        name: what the error calls it.
+        timeout_s: how long it may take.
 
     Raises:
         AssertionError: there was none within the timeout.
@@ -41,7 +46,7 @@ def until(what: Callable[[], T | None], *, timeout_s: float = PATIENCE_S) -> T:
         found = what()
         if found is not None and found is not False:
             return found
-        assert time.monotonic() < give_up, f"{what} did not come about within {timeout_s:g} s"
+        assert time.monotonic() < give_up, f"waited {timeout_s:g} s in vain for {name or what}"
         time.sleep(pause_s)
         # Asking takes processor time, often of the very program that is waited for.
         pause_s = min(1.2 * pause_s, LONGEST_PAUSE_S)

@@ -20,7 +20,6 @@ import os
 import signal
 import socket
 import subprocess
-import time
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import pairwise
@@ -31,7 +30,7 @@ import pytest
 
 from tests.support.bags import VISION_DEFINITIONS
 from tests.support.examples import LONG
-from tests.support.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import (
     RealRecorder,
     env_without_ros,
@@ -262,11 +261,14 @@ def wait_for(
     alive: subprocess.Popen[bytes] | None = None,
 ) -> None:
     """Returns once the condition holds; fails where it does not in time, or `alive` died."""
-    until = time.monotonic() + timeout_s
-    while not condition():
+
+    def holds() -> bool:
+        if condition():
+            return True
         assert alive is None or alive.poll() is None, f"it ended before {what}"
-        assert time.monotonic() < until, f"waited {timeout_s} s in vain for {what}"
-        time.sleep(0.02)
+        return False
+
+    until(holds, what, timeout_s=timeout_s)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
