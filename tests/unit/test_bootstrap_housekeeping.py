@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bootstrap import build_housekeeper, build_reader, build_repairer
+from ros2_memory.bootstrap import build_housekeeper, build_reader
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.recorder.housekeeping import Housekeeping
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import files_in
 
 if TYPE_CHECKING:
@@ -68,14 +68,3 @@ def test_age_deletes_nothing_where_the_clock_is_not_synchronised(
 
 def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:
     assert len(kept(tmp_path / "bags", "retention.max_total_gb=0.000001")) == 6
-
-
-def test_by_default_a_week_within_5_gb_is_kept(tmp_path: Path) -> None:
-    assert len(kept(tmp_path / "bags")) == 6
-
-
-def test_files_are_repaired_without_any_configuration(tmp_path: Path) -> None:
-    messages = [odom(n, 1.0, 2.0) for n in range(50)]
-    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=999, finish=False))
-    assert build_repairer().repair(path) is not None
-    assert build_repairer().is_whole(path)

@@ -31,13 +31,6 @@ def refusal(bag_dir: Path, patience_s: float = 0.0) -> str:
     return str(caught.value)
 
 
-def test_the_file_says_who_holds_it(tmp_path: Path) -> None:
-    lock = BagDirLock.acquire(tmp_path)
-    content = json.loads((tmp_path / LOCK_FILE).read_text())
-    assert content == {"pid": os.getpid(), "host": socket.gethostname()}
-    lock.release()
-
-
 def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Path) -> None:
     holder = {"pid": os.getppid(), "host": socket.gethostname()}
     descriptor = held_by(tmp_path, json.dumps(holder))
@@ -63,12 +56,6 @@ def test_the_child_of_a_recorder_that_died_is_waited_for_and_then_named(tmp_path
 
 def test_a_directory_that_cannot_be_written_into_is_refused_with_its_key(tmp_path: Path) -> None:
     assert "recording.bag_dir" in refusal(tmp_path / "nowhere")
-
-
-def test_the_lock_is_not_inherited_unless_it_is_handed_on(tmp_path: Path) -> None:
-    lock = BagDirLock.acquire(tmp_path)
-    assert not os.get_inheritable(lock.descriptor)
-    lock.release()
 
 
 def test_a_full_disk_keeps_nobody_from_taking_it(

@@ -82,15 +82,6 @@ class TestWhatARecorderLists:
         assert OwnRecordings(tmp_path).owns(recorder.directory)
         world.supervisor.stop()
 
-    def test_the_list_is_not_written_through_a_link(self, tmp_path: Path) -> None:
-        (tmp_path / "elsewhere").mkdir()
-        bags = tmp_path / "bags"
-        bags.mkdir()
-        (bags / ".episodic").symlink_to(tmp_path / "elsewhere")
-        with pytest.raises(RecorderError, match="symbolic link"):
-            OwnRecordings(bags).begin(A)
-        assert [*(tmp_path / "elsewhere").iterdir()] == []
-
     def test_a_list_that_is_deleted_while_recording_is_written_again_whole(
         self, tmp_path: Path
     ) -> None:

@@ -101,13 +101,6 @@ def test_it_asks_before(
     assert len(bags(bag_dir)) == left_over
 
 
-def test_a_recording_without_a_bag_goes_too(bag_dir: Path, forget: Forget) -> None:
-    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    forget(0, 40, 75, "--yes")
-    assert not (bag_dir / "rec_1").exists()
-    assert (bag_dir / "rec_0").is_dir()
-
-
 def test_latched_messages_that_later_answers_need_are_carried_on(
     bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
@@ -130,15 +123,6 @@ def test_beside_a_recorder_bags_with_latched_messages_are_kept(
         lock.release()
     assert bags(bag_dir) == ["rec_0.mcap", "rec_2.mcap", "rec_3.mcap"]
     assert "stop the recorder, and forget again" in shown
-
-
-def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, forget: Forget) -> None:
-    start = T0 + 80 * NS_PER_S
-    path = bag_dir / "rec_1" / "rec_4.mcap"
-    write_mcap(path, [odom(start, 0.0, 0.0)], McapLayout(finish=False, chunk_size=10))
-    shown = forget(1, 60, 100, "--yes").out
-    assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_2.mcap", "rec_4.mcap"]
-    assert "rec_4.mcap" in shown
 
 
 def test_a_bag_with_another_name_is_reported(bag_dir: Path, forget: Forget) -> None:

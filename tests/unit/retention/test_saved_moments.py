@@ -18,7 +18,6 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
 )
 from ros2_memory.retention import saved_moments
-from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import (
     LONGEST_WAIT_NS,
     Share,
@@ -326,18 +325,6 @@ class TestCrashes:
 
 
 class TestOthers:
-    def test_a_wipe_takes_moments_too_and_leaves_what_is_not_of_them(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 15, 25, "two")
-        mine = min((tmp_path / "moments").iterdir()) / "notes.txt"
-        mine.write_text("why this matters")
-        assert clear_bags(tmp_path).faults == []
-        assert mine.exists()
-        assert list(tmp_path.rglob("*.mcap")) == []
-        assert [path.name for path in (tmp_path / "moments").iterdir()] == [mine.parent.name]
-
     def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
         """It would be written anew, and be another file than the one that it was linked to."""
         recording(tmp_path, A, 0, splits=1)
