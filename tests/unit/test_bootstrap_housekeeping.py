@@ -50,20 +50,13 @@ def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
 
 
-def test_the_age_of_the_configuration_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("synchronised", "bags"), [("yes", 3), ("no", 5)])
+def test_the_age_of_the_configuration_is_kept_where_the_clock_is_synchronised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synchronised: str, bags: int
 ) -> None:
-    with_timedatectl(monkeypatch, tmp_path / "bin", "yes")
+    with_timedatectl(monkeypatch, tmp_path / "bin", synchronised)
     left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
-    assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap", "rec/h2.mcap"]
-
-
-def test_age_deletes_nothing_where_the_clock_is_not_synchronised(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_timedatectl(monkeypatch, tmp_path / "bin", "no")
-    left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
-    assert len(left) == 6
+    assert left == ["rec", *(f"rec/h{ago}.mcap" for ago in range(bags))]
 
 
 def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:
