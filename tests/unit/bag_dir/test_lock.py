@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.errors import RecorderError
 from tests.faults.small_disk import needs_mounts, small_disk
+from tests.support.fakes import failing
 
 
 def held_by(bag_dir: Path, text: str) -> int:
@@ -61,10 +62,7 @@ def test_a_directory_that_cannot_be_written_into_is_refused_with_its_key(tmp_pat
 def test_a_full_disk_keeps_nobody_from_taking_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_descriptor: int, _data: bytes, _offset: int) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "pwrite", full)
+    monkeypatch.setattr(os, "pwrite", failing())
     lock = BagDirLock.acquire(tmp_path)
     assert "left no name" in refusal(tmp_path)
     lock.release()
@@ -109,11 +107,8 @@ class TestRenewal:
     ) -> None:
         lock = BagDirLock.acquire(tmp_path)
 
-        def fails(_path: Path, **_: object) -> os.stat_result:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
         with monkeypatch.context() as disk:
-            disk.setattr(os, "stat", fails)
+            disk.setattr(os, "stat", failing(errno.EIO))
             assert not lock.renew()
         assert f"process {os.getpid()} on" in refusal(tmp_path)
         lock.release()

@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder import sessions
-from ros2_memory.storage.base import Closing
+from tests.support.fakes import failing
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
     World,
@@ -187,10 +187,7 @@ class TestFailingDisk:
     ) -> None:
         world = World(tmp_path).started(3)
 
-        def fails(_path: Path) -> Closing:
-            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-
-        monkeypatch.setattr(world.reader, "closing", fails)
+        monkeypatch.setattr(world.reader, "closing", failing(errno.ESTALE))
         world.recorders[0].die()
         with capture_logs() as logs:
             world.run(6)
@@ -203,10 +200,7 @@ class TestFailingDisk:
         keeper = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=keeper).started(3)
 
-        def fails() -> list[str]:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-        monkeypatch.setattr(world.recorders[0], "take_lines", fails)
+        monkeypatch.setattr(world.recorders[0], "take_lines", failing(errno.EIO))
         [reported] = world.logged(30, "supervision_failed")
         assert (reported["task"], reported["reason"]) == ("look", "[Errno 5] Input/output error")
         world.run(40)

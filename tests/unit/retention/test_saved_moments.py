@@ -24,6 +24,7 @@ from ros2_memory.retention.saved_moments import (
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import (
     NOW,
     T0,
@@ -125,10 +126,7 @@ class TestKeeping:
     ) -> None:
         recording(tmp_path, A, 0)
 
-        def refuse(*_args: object, **_options: object) -> None:
-            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
-
-        monkeypatch.setattr(os, "link", refuse)
+        monkeypatch.setattr(os, "link", failing(errno.EPERM))
         outcome = kept(house_of(tmp_path), tmp_path, 15, 25)
         assert outcome.refused is not None
         assert "by hard links: Operation not permitted" in outcome.refused
@@ -227,11 +225,8 @@ class TestOpenBags:
         kept(house, tmp_path, 0, 25, at=clock.at)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
 
-        def full(*_: object, **__: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-            patched.setattr(os, "link", full)
+            patched.setattr(os, "link", failing())
             for second in (26, 86):
                 clock.at = T0 + second * S
                 house.keep_moments()

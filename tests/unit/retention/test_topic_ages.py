@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 from collections import Counter
 from collections.abc import Callable
@@ -35,6 +34,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import HOUR, Direct, own_all
 from tests.support.memories import reply_over
 
@@ -278,12 +278,9 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
     receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
     append_receipts(bag_dir, [receipt])
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
     with monkeypatch.context() as patched:
-        patched.setattr(owner, name, full)
+        patched.setattr(owner, name, failing())
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert counts_of(path)["/speech"] == 10
     assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()
