@@ -132,7 +132,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     }
 
 
-LINKS = {
+LINKS: dict[str, Any] = {
     "a file": lambda bags, rec: (bags / "run/x.mcap").symlink_to(rec / "rec_0.mcap"),
     "a db3 file": lambda bags, rec: (bags / "x.db3").symlink_to(rec / "rec_1.db3"),
     "a directory": lambda bags, rec: (bags / "rec").symlink_to(rec),

@@ -196,7 +196,11 @@ async def test_other_sites_and_malformed_origins_are_refused(origin: str) -> Non
 
 @pytest.mark.parametrize("site", ["cross-site", "same-site", "", "other", "none, cross-site"])
 async def test_requests_that_another_site_is_behind_are_refused(site: str) -> None:
-    kinds = ({}, {"sec-fetch-mode": "no-cors"}, {**VISIT, "sec-fetch-dest": "iframe"})
+    kinds: tuple[dict[str, str], ...] = (
+        {},
+        {"sec-fetch-mode": "no-cors"},
+        {**VISIT, "sec-fetch-dest": "iframe"},
+    )
     async with client(app()) as http:
         for method, path, more in product(("GET", "POST", "HEAD", "OPTIONS"), PATHS, kinds):
             headers = {"sec-fetch-site": site, **more}

@@ -30,7 +30,6 @@ from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FI
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import read_superseded, read_thinned
 from ros2_memory.bootstrap import build_memory
-from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
@@ -63,7 +62,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, Direct, own_all
-from tests.support.memories import reply_over, shipped_extractor
+from tests.support.memories import reply_over, shipped_extractor, shipped_settings
 from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
 
@@ -853,8 +852,7 @@ def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
     split(bag_dir, 0)
     keep_all(bag_dir)
     shutil.rmtree(bag_dir / "rec_A")
-    words = [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"]
-    memory = build_memory(load_settings(words, env={}))
+    memory = build_memory(shipped_settings(bag_dir))
     shown = span_shown(memory, Call(), span_request(QueryParams("last=1000")))
     [[first, last]] = json.loads(to_json_text(shown))["range"]["thinned"]
     assert (first, last) == pytest.approx((T0 / S, T0 / S + 60), abs=1.0)
