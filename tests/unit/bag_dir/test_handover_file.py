@@ -70,6 +70,20 @@ class TestCounting:
         assert not excluded(old, "a_9.mcap", 0, 49)
         assert excluded(old, "a_9.mcap", 0, 50)
 
+    @given(
+        cut=st.integers(0, 100),
+        publish_time=st.integers(1, 100),
+        log_times=st.tuples(st.integers(0, 100), st.integers(0, 100)),
+    )
+    def test_in_the_overlap_a_message_counts_in_exactly_one_of_the_two(
+        self, cut: int, publish_time: int, log_times: tuple[int, int]
+    ) -> None:
+        old = Handover(next="b", counts_until=cut, end=Overlap(0, 101, ("a_9.mcap",)))
+        new = Handover(previous="a", counts_from=cut, begin=Overlap(0, 101, ("b_0.mcap",)))
+        in_old = not excluded(old, "a_9.mcap", publish_time, log_times[0])
+        in_new = not excluded(new, "b_0.mcap", publish_time, log_times[1])
+        assert in_old != in_new
+
 
 class TestFile:
     @given(handover=HANDOVERS)
