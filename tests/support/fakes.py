@@ -1,13 +1,15 @@
-"""A disk that takes no more."""
+"""Disks that take no more, or fail."""
 
 from __future__ import annotations
 
+import errno
+import os
 import resource
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Never
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 @contextmanager
@@ -19,3 +21,12 @@ def files_limited_to(size: int) -> Iterator[None]:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def failing(number: int = errno.ENOSPC) -> Callable[..., Never]:
+    """What stands for a function of the system: a full disk, unless another error is given."""
+
+    def fails(*_: object, **__: object) -> Never:
+        raise OSError(number, os.strerror(number))
+
+    return fails

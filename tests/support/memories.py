@@ -18,7 +18,7 @@ from ros2_memory.bootstrap import build_dispatcher, build_memory
 from ros2_memory.columns.fill import Batch, Filling, StoreLimits
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
-from ros2_memory.config import load_settings
+from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.extract import SchemaExtractor
@@ -179,10 +179,15 @@ def replied(
     return replies.answer(answer, from_active=call.used_active)
 
 
+@cache
+def shipped_settings(bag_dir: Path) -> Settings:
+    """Of a server over these bags; composing them takes longer than most replies do."""
+    words = [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"]
+    return load_settings(words, env={})
+
+
 def reply_over(bag_dir: Path, tool: str, **arguments: Any) -> Any:
     """What a server over the shipped configuration replies."""
-    settings = load_settings(
-        [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"], env={}
-    )
+    settings = shipped_settings(bag_dir)
     dispatcher = build_dispatcher(settings, build_memory(settings))
     return json.loads(asyncio.run(dispatcher.answer(tool, arguments)).text)

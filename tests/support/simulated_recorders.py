@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import yaml
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
@@ -163,12 +164,14 @@ class World:
         required: Sequence[Required] = (),
         keep_alive: Callable[[], None] | None = None,
         background: Background | None = None,
+        silent: bool = False,
+        defaults: dict[str, object] | None = None,
         **orders: object,
     ) -> None:
         self.bag_dir = bag_dir
         self.mono = 1_000.0
         self.wall = T0
-        self.silent = False
+        self.silent = silent
         self.disk_full = False
         self.free = 10**12
         self.unmeasurable_after = 10**9
@@ -178,7 +181,7 @@ class World:
         self.before_start: Callable[[Path], object] = bool
         self.recorders: list[PlayedRecorder] = []
         self.named_at_start: list[list[str]] = []
-        self.defaults: dict[str, object] = {}
+        self.defaults = defaults or {}
         plan: dict[str, object] = {
             "bag_dir": bag_dir,
             "split_duration_s": 5,
@@ -250,6 +253,12 @@ class World:
                 for recorder in self.recorders:
                     recorder.receive(published)
             self.supervisor.tick()
+
+    def logged(self, seconds: float, event: str) -> list[MutableMapping[str, Any]]:
+        """Lets time pass; returns what is logged under this name meanwhile."""
+        with capture_logs() as logs:
+            self.run(seconds)
+        return events(logs, event)
 
     def set_clock(self, seconds: float) -> None:
         """Steps the wall clock."""

@@ -9,7 +9,6 @@ from ros2_memory.bootstrap import (
     build_memory,
     column_paths,
 )
-from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.columns.store import FILE
 from ros2_memory.config import load_settings
 from tests.support.bags import odom, write_mcap
@@ -53,21 +52,3 @@ def test_a_memory_stores_columns_unless_it_is_told_not_to(
     assert memory.columns.store is not None
     assert memory.columns.store.path is not None
     assert memory.columns.store.path.is_relative_to(tmp_path / "cache")
-
-
-def test_index_stores_the_columns_of_every_bag(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for number in range(3):
-        write_mcap(tmp_path / "rec" / f"rec_{number}.mcap", [odom(T0 + number, 1.0, 2.0)])
-    recorded_before(tmp_path)
-    given = {"MEMORY_BAG_DIR": str(tmp_path), "MEMORY_DEPLOYMENT": "robot"}
-    settings = load_settings([], given)
-    memory = build_memory(settings)
-    backfill = build_backfill(settings, memory)
-    monkeypatch.setattr("ros2_memory.index.scan.YOUNG_NS", 0)
-    fill_store(backfill)
-    assert backfill.waiting() == []
-    assert memory.columns is not None
-    assert memory.columns.store is not None
-    assert len(memory.columns.store.paths()) == 3

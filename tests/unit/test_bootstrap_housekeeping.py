@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bootstrap import build_housekeeper, build_reader, build_repairer
+from ros2_memory.bootstrap import build_housekeeper, build_reader
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
 from ros2_memory.recorder.housekeeping import Housekeeping
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import files_in
 
 if TYPE_CHECKING:
@@ -50,32 +50,14 @@ def test_the_budget_of_the_configuration_is_kept(tmp_path: Path) -> None:
     assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap"]
 
 
-def test_the_age_of_the_configuration_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(("synchronised", "bags"), [("yes", 3), ("no", 5)])
+def test_the_age_of_the_configuration_is_kept_where_the_clock_is_synchronised(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, synchronised: str, bags: int
 ) -> None:
-    with_timedatectl(monkeypatch, tmp_path / "bin", "yes")
+    with_timedatectl(monkeypatch, tmp_path / "bin", synchronised)
     left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
-    assert left == ["rec", "rec/h0.mcap", "rec/h1.mcap", "rec/h2.mcap"]
-
-
-def test_age_deletes_nothing_where_the_clock_is_not_synchronised(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with_timedatectl(monkeypatch, tmp_path / "bin", "no")
-    left = kept(tmp_path / "bags", "retention.max_age_h=2.5", "retention.foreign=delete")
-    assert len(left) == 6
+    assert left == ["rec", *(f"rec/h{ago}.mcap" for ago in range(bags))]
 
 
 def test_by_default_bags_of_other_programs_are_kept(tmp_path: Path) -> None:
     assert len(kept(tmp_path / "bags", "retention.max_total_gb=0.000001")) == 6
-
-
-def test_by_default_a_week_within_5_gb_is_kept(tmp_path: Path) -> None:
-    assert len(kept(tmp_path / "bags")) == 6
-
-
-def test_files_are_repaired_without_any_configuration(tmp_path: Path) -> None:
-    messages = [odom(n, 1.0, 2.0) for n in range(50)]
-    path = write_mcap(tmp_path / "a.mcap", messages, McapLayout(chunk_size=999, finish=False))
-    assert build_repairer().repair(path) is not None
-    assert build_repairer().is_whole(path)

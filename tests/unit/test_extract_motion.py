@@ -10,20 +10,7 @@ import pytest
 
 from ros2_memory.core.model import Pose, Twist
 from tests.support import bags
-from tests.support.memories import shipped_extractor
-
-EXTRACTOR = shipped_extractor()
-ODOMETRY = "nav_msgs/msg/Odometry"
-NS = 1_752_500_000_123_456_789
-
-
-def odometry() -> object:
-    return decoded(bags.odom(NS, 1.23456, -2.0, 0.5, vx=0.3, wz=0.1))
-
-
-def decoded(message: bags.Msg) -> object:
-    """The message as a reader gives it: through its bytes."""
-    return bags.typestore().deserialize_cdr(message.payload, message.type)
+from tests.unit.test_extract import EXTRACTOR, NS, ODOMETRY, decoded, odometry
 
 
 def quaternion(x: float, y: float, z: float, w: float) -> object:

@@ -61,13 +61,6 @@ def bumps(memory: Memory) -> int:
     return next(row.count for row in rows if row.topic == "/bumper")
 
 
-def test_the_cut_counts_where_nothing_else_tells_copies_apart(tmp_path: Path) -> None:
-    taken_over(tmp_path, same_clock=True)
-    assert bumps(counting(tmp_path)) == 48
-    cut(tmp_path, T0 + 8 * S)
-    assert bumps(counting(tmp_path)) == 40
-
-
 def test_a_recording_whose_handover_is_under_way_does_not_count_yet(tmp_path: Path) -> None:
     taken_over(tmp_path)
     write_handover(tmp_path / "b", Handover(state=Counting.PENDING, previous="a"))

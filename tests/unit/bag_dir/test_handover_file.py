@@ -100,6 +100,7 @@ class TestFile:
             ({"format": 2}, "format is 2"),
             ({"state": "maybe"}, "state: Input should be 'counts', 'pending' or 'void'"),
             ({"previous": "../elsewhere"}, "previous: Value error, it must be the name of"),
+            *(({"next": name}, "name of a recording") for name in ("..", ".", "/etc", "")),
             ({"counts_from_ns": True}, "counts_from_ns: Input should be a valid integer"),
             ({"counts_until_ns": 2**63}, "counts_until_ns: Input should be less than"),
             ({"begin": []}, "begin: Input should be a dictionary"),

@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.core.errors import RecorderError
 from tests.faults.small_disk import needs_mounts, small_disk
+from tests.support.fakes import failing
 
 
 def held_by(bag_dir: Path, text: str) -> int:
@@ -29,13 +30,6 @@ def refusal(bag_dir: Path, patience_s: float = 0.0) -> str:
     with pytest.raises(RecorderError) as caught:
         BagDirLock.acquire(bag_dir, patience_s)
     return str(caught.value)
-
-
-def test_the_file_says_who_holds_it(tmp_path: Path) -> None:
-    lock = BagDirLock.acquire(tmp_path)
-    content = json.loads((tmp_path / LOCK_FILE).read_text())
-    assert content == {"pid": os.getpid(), "host": socket.gethostname()}
-    lock.release()
 
 
 def test_a_second_recorder_is_refused_at_once_and_told_who_holds_it(tmp_path: Path) -> None:
@@ -65,19 +59,10 @@ def test_a_directory_that_cannot_be_written_into_is_refused_with_its_key(tmp_pat
     assert "recording.bag_dir" in refusal(tmp_path / "nowhere")
 
 
-def test_the_lock_is_not_inherited_unless_it_is_handed_on(tmp_path: Path) -> None:
-    lock = BagDirLock.acquire(tmp_path)
-    assert not os.get_inheritable(lock.descriptor)
-    lock.release()
-
-
 def test_a_full_disk_keeps_nobody_from_taking_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_descriptor: int, _data: bytes, _offset: int) -> int:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(os, "pwrite", full)
+    monkeypatch.setattr(os, "pwrite", failing())
     lock = BagDirLock.acquire(tmp_path)
     assert "left no name" in refusal(tmp_path)
     lock.release()
@@ -122,11 +107,8 @@ class TestRenewal:
     ) -> None:
         lock = BagDirLock.acquire(tmp_path)
 
-        def fails(_path: Path, **_: object) -> os.stat_result:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
         with monkeypatch.context() as disk:
-            disk.setattr(os, "stat", fails)
+            disk.setattr(os, "stat", failing(errno.EIO))
             assert not lock.renew()
         assert f"process {os.getpid()} on" in refusal(tmp_path)
         lock.release()

@@ -16,6 +16,7 @@ from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import Counting, Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import OWN_FOLDER
 from ros2_memory.bag_dir.lock import BagDirLock
+from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.columns.store import CATALOGUE, FILE
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     Forget = Callable[..., Printed]
 
 T0 = 1_700_000_000 * NS_PER_S
-Capture = pytest.CaptureFixture[str]
 
 
 @pytest.fixture
@@ -101,13 +101,6 @@ def test_it_asks_before(
     assert len(bags(bag_dir)) == left_over
 
 
-def test_a_recording_without_a_bag_goes_too(bag_dir: Path, forget: Forget) -> None:
-    (bag_dir / "rec_1" / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    forget(0, 40, 75, "--yes")
-    assert not (bag_dir / "rec_1").exists()
-    assert (bag_dir / "rec_0").is_dir()
-
-
 def test_latched_messages_that_later_answers_need_are_carried_on(
     bag_dir: Path, forget: Forget, exits: Program
 ) -> None:
@@ -130,15 +123,6 @@ def test_beside_a_recorder_bags_with_latched_messages_are_kept(
         lock.release()
     assert bags(bag_dir) == ["rec_0.mcap", "rec_2.mcap", "rec_3.mcap"]
     assert "stop the recorder, and forget again" in shown
-
-
-def test_a_bag_that_is_being_written_is_kept(bag_dir: Path, forget: Forget) -> None:
-    start = T0 + 80 * NS_PER_S
-    path = bag_dir / "rec_1" / "rec_4.mcap"
-    write_mcap(path, [odom(start, 0.0, 0.0)], McapLayout(finish=False, chunk_size=10))
-    shown = forget(1, 60, 100, "--yes").out
-    assert bags(bag_dir) == ["rec_0.mcap", "rec_1.mcap", "rec_2.mcap", "rec_4.mcap"]
-    assert "rec_4.mcap" in shown
 
 
 def test_a_bag_with_another_name_is_reported(bag_dir: Path, forget: Forget) -> None:
@@ -367,31 +351,13 @@ class TestMetadata:
     @pytest.fixture
     def metadata(self, bag_dir: Path) -> Path:
         """That of the first recording, as its recorder would have left it."""
-        starts = [T0, T0 + 20 * NS_PER_S]
-        counts = {"/odom": 20, "/chatter": 2, "/tf_static": 1}
-        info = {
-            "version": 5,
-            "storage_identifier": "mcap",
-            "duration": {"nanoseconds": 29 * NS_PER_S},
-            "starting_time": {"nanoseconds_since_epoch": T0},
-            "message_count": 23,
-            "topics_with_message_count": [
-                {"topic_metadata": {"name": name}, "message_count": count}
-                for name, count in counts.items()
-            ],
-            "relative_file_paths": ["rec_0.mcap", "rec_1.mcap"],
-            "files": [
-                {
-                    "path": f"rec_{number}.mcap",
-                    "starting_time": {"nanoseconds_since_epoch": start},
-                    "duration": {"nanoseconds": 9 * NS_PER_S},
-                    "message_count": 12 - number,
-                }
-                for number, start in enumerate(starts)
-            ],
+        reader, recording = McapReader(), bag_dir / "rec_0"
+        contents = {
+            each.name: Contents(reader.summarize(each), reader.channels(each))
+            for each in sorted(recording.glob("*.mcap"))
         }
-        path = bag_dir / "rec_0" / "metadata.yaml"
-        path.write_text(yaml.safe_dump({"rosbag2_bagfile_information": info}))
+        path = recording / "metadata.yaml"
+        path.write_text(describing("", contents))
         return path
 
     def test_it_lists_what_is_left(self, metadata: Path, forget: Forget) -> None:

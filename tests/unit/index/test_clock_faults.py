@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -51,22 +52,23 @@ def span(found: Dating) -> tuple[int | None, int | None]:
     return found.earliest, found.latest
 
 
-def test_time_0_and_1970_are_clocks_that_were_not_set() -> None:
-    found = dating(*GOOD, bag("zero", 0), bag("boot", 40 * S))
+@pytest.mark.parametrize(
+    ("wrong", "kind"),
+    [
+        (bag("zero", 0), FaultyClock.UNSET),
+        (bag("boot", 40 * S), FaultyClock.UNSET),
+        (bag("set within it", 20 * S, NOW - HOUR), FaultyClock.UNSET),
+        (bag("after now", NOW + DAY), FaultyClock.AHEAD),
+        (bag("max", NOW - HOUR, MAX_NS), FaultyClock.AHEAD),
+    ],
+    ids=lambda each: each.path.name if isinstance(each, BagFile) else "",
+)
+def test_a_bag_of_a_wrong_clock_is_named_and_does_not_stretch_the_span(
+    wrong: BagFile, kind: FaultyClock
+) -> None:
+    found = dating(*GOOD, wrong)
     assert span(found) == SPAN
-    assert kinds(found) == {"zero": FaultyClock.UNSET, "boot": FaultyClock.UNSET}
-
-
-def test_a_clock_that_was_set_within_a_bag_does_not_stretch_the_span() -> None:
-    found = dating(*GOOD, bag("across", 20 * S, NOW - HOUR))
-    assert span(found) == SPAN
-    assert kinds(found) == {"across": FaultyClock.UNSET}
-
-
-def test_what_is_dated_after_now_was_recorded_by_a_clock_that_was_ahead() -> None:
-    found = dating(*GOOD, bag("ahead", NOW + DAY), bag("max", NOW - HOUR, MAX_NS))
-    assert span(found) == SPAN
-    assert kinds(found) == {"ahead": FaultyClock.AHEAD, "max": FaultyClock.AHEAD}
+    assert kinds(found) == {wrong.path.name: kind}
 
 
 def test_where_all_bags_are_in_the_future_this_machines_clock_may_be_behind() -> None:

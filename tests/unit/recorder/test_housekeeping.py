@@ -351,17 +351,6 @@ class TestMakingRoom:
 
 
 class TestInTheBackground:
-    def test_what_is_under_way_ends_before_the_recorder_does(self, tmp_path: Path) -> None:
-        paths, finishing = recording(tmp_path, "a", 0), threading.Event()
-        keeper = background_keeper_of(
-            tmp_path, measure_free=lambda _: 0 if finishing.wait(30) else PLENTY
-        )
-        keeper.make_room(1)
-        finishing.set()
-        keeper.finish()
-        assert not keeper.is_making_room()
-        assert not paths[0].exists()
-
     def test_room_is_made_while_the_caller_goes_on(self, tmp_path: Path) -> None:
         first, *_ = recording(tmp_path, "a", 0)
         held, asked = threading.Event(), []
@@ -376,7 +365,7 @@ class TestInTheBackground:
         assert keeper.is_making_room()
         assert first.exists()
         held.set()
-        keeper.wait()
+        keeper.finish()
         assert not keeper.is_making_room()
         assert not first.exists()
         assert all(asked)
@@ -469,16 +458,10 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
 def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
     (tmp_path / OWN).mkdir()
     (tmp_path / OWN / f"{OWN}_0.mcap").write_bytes(b"")
+    (tmp_path / OWN / "metadata.yaml").touch()
     (tmp_path / OWN / "handover.json").write_text("{}")
     keeper_of(tmp_path).repair()
     assert files_in(tmp_path) == []
-
-
-def test_what_a_repair_left_that_was_cut_short_goes(tmp_path: Path) -> None:
-    left_open(tmp_path / OWN / f"{OWN}_0.mcap")
-    (tmp_path / OWN / f".{OWN}_0.mcap.repair").write_bytes(b"half")
-    keeper_of(tmp_path).repair()
-    assert files_in(tmp_path) == [OWN, f"{OWN}/{OWN}_0.mcap"]
 
 
 def test_a_recording_of_another_is_left_alone_until_it_lay_still(tmp_path: Path) -> None:

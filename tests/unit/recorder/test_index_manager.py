@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.model import BagFile, BagState, SetAside
-from ros2_memory.core.timebase import Clock
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from tests.support.clocks import SettableClock
+from tests.support.housekeepers import recording_now
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
@@ -26,28 +26,15 @@ NOW = 1_800_000_000 * S
 LONG_AGO = NOW - 3600 * S
 
 
-class HandClock(Clock):
-    """A clock that stands still until a test moves it."""
-
-    def __init__(self, at: int = NOW) -> None:
-        self.at = at
-
-    def now(self) -> int:
-        return self.at
-
-
 class Yard:
     """A bag directory, its index, and a hand on the clock and on every mtime."""
 
     def __init__(self, bag_dir: Path, *kinds: str) -> None:
         self.bag_dir = bag_dir
-        self.clock = HandClock()
+        self.clock = SettableClock(NOW)
         self.reader = PlainReader(*kinds)
-        self.index = self.fresh_index()
-
-    def fresh_index(self) -> IndexManager:
-        return IndexManager(
-            self.bag_dir, self.reader, self.clock, refresh_s=5.0, split_duration_s=10.0
+        self.index = IndexManager(
+            bag_dir, self.reader, self.clock, refresh_s=5.0, split_duration_s=10.0
         )
 
     def age(self, at: int = LONG_AGO) -> None:
@@ -68,12 +55,6 @@ def yard(tmp_path: Path) -> Yard:
 
 def _names(files: Iterable[BagFile | SetAside]) -> list[str]:
     return [each.path.name for each in files]
-
-
-def _beat(*recordings: str, updated: int = NOW) -> Heartbeat:
-    return Heartbeat(
-        1, updated, RecorderState.RECORDING, recordings, updated, 0, (), (), None, interval_s=2.0
-    )
 
 
 def test_everything_that_does_not_answer_is_set_aside_where_it_belongs(yard: Yard) -> None:
@@ -112,23 +93,17 @@ def test_the_active_bag_stays_out_until_it_is_closed_in_place(yard: Yard) -> Non
     assert [(bag.start, bag.end) for bag in snapshot.bags] == [(1, 3)]
 
 
-def test_at_a_rotation_there_are_two_active_bags(yard: Yard) -> None:
+def test_at_a_rotation_two_bags_are_active_until_the_heartbeat_dies(yard: Yard) -> None:
     for name in ("rec_1", "rec_2", "rec_0"):
         plain(yard.bag_dir / name / f"{name}_0.mcap", [1], closed=False)
     yard.age()
-    write_heartbeat(yard.bag_dir, _beat("rec_1", "rec_2"))
-    snapshot = yard.scan_after()
-    assert _names(snapshot.active) == ["rec_1_0.mcap", "rec_2_0.mcap"]
-    assert _names(snapshot.bags) == ["rec_0_0.mcap"]
-
-
-def test_when_the_heartbeat_dies_a_still_bag_is_served_as_incomplete(yard: Yard) -> None:
-    plain(yard.bag_dir / "rec" / "rec_0.mcap", [1], closed=False)
-    yard.age()
-    write_heartbeat(yard.bag_dir, _beat("rec"))
-    assert yard.scan_after(15).bags == ()
-    (bag,) = yard.scan_after(1).bags
-    assert bag.state is BagState.INCOMPLETE
+    recording_now(yard.bag_dir, "rec_1", "rec_2", clock=yard.clock)
+    for seconds in (0, 15):
+        snapshot = yard.scan_after(seconds)
+        assert _names(snapshot.active) == ["rec_1_0.mcap", "rec_2_0.mcap"]
+        assert _names(snapshot.bags) == ["rec_0_0.mcap"]
+    assert {bag.state for bag in yard.scan_after(1).bags} == {BagState.INCOMPLETE}
+    assert len(yard.index.snapshot().bags) == 3
 
 
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,6 +15,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.screening import Screening
 from tests.support.bags import McapLayout
+from tests.support.fakes import failing
 from tests.support.housekeepers import background_keeper_of, keeper_of, recording_now
 from tests.support.memories import shipped_extractor
 from tests.support.screened_bags import T0, S, ScreenedBags, mode, privacy, words
@@ -72,13 +72,10 @@ class TestSessions:
     def test_a_recording_that_cannot_be_held_back_does_not_begin(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def full(*_: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         house = keeper_of(tmp_path, screening=screening_of(tmp_path, privacy()))
         world = World(tmp_path, housekeeper=house, session_duration_s=20).started(15)
         with monkeypatch.context() as patched:
-            patched.setattr(SCREENED, "write", full)
+            patched.setattr(SCREENED, "write", failing())
             world.run(15)
             assert len(world.recorders) == 1
             assert "screened.json: No space left" in world.heartbeat()["last_error"]
@@ -104,10 +101,7 @@ class TestTheHouse:
     def test_the_budget_may_delete_what_is_held_back_in_a_recording_that_ended(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        def full(*_: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
-        monkeypatch.setattr(McapWriter, "cut", full)
+        monkeypatch.setattr(McapWriter, "cut", failing())
         bags = ScreenedBags(tmp_path / "bags")
         name = bags.begin(0)
         held = bags.split(name, [mode(0, value=True), *words(0, 10)])

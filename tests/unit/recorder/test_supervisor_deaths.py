@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder import sessions
-from ros2_memory.storage.base import Closing
+from tests.support.fakes import failing
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
     World,
@@ -45,9 +45,7 @@ class TestDeath:
         world = World(tmp_path).started(2)
         world.recorders[0].lines.append("terminate called after throwing")
         world.recorders[0].die(-6)
-        with capture_logs() as logs:
-            world.run(3)
-        (died,) = events(logs, "recorder_died")
+        [died] = world.logged(3, "recorder_died")
         assert died["log_level"] == "error"
         assert "was killed (SIGABRT)" in str(died["reason"])
         assert "terminate called" in str(died["reason"])
@@ -59,9 +57,7 @@ class TestDeath:
         hung = world.recorders[0]
         hung.deaf, hung.ends_with = True, -9
         stopped = world.wall
-        with capture_logs() as logs:
-            world.run(40)
-        assert len(events(logs, "recorder_hung")) == 1
+        assert len(world.logged(40, "recorder_hung")) == 1
         assert world.heartbeat()["restarts"] == 1
         [(first, how)] = house.restarts
         assert how == "hung"
@@ -70,9 +66,7 @@ class TestDeath:
     def test_one_that_does_not_begin_is_given_up_and_another_is_started(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path)
-        world.defaults = {"ready_s": 10**9, "subscribe_s": 10**9}
-        world.supervisor.start()
+        world = World(tmp_path, defaults={"ready_s": 10**9, "subscribe_s": 10**9}).started()
         with capture_logs() as logs:
             world.run(119)
             assert len(world.recorders) == 1
@@ -84,8 +78,7 @@ class TestDeath:
     def test_what_never_held_a_byte_leaves_no_directory(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.disk_full = True
-        world.supervisor.start()
-        world.run(0.5)
+        world.started(0.5)
         world.recorders[0].die()
         world.run(0.5)
         assert not world.recorders[0].directory.exists()
@@ -173,9 +166,7 @@ class TestFailingDisk:
         disk = FailingDisk(
             monkeypatch, lambda path: path.name.startswith("rec_") and path not in known
         )
-        with capture_logs() as logs:
-            world.run(3)
-        assert "Input/output error" in events(logs, "recorder_not_started")[0]["reason"]
+        assert "Input/output error" in world.logged(3, "recorder_not_started")[0]["reason"]
         assert "Input/output error" in world.heartbeat()["last_error"]
         disk.failing = False
         world.run(10)
@@ -188,9 +179,7 @@ class TestFailingDisk:
         old, new = world.recorders
         new.die()
         FailingDisk(monkeypatch, lambda path: path == new.directory)
-        with capture_logs() as logs:
-            world.run(1)
-        assert "Input/output error" in events(logs, "rotation_failed")[0]["reason"]
+        assert "Input/output error" in world.logged(1, "rotation_failed")[0]["reason"]
         assert world.running == [old]
 
     def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
@@ -198,10 +187,7 @@ class TestFailingDisk:
     ) -> None:
         world = World(tmp_path).started(3)
 
-        def fails(_path: Path) -> Closing:
-            raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-
-        monkeypatch.setattr(world.reader, "closing", fails)
+        monkeypatch.setattr(world.reader, "closing", failing(errno.ESTALE))
         world.recorders[0].die()
         with capture_logs() as logs:
             world.run(6)
@@ -214,13 +200,8 @@ class TestFailingDisk:
         keeper = PlayedHousekeeper()
         world = World(tmp_path, housekeeper=keeper).started(3)
 
-        def fails() -> list[str]:
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-
-        monkeypatch.setattr(world.recorders[0], "take_lines", fails)
-        with capture_logs() as logs:
-            world.run(30)
-        (reported,) = events(logs, "supervision_failed")
+        monkeypatch.setattr(world.recorders[0], "take_lines", failing(errno.EIO))
+        [reported] = world.logged(30, "supervision_failed")
         assert (reported["task"], reported["reason"]) == ("look", "[Errno 5] Input/output error")
         world.run(40)
         assert "apply" in keeper.asked

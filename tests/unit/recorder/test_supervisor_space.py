@@ -55,8 +55,7 @@ class TestSpace:
 
     def test_a_disk_that_fills_is_first_made_room_on(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.supervisor.start()
-        world.run(3)
+        world.started(3)
         housekeeping.frees_to = 5000
         world.free = 900
         world.run(3)
@@ -80,8 +79,7 @@ class TestSpace:
 
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
         world, _ = self.world(tmp_path)
-        world.supervisor.start()
-        world.run(3)
+        world.started(3)
         world.free = 900
         world.run(3)
         world.free = 1100
@@ -104,8 +102,7 @@ class TestSpace:
 
     def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.supervisor.start()
-        world.run(3)
+        world.started(3)
         world.free = 900
         world.run(200)
         assert 3 <= housekeeping.asked.count("room 1200") <= 5
@@ -139,15 +136,19 @@ class TestUnmounted:
         world.device = 2
         return aside
 
+    @staticmethod
+    def mounted(world: World, aside: Path) -> None:
+        shutil.rmtree(world.bag_dir)
+        aside.rename(world.bag_dir)
+        world.device = 1
+
     def test_nothing_is_recorded_onto_another_disk_and_that_is_reported(
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
         world = World(tmp_path / "bags", housekeeper=housekeeping).started(3)
         self.unmounted(world)
-        with capture_logs() as logs:
-            world.run(200)
-        assert len(events(logs, "disk_gone")) == 1
+        assert len(world.logged(200, "disk_gone")) == 1
         assert world.running == []
         assert len(world.recorders) == 1
         assert housekeeping.asked == ["apply"]
@@ -158,9 +159,7 @@ class TestUnmounted:
         world = World(tmp_path / "bags").started(3)
         aside = self.unmounted(world)
         world.run(20)
-        shutil.rmtree(world.bag_dir)
-        aside.rename(world.bag_dir)
-        world.device = 1
+        self.mounted(world, aside)
         with capture_logs() as logs:
             world.run(0.5)
             assert len(world.recorders) == 1
@@ -182,9 +181,7 @@ class TestUnmounted:
         world.orders.reception.lost(world.recorders[0].directory.name, "/door", 3)
         world.run(20)
         assert list(bag_dir.iterdir()) == []
-        shutil.rmtree(bag_dir)
-        aside.rename(bag_dir)
-        world.device = 1
+        self.mounted(world, aside)
         world.run(20)
         lost = [(loss.topic, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
         assert lost == [("*", 0, "hung"), ("/door", 3, "rosbag2")]
@@ -194,9 +191,7 @@ class TestUnmounted:
         for _ in range(5):
             aside = self.unmounted(world)
             world.run(1)
-            shutil.rmtree(world.bag_dir)
-            aside.rename(world.bag_dir)
-            world.device = 1
+            self.mounted(world, aside)
             world.run(1)
         world.run(10)
         assert len(world.recorders) <= 3
@@ -209,9 +204,7 @@ class TestHouse:
         lost.mkdir()
         name = world.recorders[0].directory.name
         world.orders.reception.lost(name, "/door", 3)
-        with capture_logs() as logs:
-            world.run(5)
-        (reported,) = events(logs, "housekeeping_failed")
+        [reported] = world.logged(5, "housekeeping_failed")
         assert (reported["task"], "losses" in reported["reason"]) == ("reception", True)
         assert world.heartbeat()["last_error"] == reported["reason"]
         lost.rmdir()
@@ -222,10 +215,7 @@ class TestHouse:
         self, tmp_path: Path
     ) -> None:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping)
-        world.silent = True
-        world.supervisor.start()
-        world.run(130)
+        World(tmp_path, housekeeper=housekeeping, silent=True).started(130)
         assert housekeeping.asked.count("apply") == 3
 
 

@@ -24,9 +24,7 @@ class TestWatch:
     def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(18)
         world.silent = True
-        with capture_logs() as logs:
-            world.run(300)
-        (reported,) = events(logs, "no_growth")
+        [reported] = world.logged(300, "no_growth")
         assert world.heartbeat()["last_error"] == reported["reason"]
         assert len(world.recorders) == 2
         assert world.recorders[0].status == 0
@@ -43,9 +41,7 @@ class TestWatch:
     ) -> None:
         world = World(tmp_path).started(8)
         shutil.rmtree(world.recorders[0].directory)
-        with capture_logs() as logs:
-            world.run(4)
-        assert len(events(logs, "recording_vanished")) == 1
+        assert len(world.logged(4, "recording_vanished")) == 1
         assert [recorder.status for recorder in world.recorders] == [0, None]
         assert world.supervisor.is_recording
 
@@ -83,9 +79,7 @@ class TestWatch:
             "[WARN] [1.5] [rosbag2_recorder]: A new publisher for subscribed topic /scan was found "
             "offering RMW_QOS_POLICY_RELIABILITY_BEST_EFFORT, but rosbag already subscribed"
         )
-        with capture_logs() as logs:
-            world.run(3)
-        (reported,) = events(logs, "qos_refused")
+        [reported] = world.logged(3, "qos_refused")
         assert str(reported["reason"]).startswith(
             "/scan: messages of this publisher are not recorded"
         )
@@ -93,21 +87,12 @@ class TestWatch:
 
 
 class TestHeartbeat:
-    def test_a_change_is_reported_at_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(7)
-        world.recorders[0].die()
-        world.run(0.25)
-        beat = world.heartbeat()
-        assert (beat["state"], beat["recordings"]) == ("starting", [])
-
     def test_one_that_cannot_be_written_is_reported_once_and_recording_goes_on(
         self, tmp_path: Path
     ) -> None:
         world = World(tmp_path).started(2)
         (tmp_path / ".recorder.json.tmp").mkdir()
-        with capture_logs() as logs:
-            world.run(20)
-        assert len(events(logs, "heartbeat_not_written")) == 1
+        assert len(world.logged(20, "heartbeat_not_written")) == 1
         assert world.supervisor.is_recording
 
     def test_bytes_count_recordings_that_ended_too(self, tmp_path: Path) -> None:
@@ -134,9 +119,7 @@ class TestOffers:
     def test_nodes_that_have_gone_are_reported_until_they_come_back(self, tmp_path: Path) -> None:
         world = World(tmp_path, subscribe_timeout_s=6).started(12)
         world.silent, world.defaults = True, {"topics": ()}
-        with capture_logs() as logs:
-            world.run(90)
-        (said,) = events(logs, "topic_silent")
+        [said] = world.logged(90, "topic_silent")
         assert said["topics"] == ["/bumper", "/door"]
         assert world.heartbeat()["silent"] == ["/bumper", "/door"]
 
@@ -145,14 +128,9 @@ class TestWaiting:
     def test_a_recorder_that_never_received_anything_says_what_it_waits_for(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, advice=lambda: "look at the network")
-        world.silent = True
-        world.supervisor.start()
-        world.run(29)
+        world = World(tmp_path, advice=lambda: "look at the network", silent=True).started(29)
         assert world.heartbeat()["state"] == "recording"
-        with capture_logs() as logs:
-            world.run(30)
-        (reported,) = events(logs, "recording_waits")
+        [reported] = world.logged(30, "recording_waits")
         beat = world.heartbeat()
         assert beat["state"] == "waiting"
         assert beat["waiting_for"] == reported["reason"]
@@ -162,19 +140,17 @@ class TestWaiting:
         assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
 
     def test_its_own_log_is_no_sign_of_the_robot(self, tmp_path: Path) -> None:
-        world = World(tmp_path, expected=("/rosout", "/odom"))
-        world.defaults = {"topics": ("/rosout",), "heard": ("/rosout",)}
-        world.supervisor.start()
-        world.run(40)
+        world = World(
+            tmp_path,
+            expected=("/rosout", "/odom"),
+            defaults={"topics": ("/rosout",), "heard": ("/rosout",)},
+        ).started(40)
         beat = world.heartbeat()
         assert beat["state"] == "waiting"
         assert "no publisher offers any of the listed topics" in beat["waiting_for"]
 
     def test_a_recording_of_long_splits_waits_for_one_of_them(self, tmp_path: Path) -> None:
-        world = World(tmp_path, split_duration_s=60)
-        world.silent = True
-        world.supervisor.start()
-        world.run(58)
+        world = World(tmp_path, split_duration_s=60, silent=True).started(58)
         assert world.heartbeat()["state"] == "recording"
         world.run(10)
         assert world.heartbeat()["state"] == "waiting"
@@ -186,11 +162,9 @@ class TestWaiting:
     def test_simulated_time_and_a_wrong_domain_are_told_apart(
         self, tmp_path: Path, simulated: bool, topics: tuple[str, ...], expected: str
     ) -> None:
-        world = World(tmp_path, simulated=simulated)
-        world.defaults = {"topics": topics, "heard": ()}
-        world.silent = True
-        world.supervisor.start()
-        world.run(40)
+        world = World(
+            tmp_path, simulated=simulated, defaults={"topics": topics, "heard": ()}, silent=True
+        ).started(40)
         assert expected in world.heartbeat()["waiting_for"]
 
 
@@ -199,9 +173,7 @@ def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> 
     world.recorders[0].lines.append(
         "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
     )
-    with capture_logs() as logs:
-        world.run(30)
-    (reported,) = events(logs, "topics_not_recorded")
+    [reported] = world.logged(30, "topics_not_recorded")
     assert "not recorded: /arm;" in reported["reason"]
     assert "of those that a glob selects, others of the same type" in reported["reason"]
     assert reported["reason"].endswith("nor these, if anybody offers them: /grip")
@@ -225,8 +197,7 @@ def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> N
     world.defaults["lines"] = [
         "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
     ]
-    world.supervisor.start()
-    world.run(20)
+    world.started(20)
     assert "/arm" in str(world.heartbeat()["last_error"])
     world.recorders[0].die(-9)
     world.run(20)
@@ -241,10 +212,12 @@ class TestShortfall:
     def test_a_topic_that_is_offered_and_never_comes_is_named_with_advice(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, session_duration_s=20, advice=lambda: "look at the users")
-        world.defaults["heard"] = ("/bumper",)
-        world.supervisor.start()
-        world.run(25)
+        world = World(
+            tmp_path,
+            session_duration_s=20,
+            advice=lambda: "look at the users",
+            defaults={"heard": ("/bumper",)},
+        ).started(25)
         assert world.heartbeat()["unheard"] == []
         with capture_logs() as logs:
             world.run(60)
@@ -259,8 +232,7 @@ class TestShortfall:
     def test_services_and_actions_may_be_unused(self, tmp_path: Path) -> None:
         world = World(tmp_path)
         world.defaults |= {"topics": ("/bumper", "/go/_action/feedback"), "heard": ("/bumper",)}
-        world.supervisor.start()
-        world.run(60)
+        world.started(60)
         assert world.heartbeat()["unheard"] == []
 
     @pytest.mark.parametrize("still", [("/bumper",), ()])
@@ -284,10 +256,12 @@ class TestShortfall:
     def test_a_slow_topic_that_is_written_with_its_split_is_not_silent(
         self, tmp_path: Path
     ) -> None:
-        world = World(tmp_path, split_duration_s=10, required=[Required("/bumper", 3.5)])
-        world.defaults["buffers"] = True
-        world.supervisor.start()
-        world.run(60)
+        world = World(
+            tmp_path,
+            split_duration_s=10,
+            required=[Required("/bumper", 3.5)],
+            defaults={"buffers": True},
+        ).started(60)
         for _ in range(60):
             world.run(1)
             beat = world.heartbeat()
@@ -307,20 +281,14 @@ class TestShortfall:
         assert world.heartbeat()["required_missing"][0].startswith("/bumper: it came regularly")
 
     def test_a_child_that_lives_and_writes_nothing_is_replaced_once(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.defaults["deaf"] = True
-        world.supervisor.start()
-        world.run(10)
+        world = World(tmp_path, defaults={"deaf": True}).started(10)
         world.defaults["deaf"] = False
         world.run(40)
         assert [each.deaf for each in world.running] == [False]
         assert world.heartbeat()["state"] == "recording"
 
     def test_a_robot_that_says_nothing_is_not_asked_again_and_again(self, tmp_path: Path) -> None:
-        world = World(tmp_path)
-        world.silent = True
-        world.supervisor.start()
-        world.run(300)
+        world = World(tmp_path, silent=True).started(300)
         assert len(world.recorders) == 2
 
 
@@ -348,9 +316,7 @@ class TestChangedList:
         world = World(tmp_path / "bags", expected=("/bumper", "/door")).started(20)
         before = world.heartbeat()["listed"]
         world.topics_path.write_text("topics: [no slash]\n")
-        with capture_logs() as logs:
-            world.run(30)
-        [refused] = events(logs, "topics_refused")
+        [refused] = world.logged(30, "topics_refused")
         beat = world.heartbeat()
         assert beat["list_refused"] == refused["reason"] == beat["last_error"]
         assert "'no slash' cannot be recorded" in beat["list_refused"]
@@ -363,8 +329,7 @@ class TestChangedList:
     def test_a_file_that_is_touched_or_written_in_steps_is_no_change(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags", expected=("/bumper",))
         whole = world.topics_path.read_text()
-        world.supervisor.start()
-        world.run(20)
+        world.started(20)
         world.topics_path.write_text("topics:\n")
         world.run(1.5)
         world.topics_path.write_text(whole)
@@ -375,9 +340,9 @@ class TestChangedList:
 def test_topics_that_nobody_has_offered_are_named_once_a_recorder_has_looked(
     tmp_path: Path,
 ) -> None:
-    world = World(tmp_path, expected=("/odom", "/gone", "/bumper"))
-    world.defaults["topics"] = ("/bumper",)
-    world.supervisor.start()
+    world = World(
+        tmp_path, expected=("/odom", "/gone", "/bumper"), defaults={"topics": ("/bumper",)}
+    ).started()
     assert world.heartbeat()["missing"] == []
     world.run(7)
     assert world.heartbeat()["missing"] == ["/gone", "/odom"]
@@ -392,6 +357,7 @@ def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path
     world.running[0].die()
     world.run(0.25)
     beat = world.heartbeat()
+    assert (beat["state"], beat["recordings"]) == ("starting", [])
     assert "was killed" in beat["last_error"]
     assert (beat["last_error_at"], beat["recovered"]) == (world.wall, False)
     world.run(20)

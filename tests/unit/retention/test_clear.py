@@ -110,16 +110,6 @@ def test_no_file_of_another_kind_is_ever_deleted(
     assert kept == {name for name in names if not name.endswith((".mcap", ".db3"))}
 
 
-def test_a_recording_without_a_byte_is_removed(tmp_path: Path) -> None:
-    recording = tmp_path / "rec_1"
-    recording.mkdir()
-    (recording / "rec_1_0.mcap").touch()
-    (recording / "metadata.yaml").touch()
-    (recording / "handover.json").write_text("{}")
-    assert remove_if_empty(recording)
-    assert not recording.exists()
-
-
 @pytest.mark.parametrize(
     ("name", "content"), [("rec_1_0.mcap", b"1"), ("notes.txt", b""), ("metadata.yaml", b"x: 1")]
 )

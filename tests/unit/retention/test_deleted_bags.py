@@ -22,6 +22,7 @@ from ros2_memory.bag_dir.state_files import (
     read_deleted,
 )
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import NOW, T0, A, B, S, house_of, kept, recording, size_of
 from tests.support.memories import asked, memory_of
 
@@ -134,11 +135,8 @@ def test_a_list_that_cannot_be_written_stops_no_deletion_and_is_written_once_the
     listed(tmp_path, B, 3 * 3600)
     house = house_of(tmp_path, max_age_h=1)
 
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-        patched.setattr(DELETED, "append", full)
+        patched.setattr(DELETED, "append", failing())
         house.apply()
     assert "deletions_not_written" in {each["event"] for each in captured}
     assert not any(path.exists() for path in old)
@@ -168,13 +166,10 @@ def test_a_list_that_cannot_be_read_when_it_is_too_long_loses_nothing(
 ) -> None:
     monkeypatch.setattr(state_files, "_MOST_DELETED_BYTES", 300)
 
-    def failing(_: Path) -> None:
-        raise OSError(errno.EMFILE, "Too many open files")
-
     for n in range(4):
         at = T0 + n * 100 * S
         with monkeypatch.context() as patched:
-            patched.setattr(DELETED, "rows", failing)
+            patched.setattr(DELETED, "rows", failing(errno.EMFILE))
             append_deleted(tmp_path, [deleted_of(f"rec_{n}", [("a_0.mcap", at, at + 9 * S)])])
     assert [(start - T0) // S for start, _ in deleted_spans(tmp_path)] == [0, 100, 200, 300]
     append_deleted(tmp_path, [deleted_of("rec_4", [("a_0.mcap", at + 100 * S, at + 109 * S)])])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 from pathlib import Path
 
 import pytest
@@ -11,15 +10,11 @@ from ros2_memory.retention.disk import HomeDisk, device_of
 
 
 class Devices:
-    """Says which device lies under a directory, or fails."""
+    """Says which device lies under a directory."""
 
-    def __init__(self) -> None:
-        self.number = 1
-        self.fails = False
+    number = 1
 
     def __call__(self, _directory: Path) -> int:
-        if self.fails:
-            raise OSError(errno.EIO, "Input/output error")
         return self.number
 
 

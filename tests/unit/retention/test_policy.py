@@ -105,10 +105,6 @@ class TestAge:
         going = by_hours(plan, held)
         assert plan.newest not in {each.path for each in going}
 
-    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
-        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
-        assert expired(stock(*before, after), LIMITS) == ()
-
     def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
         boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
@@ -147,11 +143,6 @@ class TestBudget:
         limits = replace(LIMITS, max_total_bytes=0)
         assert names(expired(stock(*bags), limits)) == ["a", "b", "c", "d", "e"]
 
-    def test_a_bag_of_1970_is_not_the_oldest_before_its_file_is(self) -> None:
-        boot = bag("boot", 60 * S, written=NOW - 150 * 60 * S)
-        deleted = expired(stock(boot, *hourly(5)), budget(30))
-        assert names(deleted) == ["h4", "h3", "boot"]
-
     def test_a_file_from_a_far_future_goes_first_and_is_not_kept_for_good(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY)
         limits = RetentionLimits(max_total_bytes=30, max_age_ns=168 * HOUR)
@@ -172,20 +163,6 @@ class TestBudget:
         assert plan_deletions(held, LIMITS).total_bytes == 55
         assert names(expired(held, budget(25))) == ["a"]
         assert names(expired(held, budget(54))) == ["a"]
-
-    def test_free_space_that_is_missing_is_made_and_no_more(self) -> None:
-        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=10 * BLOCK)
-        assert expired(stock(*hourly(10), free_bytes=10 * BLOCK), limits) == ()
-        bags = stock(*hourly(10), free_bytes=8 * BLOCK + 1)
-        assert names(expired(bags, limits)) == ["h9", "h8"]
-        assert expired(stock(*hourly(10), free_bytes=None), limits) == ()
-
-    def test_for_free_space_that_cannot_be_reached_nothing_is_deleted(self) -> None:
-        limits = RetentionLimits(PLENTY, 168 * HOUR, min_free_bytes=9 * BLOCK + 10)
-        found = plan_deletions(stock(*hourly(10), free_bytes=9), limits)
-        assert (found.to_delete, found.fits, found.most_free) == ((), False, 9 * BLOCK + 9)
-        found = plan_deletions(stock(*hourly(170), free_bytes=-200 * BLOCK), limits)
-        assert (names(found.to_delete), found.fits) == (["h169"], False)
 
 
 def budget(size: int) -> RetentionLimits:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import json
-from typing import TYPE_CHECKING, Never
+from typing import TYPE_CHECKING
 
 import pytest
 import structlog
@@ -14,10 +14,10 @@ from ros2_memory.core.timebase import ns_from_unix
 from ros2_memory.retention.recorded_time import SAVE_S, RecordedTime
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.support.examples import LONG
+from tests.support.fakes import failing
 from tests.support.log_lines import with_checks
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
     from pathlib import Path
 
 S = 10**9
@@ -172,12 +172,9 @@ def test_a_disk_that_fails_to_read_it_for_a_while_makes_nothing_older(
     recorded(RecordedTime(tmp_path), "a", 100, since_s=end)
     before = (tmp_path / FILE).read_text()
 
-    def failing(_: Path) -> Iterator[Never]:
-        raise OSError(errno.EMFILE, "Too many open files")
-
     time = RecordedTime(tmp_path)
     with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-        patched.setattr(RECORDED, "lines", failing)
+        patched.setattr(RECORDED, "lines", failing(errno.EMFILE))
         end = recorded(time, "b", 200)
         assert time.since("ab") == {"a": 0, "b": 0}
         assert time.doubtful("ab") == {"a", "b"}

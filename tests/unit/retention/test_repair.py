@@ -4,7 +4,6 @@ import os
 from typing import TYPE_CHECKING
 
 import pytest
-from rosbags.rosbag2 import Reader as RosbagsReader
 
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
@@ -14,8 +13,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.fakes import files_limited_to
-from tests.support.housekeepers import copied, files_in
-from tests.support.shared_bags import RECORDED, needs_recorded
+from tests.support.housekeepers import files_in
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -120,23 +118,3 @@ def test_links_are_not_followed(tmp_path: Path) -> None:
     with pytest.raises(BagError, match="not a regular file"):
         repairer().repair(tmp_path / "b_0.mcap")
     assert path.read_bytes() == before
-
-
-@needs_recorded
-@pytest.mark.parametrize(
-    "name", ["session_killed", "session_killed_chunk64k", "extra/full_truncated"]
-)
-def test_what_killed_recorders_left_is_read_by_rosbags_afterwards(
-    tmp_path: Path, name: str
-) -> None:
-    folder = copied(RECORDED / name, tmp_path / "copy")
-    paths = sorted(folder.glob("*.mcap"))
-    before = {path: contents(path) for path in paths if path.stat().st_size}
-    for path in paths:
-        repairer().repair(path)
-    assert sorted(folder.glob("*.mcap")) == sorted(before)
-    for path, records in before.items():
-        with RosbagsReader(path) as reader:
-            read = [(c.topic, time, bytes(data)) for c, time, data in reader.messages()]
-        expected = [(each.channel.topic, each.log_time, each.payload) for each in records]
-        assert sorted(read) == sorted(expected)

@@ -18,13 +18,13 @@ from ros2_memory.bag_dir.moment_file import (
     stored_moments_in,
 )
 from ros2_memory.retention import saved_moments
-from ros2_memory.retention.clear import clear_bags
 from ros2_memory.retention.saved_moments import (
     LONGEST_WAIT_NS,
     Share,
 )
 from tests.support.bags import McapLayout
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import (
     NOW,
     T0,
@@ -126,10 +126,7 @@ class TestKeeping:
     ) -> None:
         recording(tmp_path, A, 0)
 
-        def refuse(*_args: object, **_options: object) -> None:
-            raise OSError(errno.EPERM, os.strerror(errno.EPERM))
-
-        monkeypatch.setattr(os, "link", refuse)
+        monkeypatch.setattr(os, "link", failing(errno.EPERM))
         outcome = kept(house_of(tmp_path), tmp_path, 15, 25)
         assert outcome.refused is not None
         assert "by hard links: Operation not permitted" in outcome.refused
@@ -228,11 +225,8 @@ class TestOpenBags:
         kept(house, tmp_path, 0, 25, at=clock.at)
         bag(tmp_path / A / f"{A}_2.mcap", 20)
 
-        def full(*_: object, **__: object) -> None:
-            raise OSError(errno.ENOSPC, "No space left on device")
-
         with monkeypatch.context() as patched, structlog.testing.capture_logs() as captured:
-            patched.setattr(os, "link", full)
+            patched.setattr(os, "link", failing())
             for second in (26, 86):
                 clock.at = T0 + second * S
                 house.keep_moments()
@@ -326,18 +320,6 @@ class TestCrashes:
 
 
 class TestOthers:
-    def test_a_wipe_takes_moments_too_and_leaves_what_is_not_of_them(self, tmp_path: Path) -> None:
-        recording(tmp_path, A, 0)
-        house = house_of(tmp_path)
-        kept(house, tmp_path, 15, 25, "one")
-        kept(house, tmp_path, 15, 25, "two")
-        mine = min((tmp_path / "moments").iterdir()) / "notes.txt"
-        mine.write_text("why this matters")
-        assert clear_bags(tmp_path).faults == []
-        assert mine.exists()
-        assert list(tmp_path.rglob("*.mcap")) == []
-        assert [path.name for path in (tmp_path / "moments").iterdir()] == [mine.parent.name]
-
     def test_what_is_in_a_moment_is_not_repaired(self, tmp_path: Path) -> None:
         """It would be written anew, and be another file than the one that it was linked to."""
         recording(tmp_path, A, 0, splits=1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import fcntl
 from collections import Counter
 from collections.abc import Callable
@@ -35,6 +34,7 @@ from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, boolean, odom, text, tf, transform, write_mcap
 from tests.support.clocks import SettableClock
+from tests.support.fakes import failing
 from tests.support.housekeepers import HOUR, Direct, own_all
 from tests.support.memories import reply_over
 
@@ -172,11 +172,14 @@ def test_latched_topics_moments_and_foreign_bags_stay(bag_dir: Path, tmp_path: P
 
 @pytest.mark.parametrize(
     "why",
-    [{"is_quiet": False}, {"free": 1100}],
-    ids=["the machine is busy", "the disk is short"],
+    [{"is_quiet": False}, {"free": 1100}, {"synchronised": False}, {"erasing": True}],
+    ids=["busy", "the disk is short", "the clock may be wrong", "messages are forgotten"],
 )
 def test_nothing_is_cut_while(bag_dir: Path, why: dict[str, Any]) -> None:
-    house(bag_dir, cutter_of(bag_dir, **why)).apply()
+    synchronised = why.pop("synchronised", True)
+    if why.pop("erasing", False):
+        (bag_dir / ERASING_FILE).write_text("{}")
+    house(bag_dir, cutter_of(bag_dir, **why), synchronised=synchronised).apply()
     assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
     assert not (bag_dir / EXPIRED_FILE).exists()
 
@@ -193,18 +196,6 @@ def test_a_machine_that_is_never_quiet_is_waited_for_an_hour(bag_dir: Path) -> N
     now_s[0] = PATIENCE_S
     keeper.apply()
     assert "/speech" not in counts_of(bag)
-
-
-def test_nothing_is_cut_while_messages_are_forgotten(bag_dir: Path) -> None:
-    (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
-    (bag_dir / ERASING_FILE).write_text("{}")
-    house(bag_dir, cutter_of(bag_dir)).apply()
-    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
-
-
-def test_nothing_is_cut_by_a_clock_that_may_be_wrong(bag_dir: Path) -> None:
-    house(bag_dir, cutter_of(bag_dir), synchronised=False).apply()
-    assert counts_of(bag_dir / "rec_A" / "rec_A_0.mcap")["/speech"] == 10
 
 
 def test_a_pass_ends_after_its_time_and_the_next_goes_on(bag_dir: Path) -> None:
@@ -287,12 +278,9 @@ def test_a_bag_whose_cut_fails_at_its_end_stays_whole_and_shipped(
     receipt = Receipt("rec_A/rec_A_0.mcap", "id", path.stat().st_size, "00", "lake", 1)
     append_receipts(bag_dir, [receipt])
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
     owner, name = (SHIPPED, "append") if step == "receipt" else (repair, "replace_file")
     with monkeypatch.context() as patched:
-        patched.setattr(owner, name, full)
+        patched.setattr(owner, name, failing())
         house(bag_dir, cutter_of(bag_dir), require_shipped=True).apply()
     assert counts_of(path)["/speech"] == 10
     assert unshipped(bag_dir, [(receipt.bag, path.stat().st_size)]) == frozenset()

@@ -135,20 +135,6 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path:
     assert stored(memory) == ["rec/rec_0.mcap"]
 
 
-async def test_in_the_background_what_closes_is_stored(tmp_path: Path) -> None:
-    bag(tmp_path, 0)
-    _, backfill = storing(tmp_path)
-    with anyio.fail_after(30):
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, backfill, ["/no/such/program"], 0.001)
-            while backfill.progress().waiting:
-                await anyio.lowlevel.checkpoint()
-            bag(tmp_path, 1)
-            while backfill.progress() != Progress(2, 2):
-                await anyio.lowlevel.checkpoint()
-            tasks.cancel_scope.cancel()
-
-
 async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(
     tmp_path: Path,
 ) -> None:

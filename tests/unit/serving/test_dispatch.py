@@ -204,50 +204,35 @@ async def test_a_query_that_takes_too_long_gives_up_by_itself() -> None:
 
 
 async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> None:
-    released = threading.Event()
-
-    def stuck(_call: Call) -> Answer:
-        released.wait(10)
-        return value(1)
-
-    async with Client(served(tool("stuck", stuck), timeout_s=0.05)) as client:
+    held = Held()
+    async with Client(served(tool("stuck", held.ask), timeout_s=0.05)) as client:
         result = await client.call_tool("stuck", {})
-        released.set()
+        held.released.set()
     assert result.is_error
     assert sent(result)["error"] == "timeout"
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
 
 
 async def test_tools_are_listed_while_queries_run_and_wait() -> None:
-    released = threading.Event()
-
-    def stuck(_call: Call) -> Answer:
-        released.wait(10)
-        return value(1)
-
-    async with Client(served(tool("stuck", stuck))) as client, anyio.create_task_group() as tasks:
+    held = Held()
+    stuck = tool("stuck", held.ask)
+    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
         for _ in range(2 * QUICK_AT_ONCE):
             tasks.start_soon(client.call_tool, "stuck", {})
         await anyio.wait_all_tasks_blocked()
         assert len((await client.list_tools()).tools) == 1
-        released.set()
+        held.released.set()
 
 
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
-    released = threading.Event()
-
-    def stuck(_call: Call) -> Answer:
-        released.wait(10)
-        return value(1)
-
-    slow, quick = tool("slow", stuck, blocking=True), tool("quick", lambda _call: value(2))
+    held = Held()
+    slow, quick = tool("slow", held.ask, blocking=True), tool("quick", lambda _call: value(2))
     async with Client(served(slow, quick)) as client, anyio.create_task_group() as tasks:
         for _ in range(BLOCKING_AT_ONCE + QUICK_AT_ONCE):
             tasks.start_soon(client.call_tool, "slow", {})
         await anyio.wait_all_tasks_blocked()
         assert sent(await client.call_tool("quick", {}))["value"] == 2
-        assert not released.is_set()
-        released.set()
+        held.released.set()
 
 
 async def test_a_query_gives_up_when_its_client_no_longer_waits(log: LogCapture) -> None:

@@ -6,7 +6,7 @@ import random
 import sqlite3
 import struct
 import tracemalloc
-from contextlib import closing
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -47,6 +47,7 @@ from tests.support.bags import Msg, text, write_db3
 from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 MB = 1 << 20
@@ -65,6 +66,18 @@ def bytes_of(records: list[Piece]) -> bytes:
 def bomb(size: int) -> Piece:
     """A chunk of some bytes that unpacks to `size` bytes, which make no record."""
     return chunk_of(b"", "zstd", packed=rle_frame(size), size=10, crc=0)
+
+
+@contextmanager
+def little_memory(most: int) -> Iterator[None]:
+    """What is done meanwhile must hold less than so many bytes at any time."""
+    tracemalloc.start()
+    try:
+        yield
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < most
 
 
 def bag(folder: Path, *records: Piece, name: str = "run/run_0.mcap") -> Path:
@@ -86,13 +99,8 @@ class TestChunks:
         whole = chunk_of(bytes_of([*STRINGS, string_message()]))
         large = chunk_of(b"", compression, packed=packed, size=stated, crc=0)
         path = bag(tmp_path, whole, large)
-        tracemalloc.start()
-        try:
+        with little_memory(10 * MB):
             summary = McapReader(max_chunk_mb=1).summarize(path)
-            _, peak = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
-        assert peak < 10 * MB
         assert summary.count == 1
         assert "larger than the 1 MiB allowed" in summary.notes[0]
         assert "reader.max_chunk_mb" in summary.notes[0]
@@ -156,14 +164,9 @@ class TestChunks:
         path = bag(tmp_path, *chunks)
         reader = McapReader(cache_mb=1)
         reader.summarize(path)
-        tracemalloc.start()
-        try:
+        with little_memory(5 * size):
             times = [each.log_time for each in reader.records(path, ["/chatter"], EVERYTHING)]
-            _, peak = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
         assert times == [*range(count), *range(100, 100 + count)]
-        assert peak < 5 * size
 
     def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(self, tmp_path: Path) -> None:
         many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_CHANNELS + 2)]
@@ -347,14 +350,11 @@ class TestSqlite:
         with closing(sqlite3.connect(path)) as base:
             base.execute(change, ("\0" + "x" * 33 * MB,))
             base.commit()
-        tracemalloc.start()
-        try:
-            with pytest.raises(BagError, match=f"texts of its table {table} are longer than"):
-                Rosbag2Reader().summarize(path)
-            _, peak = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
-        assert peak < MB
+        with (
+            little_memory(MB),
+            pytest.raises(BagError, match=f"texts of its table {table} are longer than"),
+        ):
+            Rosbag2Reader().summarize(path)
 
     def test_columns_that_no_bag_has_and_values_of_other_types_are_not_read(
         self, tmp_path: Path
@@ -366,15 +366,10 @@ class TestSqlite:
             "INSERT INTO messages(topic_id, timestamp, data)"
             " VALUES (CAST(zeroblob(30000000) AS TEXT), 5, x'00')",
         )
-        tracemalloc.start()
-        try:
+        with little_memory(MB):
             summary = Rosbag2Reader().summarize(path)
-            _, peak = tracemalloc.get_traced_memory()
-        finally:
-            tracemalloc.stop()
         assert summary.count == 5
         assert "1 message of no topic" in summary.notes[0]
-        assert peak < MB
 
     def test_a_message_larger_than_allowed_is_named(self, tmp_path: Path) -> None:
         messages = [text(1, "x"), Msg("/chatter", "std_msgs/msg/String", 2, bytes(2 * MB))]

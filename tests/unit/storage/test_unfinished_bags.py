@@ -9,25 +9,14 @@ import pytest
 from mcap.writer import CompressionType
 
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.storage.base import Closing, Record
+from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.mcap_surgery import SMALL, chatter, chunks_of, spoil_chunk
+from tests.unit.storage.test_mcap_reader import read, times
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-EVERYTHING = TimeWindow.everything()
-
-
-def read(reader: McapReader, path: Path, *topics: str, **how: bool) -> list[Record]:
-    return list(reader.records(path, topics or ("/chatter",), EVERYTHING, **how))
-
-
-def times(records: list[Record]) -> list[int]:
-    return [record.log_time for record in records]
 
 
 @pytest.mark.parametrize("layout", [McapLayout(), SMALL, McapLayout(chunk_size=None)])

@@ -12,7 +12,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +30,6 @@ from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FI
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import read_superseded, read_thinned
 from ros2_memory.bootstrap import build_memory
-from ros2_memory.config import load_settings
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
@@ -61,7 +62,7 @@ from tests.support.bags import (
 )
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import HOUR, Direct, own_all
-from tests.support.memories import reply_over, shipped_extractor
+from tests.support.memories import reply_over, shipped_extractor, shipped_settings
 from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
 
@@ -78,6 +79,14 @@ def split(
 
     With None in place of labels its detector says nothing.
     """
+    path = bag_dir / name / f"{name}_{start // 60}.mcap"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content_of_split(start, None if labels is None else (*labels,)))
+    return path
+
+
+@cache
+def content_of_split(start: int, labels: tuple[str, ...] | None) -> bytes:
     begin = T0 + start * S
     times = range(begin, begin + 60 * S, S // 5)
     messages: list[Msg] = [
@@ -91,7 +100,8 @@ def split(
     messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::5]]
     messages.append(text(begin + 7 * S, "the code is 4711"))
     messages.sort(key=lambda each: each.log_time)
-    return write_mcap(bag_dir / name / f"{name}_{start // 60}.mcap", messages)
+    with TemporaryDirectory() as folder:
+        return write_mcap(Path(folder) / "split.mcap", messages).read_bytes()
 
 
 def days_of(
@@ -150,8 +160,15 @@ def content_of(path: Path) -> bytes:
 
 
 def keep_all(
-    days: MemoryDays, bag_dir: Path, name: str = "rec_A", *, clock: Clock | None = None
+    bag_dir: Path,
+    name: str = "rec_A",
+    *,
+    days: MemoryDays | None = None,
+    clock: Clock | None = None,
+    **how: Any,
 ) -> None:
+    """Lists what lies there as the recorder's own, and keeps the days of one recording."""
+    own_all(bag_dir)
     index = IndexManager(
         bag_dir,
         BagDirReader(McapReader()),
@@ -160,13 +177,22 @@ def keep_all(
         split_duration_s=60.0,
     )
     snapshot = index.refresh()
-    days.keep(snapshot, {bag.file for bag in snapshot.bags if bag.recording.name == name})
+    files = {bag.file for bag in snapshot.bags if bag.recording.name == name}
+    (days or days_of(bag_dir, **how)).keep(snapshot, files)
 
 
 def messages_in(path: Path) -> list[Record]:
     reader = McapReader()
     topics = [channel.topic for channel in reader.channels(path)]
     return list(reader.records(path, topics, TimeWindow.everything()))
+
+
+def topics_in(bag_dir: Path) -> Counter[str]:
+    return Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+
+
+def days_in(bag_dir: Path) -> list[str]:
+    return sorted(path.name for path in bag_dir.glob("memory/*.mcap"))
 
 
 def labels_in(path: Path) -> set[str]:
@@ -188,9 +214,8 @@ def bag_dir(tmp_path: Path) -> Path:
 def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> None:
     for nth in range(3):
         split(bag_dir, 60 * nth)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
-    found = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    keep_all(bag_dir)
+    found = topics_in(bag_dir)
     assert "/chatter" not in found
     assert 175 <= found["/odom"] <= 200
     assert found["/bumper"] <= 60
@@ -205,13 +230,12 @@ def test_people_are_taken_out_by_words_of_several_languages_unless_their_label_i
     people = ("Person", "alte Frau", "niño", "行人", "TrackedPerson", "PERSON_2", "Anna")
     things = {"mug", "drill", "surface", "Manometer"}
     split(bag_dir, 0, labels=(*people, *things))
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir, limits=MemoryLimits(people=("anna",))), bag_dir)
+    keep_all(bag_dir, limits=MemoryLimits(people=("anna",)))
     assert labels_in(bag_dir / DAY_FILE) == things
     assert b"Person" not in (bag_dir / DAY_FILE).read_bytes()
     (bag_dir / DAY_FILE).unlink()
     limits = MemoryLimits(labels=("Person",), people=("anna",))
-    keep_all(days_of(bag_dir, limits=limits), bag_dir)
+    keep_all(bag_dir, limits=limits)
     assert labels_in(bag_dir / DAY_FILE) == {*things, "Person"}
 
 
@@ -230,8 +254,7 @@ def test_people_are_looked_for_in_frames_topics_and_numbers(bag_dir: Path) -> No
         *(boolean(each, each % 2 == 0, topic="/face/is_seen") for each in at),
     ]
     write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", sorted(messages, key=lambda one: one.log_time))
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     reader = McapReader()
     stays = [(one.channel.topic, reader.decode(one)) for one in messages_in(bag_dir / DAY_FILE)]
     assert {topic for topic, _ in stays} == {"/vision/scene/scene_objects", "/tf"}
@@ -258,8 +281,7 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
     states = [goals(begin + n * S // 2, {1: 2 if n < 21 else 4}) for n in range(60)]
     both = sorted([*spectrum, *states], key=lambda one: one.log_time)
     write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", both)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     found = {
         (one.log_time - begin) / S
         for one in messages_in(bag_dir / DAY_FILE)
@@ -267,15 +289,12 @@ def test_samples_do_not_stay_and_each_change_of_a_goal_does(bag_dir: Path) -> No
     }
     assert found >= {10.0, 10.5}
     assert len(found) < 20
-    assert {one.channel.topic for one in messages_in(bag_dir / DAY_FILE)} == {
-        "/drive/_action/status"
-    }
+    assert {*topics_in(bag_dir)} == {"/drive/_action/status"}
 
 
 def test_days_that_nobody_wants_go_after_a_day_of_running_and_not_before(bag_dir: Path) -> None:
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     monotonic = SettableClock(0)
 
     def started(*, keeps: bool = False) -> Housekeeping:
@@ -311,21 +330,20 @@ def test_nothing_is_written_while_messages_are_forgotten(bag_dir: Path) -> None:
     (bag_dir / ERASING_FILE).parent.mkdir(exist_ok=True)
     (bag_dir / ERASING_FILE).write_text("{}")
     with pytest.raises(BagError, match="being forgotten"):
-        keep_all(days_of(bag_dir), bag_dir)
+        keep_all(bag_dir)
     assert not (bag_dir / DAY_FILE).exists()
 
 
 def test_days_of_a_wrong_date_do_not_age_nor_any_by_an_unsure_clock(bag_dir: Path) -> None:
     split(bag_dir, 0)
     write_mcap(bag_dir / "rec_A" / "old.mcap", [odom(n * S, n, 0.0) for n in range(1, 9)])
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     both = ["19700101.thinned.mcap", "20260921.thinned.mcap"]
     days = days_of(bag_dir, limits=MemoryLimits(max_age_ns=30 * 86_400 * S))
     days.limit(None)
-    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == both
+    assert days_in(bag_dir) == both
     days.limit(T0 + 60 * 86_400 * S)
-    assert [path.name for path in (bag_dir / "memory").glob("*.mcap")] == both[:1]
+    assert days_in(bag_dir) == both[:1]
 
 
 def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(
@@ -334,8 +352,7 @@ def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(
     days = days_of(bag_dir)
     for name, second in (("rec_A", 0), ("rec_B", 7200)):
         split(bag_dir, second, name=name)
-    own_all(bag_dir)
-    keep_all(days, bag_dir)
+    keep_all(bag_dir, days=days)
 
     def failing(path: Path, *given: int) -> str:
         if path.name == Path(SUPERSEDED_FILE).name:
@@ -345,8 +362,8 @@ def test_a_list_of_bags_in_days_that_cannot_be_read_is_not_replaced(
     with monkeypatch.context() as patched:
         patched.setattr(json_files, "read_small_file", failing)
         with pytest.raises(OSError, match="Too many"):
-            keep_all(days, bag_dir, "rec_B")
-    keep_all(days, bag_dir, "rec_B")
+            keep_all(bag_dir, "rec_B", days=days)
+    keep_all(bag_dir, "rec_B", days=days)
     assert {bag.partition("/")[0] for bag in read_superseded(bag_dir).bags} == {"rec_A", "rec_B"}
 
 
@@ -356,8 +373,7 @@ def test_a_day_that_is_damaged_or_of_others_is_left_and_another_file_written(
     (bag_dir / "memory").mkdir()
     (bag_dir / DAY_FILE).write_bytes(b"\x89MCAP0\r\nbroken")
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     assert (bag_dir / DAY_FILE).read_bytes() == b"\x89MCAP0\r\nbroken"
     assert messages_in(bag_dir / "memory/20260921-1.thinned.mcap")
 
@@ -411,7 +427,7 @@ def test_what_was_not_recorded_is_not_answered_from_memory(bag_dir: Path, pause:
     }
     recap, values = (reply_over(bag_dir, tool, **given) for tool, given in whole.items())
     for name in ("rec_A", "rec_B"):
-        keep_all(days_of(bag_dir), bag_dir, name)
+        keep_all(bag_dir, name)
         shutil.rmtree(bag_dir / name)
     middle = reply_over(bag_dir, "get_position_at", timestamp=T0 / S + 120 + pause / 2)
     assert middle["error"] == "no_data", middle
@@ -513,13 +529,11 @@ def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
 @pytest.mark.parametrize("after", [0, 1, 50, 150])
 def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     before = (bag_dir / DAY_FILE).read_bytes()
     split(bag_dir, 60, name="rec_B")
-    own_all(bag_dir)
     with pytest.raises(BagError):
-        keep_all(days_of(bag_dir, writer=Failing(after)), bag_dir, "rec_B")
+        keep_all(bag_dir, "rec_B", writer=Failing(after))
     assert (bag_dir / DAY_FILE).read_bytes() == before
     left = sorted(path.name for path in (bag_dir / "memory").iterdir())
     assert left == ["20260921.thinned.mcap", "thinned.json"]
@@ -533,15 +547,15 @@ def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
     own_all(bag_dir)
     days = days_of(bag_dir)
     for day in range(4):
-        keep_all(days, bag_dir, f"rec_{day}")
+        keep_all(bag_dir, f"rec_{day}", days=days)
     names = [f"202609{number}.thinned.mcap" for number in (21, 22, 23, 24)]
-    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names
+    assert days_in(bag_dir) == names
     size = (bag_dir / DAY_FILE).stat().st_size
     now = T0 + 4 * 86_400 * S
     days_of(bag_dir, limits=MemoryLimits(max_age_ns=round(3.5 * 86_400) * S)).limit(now)
-    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names[1:]
+    assert days_in(bag_dir) == names[1:]
     days_of(bag_dir, limits=MemoryLimits(max_bytes=round(2.5 * size))).limit(now)
-    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == names[2:]
+    assert days_in(bag_dir) == names[2:]
     (bag_dir / "memory" / "mine.mcap").write_bytes(b"of somebody else")
     leaving = days_of(bag_dir, keeps=False, monotonic=iter((0.0, GRACE_S)).__next__)
     leaving.clear()
@@ -554,12 +568,12 @@ def test_after_a_month_numbers_have_one_message_a_minute(bag_dir: Path) -> None:
         split(bag_dir, 60 * nth)
     own_all(bag_dir)
     days = days_of(bag_dir)
-    keep_all(days, bag_dir)
-    before = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    keep_all(bag_dir, days=days)
+    before = topics_in(bag_dir)
     days.limit(T0 + 2 * 86_400 * S)
-    assert Counter(each.channel.topic for each in messages_in(bag_dir / DAY_FILE)) == before
+    assert topics_in(bag_dir) == before
     days.limit(T0 + MONTH_NS + 2 * 86_400 * S)
-    after = Counter(record.channel.topic for record in messages_in(bag_dir / DAY_FILE))
+    after = topics_in(bag_dir)
     assert before["/battery_state"] > 80
     assert after["/battery_state"] <= 10 + 2 * 8 + 1
     assert before - Counter({"/battery_state": before["/battery_state"]}) == after - Counter(
@@ -571,8 +585,7 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
     bag_dir: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     now, path = T0 + MONTH_NS + 2 * 86_400 * S, bag_dir / DAY_FILE
     unthinned = path.stat().st_ino
     days_of(bag_dir).limit(now)
@@ -590,8 +603,7 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
     assert not read
     assert path.stat().st_ino == thinned
     split(bag_dir, 60, name="rec_B")
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    keep_all(bag_dir, "rec_B")
     before = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
     days_of(bag_dir).limit(now)
     after = [one.log_time for one in messages_in(path) if one.channel.topic == "/battery_state"]
@@ -601,8 +613,7 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
 
 def test_a_damaged_day_is_not_thinned_so_that_it_still_says_so(bag_dir: Path) -> None:
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     path = bag_dir / DAY_FILE
     whole = path.read_bytes()
     path.write_bytes(damaged := whole[:300] + bytes(100) + whole[400:])
@@ -641,10 +652,8 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
 def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
     for nth in range(3):
         split(bag_dir, 60 * nth)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir, limits=MemoryLimits(texts=("/chat*",))), bag_dir)
-    for path in (bag_dir / "rec_A").iterdir():
-        path.unlink()
+    keep_all(bag_dir, limits=MemoryLimits(texts=("/chat*",)))
+    shutil.rmtree(bag_dir / "rec_A")
     wanted = {"topic": "/chatter", "condition_type": "contains"}
     found = reply_over(bag_dir, "find_last_match", **wanted, value="4711")
     assert (found["value"], found["from"]) == ({"value": "the code is 4711"}, "memory")
@@ -737,16 +746,14 @@ def test_forgetting_takes_it_out_of_days_to_the_byte(
 ) -> None:
     for nth in range(3):
         split(bag_dir, 60 * nth, labels=("mug", "vodka bottle"))
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
-    for path in (bag_dir / "rec_A").iterdir():
-        path.unlink()
+    keep_all(bag_dir)
+    shutil.rmtree(bag_dir / "rec_A")
     assert b"vodka" in content_of(bag_dir / DAY_FILE)
     monkeypatch.setenv("MEMORY_BAG_DIR", str(bag_dir))
     window = ("--start", T0 / S, "--end", T0 / S + 3600)
     exits(0, "forget", "--topic", "/vision/*", *window, "--yes")
     assert b"vodka" not in content_of(bag_dir / DAY_FILE)
-    topics = {record.channel.topic for record in messages_in(bag_dir / DAY_FILE)}
+    topics = {*topics_in(bag_dir)}
     assert "/odom" in topics
     assert "/vision/scene/scene_objects" not in topics
 
@@ -818,8 +825,7 @@ def test_what_bags_showed_goes_with_the_last_day_of_that_time(bag_dir: Path) -> 
     later = 2 * 86_400
     for nth in range(9):
         split(bag_dir, later + 60 * nth, name="rec_B")
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    keep_all(bag_dir, "rec_B")
     limits = MemoryLimits(max_age_ns=86_400 * S)
     days_of(bag_dir, limits=limits).limit(T0 + (later + 3600) * S)
     assert not read_thinned(bag_dir).silences
@@ -835,8 +841,7 @@ def test_days_whose_bags_nobody_looked_at_say_so(bag_dir: Path) -> None:
     (bag_dir / THINNED_FILE).write_text("{")
     assert note in reply_over(bag_dir, "data_time_range")["notes"]
     split(bag_dir, 3600, name="rec_B")
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir, "rec_B")
+    keep_all(bag_dir, "rec_B")
     [said] = [
         each for each in reply_over(bag_dir, "data_time_range")["notes"] if "memory/ before" in each
     ]
@@ -845,12 +850,9 @@ def test_days_whose_bags_nobody_looked_at_say_so(bag_dir: Path) -> None:
 
 def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
     split(bag_dir, 0)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
-    for path in (bag_dir / "rec_A").iterdir():
-        path.unlink()
-    words = [f"recording.bag_dir='{bag_dir}'", "data.now=latest", "store.enabled=false"]
-    memory = build_memory(load_settings(words, env={}))
+    keep_all(bag_dir)
+    shutil.rmtree(bag_dir / "rec_A")
+    memory = build_memory(shipped_settings(bag_dir))
     shown = span_shown(memory, Call(), span_request(QueryParams("last=1000")))
     [[first, last]] = json.loads(to_json_text(shown))["range"]["thinned"]
     assert (first, last) == pytest.approx((T0 / S, T0 / S + 60), abs=1.0)
@@ -892,7 +894,7 @@ def test_a_day_across_a_step_of_the_clock_is_read_by_the_hours_that_it_has(
 
     monkeypatch.setattr(McapReader, "records", counted)
     for name in ("rec_A", "rec_B"):
-        keep_all(days_of(tmp_path), tmp_path, name)
+        keep_all(tmp_path, name)
     assert asked
 
 
@@ -913,8 +915,7 @@ def test_without_hidden_joints_others_keep_their_own_values(
     seen = [detections(T0 + nth * S, ("0", "mug")) for nth in range(3)]
     messages = [Msg("/joint_states", kind, T0, body), *seen]
     write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", messages)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     [found] = [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.type == kind]
     message: Any = McapReader().decode(found)
     assert message.name == kept
@@ -930,8 +931,7 @@ def test_of_a_latched_message_only_the_hidden_frame_goes(bag_dir: Path) -> None:
     exact = tf(T0, *(transform(T0, "map", each, (0.123456789, 0, 0)) for each in frames))
     messages = [replace(exact, topic="/tf_static"), *(odom(each, 1.0, 2.0) for each in at)]
     write_mcap(bag_dir / "rec_A" / "rec_A_0.mcap", messages)
-    own_all(bag_dir)
-    keep_all(days_of(bag_dir), bag_dir)
+    keep_all(bag_dir)
     [kept] = [one for one in messages_in(bag_dir / DAY_FILE) if one.channel.topic == "/tf_static"]
     message: Any = McapReader().decode(kept)
     assert [each.child_frame_id for each in message.transforms] == ["base_link", "2"]
@@ -943,13 +943,12 @@ def test_a_clock_that_was_ahead_hides_nothing_and_pushes_no_day_out(bag_dir: Pat
     now = SettableClock(T0 + (ahead + 100) * S)
     for start, name in ((ahead, "rec_A"), (0, "rec_B"), (86_400, "rec_C")):
         split(bag_dir, start, name=name)
-        own_all(bag_dir)
-        keep_all(days_of(bag_dir), bag_dir, name, clock=now)
+        keep_all(bag_dir, name, clock=now)
         (bag_dir / name / f"{name}_{start // 60}.mcap").unlink()
         now = SettableClock(T0 + 86_400 * S)
     assert read_thinned(bag_dir).since == T0
     assert "are not known" not in str(reply_over(bag_dir, "data_time_range"))
-    days = sorted(path.name for path in (bag_dir / "memory").glob("*.mcap"))
+    days = days_in(bag_dir)
     size = sum(path.stat().st_size for path in (bag_dir / "memory").glob("*.mcap"))
     days_of(bag_dir, limits=MemoryLimits(max_bytes=size - 1)).limit(T0 + 90_000 * S)
-    assert sorted(path.name for path in (bag_dir / "memory").glob("*.mcap")) == days[:2]
+    assert days_in(bag_dir) == days[:2]

@@ -73,7 +73,7 @@ def test_a_year_of_a_home_robot_fits_a_gigabyte(tmp_path: Path) -> None:
     chance, path = np.random.default_rng(SEED), tmp_path / "rec_A" / "rec_A_0.mcap"
     write_mcap(path, sorted(published(chance, begin), key=attrgetter("log_time")))
     days = days_of(tmp_path)
-    keep_all(days, tmp_path)
+    keep_all(tmp_path, days=days)
     [day] = tmp_path.glob("memory/*.thinned.mcap")
     young = day.stat().st_size
     assert young < path.stat().st_size / 20
