@@ -13,10 +13,8 @@ from ros2_memory.analysis.facts import (
     COMMAND,
     DIAGNOSTICS,
     ERROR,
-    FLAG,
     GOAL,
     GOALS,
-    LABEL,
     STATUS,
     Word,
     charge_levels,
@@ -33,21 +31,6 @@ def stated(value: JsonValue, type_name: str) -> dict[Word, float]:
     """The facts of a message, without the NaN of those that have no value."""
     facts = state_of(value, type_name).facts
     return {word: 0 if math.isnan(value) else value for word, value in facts}
-
-
-def test_labels_and_booleans_are_found_in_values() -> None:
-    cups: JsonValue = {
-        "detections": [
-            {"label": "cup"},
-            {"label": "cup", "score": 0.5},
-            {"label": "cup", "score": 0.7},
-            {"label": "cup", "score": 0.6},
-        ]
-    }
-    assert stated(cups, "x/msg/Y") == {Word(LABEL, "cup"): 0.7}
-    assert stated({"value": True}, "std_msgs/msg/Bool") == {Word(FLAG, "value"): 1}
-    assert stated({"a": {"b": False, "list": [True]}}, "x/msg/Y") == {Word(FLAG, "a.b"): 0}
-    assert stated({"value": 3.5}, "std_msgs/msg/Float64") == {}
 
 
 def test_statuses_and_goals_have_a_value_each() -> None:

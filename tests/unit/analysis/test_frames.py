@@ -329,12 +329,6 @@ def test_stamps_near_log_time_are_the_clock(held: list[StampedTransform], clock:
     assert agreeing_clock(edges_of(held)) == clock
 
 
-def test_static_transforms_say_nothing_of_the_clock() -> None:
-    latched = [edge("a", "b", 0, log_time=10**18, static=True) for _ in range(9)]
-    assert Tree([*latched, *replayed(0)], "auto").frames("a").clock == "stamp"
-    assert Tree(latched, "auto").frames("a").clock == "stamp"
-
-
 def test_a_tree_on_log_time_is_asked_in_log_time() -> None:
     tree = Tree(replayed(1000 * S), "log")
     assert shift(tree, "odom", "base", 1101 * S) == 1.0
@@ -402,19 +396,6 @@ def test_a_transform_of_a_track_holds_a_little_into_a_gap(parents: tuple[str, st
     last = 22.0 if parents[1] == "map" else 122.0
     times = [at * S for at in (12, 13, 19, 20)]
     assert held(tree, "map", "odom", times) == [10.0, None, None, last]
-
-
-def test_a_static_transform_holds_until_the_next_one_of_its_child() -> None:
-    tree = Tree(
-        [
-            edge("base", "camera", 0, 1.0, static=True),
-            edge("base", "camera", 0, 5.0, log_time=20 * S, static=True),
-            edge("torso", "camera", 0, 7.0, log_time=40 * S, static=True),
-        ]
-    )
-    times = [-S, 19 * S, 20 * S, 30 * S, 40 * S]
-    assert held(tree, "base", "camera", times) == [1.0, 1.0, 5.0, 5.0, None]
-    assert held(tree, "torso", "camera", times) == [None, None, None, None, 7.0]
 
 
 def test_of_static_transforms_of_one_moment_the_last_is_used() -> None:

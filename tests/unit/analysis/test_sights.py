@@ -68,13 +68,6 @@ def test_spots_that_grew_together_are_one_where_no_message_has_both() -> None:
     assert found.spots[:, Spot.N].tolist() == [18]
 
 
-def test_a_look_counts_every_message_from_a_pose_whether_it_saw_anything_or_not() -> None:
-    found = sights_of([mug(1.0)], [], [], [mug(1.0)])
-    [look] = found.looks
-    assert look[Look.N] == 4
-    assert found.hits.tolist() == [[0, 0, 2]]
-
-
 def test_looks_differ_by_place_and_direction() -> None:
     poses = [(0.1, 0.1, 0.05), (0.2, 0.2, 0.1), (0.3, 0.1, 0.05), (0.1, 0.1, 1.0)]
     messages = [Message("/detections", nth, pose, []) for nth, pose in enumerate(poses)]
@@ -82,26 +75,6 @@ def test_looks_differ_by_place_and_direction() -> None:
     assert sorted(looks[:, Look.N].tolist()) == [1, 1, 2]
     assert looks[0, Look.X] == 150
     assert looks[0, Look.YAW] == 43  # the mean of 2.9 and 5.7 degrees
-
-
-def test_without_a_pose_of_the_robot_a_detection_counts_and_its_look_is_from_nowhere() -> None:
-    found = sights_of([mug(1.0)], robot=None)
-    assert found.looks[:, [Look.N, Look.YAW]].tolist() == [[1, NO_YAW]]
-    assert found.hits.tolist() == [[0, -1, 1]]
-
-
-def test_detections_without_a_place_are_counted_apart() -> None:
-    found = sights_of(
-        [PlacedDetection("mug", None)], [PlacedDetection("mug", (math.inf, 0, 0)), mug(1.0)]
-    )
-    assert found.spots[:, Spot.N].tolist() == [1]
-    assert found.unplaced[:, Unplaced.N].tolist() == [2]
-
-
-def test_scores_are_counted_in_bins_and_the_best_is_kept() -> None:
-    found = sights_of([mug(1.0, score=0.52)], [mug(1.0, score=0.54)], [mug(1.0, score=7.0)])
-    assert found.spots[0, Spot.BEST] == 7000
-    assert found.scores[:, [Score.BIN, Score.N]].tolist() == [[10, 2], [19, 1]]
 
 
 def test_a_score_that_is_no_number_is_none() -> None:
@@ -121,12 +94,6 @@ def test_other_labels_beside_a_detection_of_the_same_message_are_counted() -> No
         for row in found.beside
     }
     assert by_spot == {("mug", "cup"): 1, ("cup", "mug"): 1}
-
-
-def test_what_moves_through_a_bag_makes_a_bounded_number_of_spots() -> None:
-    found = sights_of(*[[mug(float(nth))] for nth in range(200)])
-    assert len(found.spots) == 128
-    assert found.unplaced[:, Unplaced.N].tolist() == [72]
 
 
 def test_labels_beside_a_detection_are_counted_in_a_crowd_too() -> None:

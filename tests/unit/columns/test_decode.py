@@ -6,13 +6,11 @@ import random
 import struct
 import tempfile
 from pathlib import Path
-from typing import Final
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.examples import LONG, examples
@@ -20,8 +18,6 @@ from tests.support.leaves import Comparison
 from tests.support.shared_bags import REAL, RECORDED, needs_real, needs_recorded
 from tests.unit.columns.decoded_bags import bag_of, decoded_alike, tables_of
 from tests.unit.columns.drawn_types import DrawnTypes, drawn_types
-
-EVERYTHING: Final = TimeWindow.everything()
 
 
 def bags_below(folder: Path) -> list[Path]:

@@ -96,13 +96,3 @@ def test_a_table_is_freed_when_nobody_holds_it_without_the_garbage_collector() -
         assert loads() is None
     finally:
         gc.enable()
-
-
-def test_layouts_read_what_they_write_and_refuse_other_tables() -> None:
-    layout = Layout.of(table(), None)
-    assert Layout.from_json(layout.to_json()) == layout
-    with pytest.raises(ValueError, match="other columns"):
-        packed_part(Layout(layout.slots), [(table(), np.ones(40, np.int64))])
-    for text in ("", "[]", "{}", '{"columns": {"x": "float64 coarse"}}', '{"columns": 3}'):
-        with pytest.raises((ValueError, LookupError, TypeError)):
-            Layout.from_json(text)

@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.facts import LABEL, Facts, State, Word, state_of, stated_by
 from ros2_memory.columns.stated import StatedColumns
-from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import examples
 from tests.support.memories import shipped_extractor
 from tests.unit.columns.drawn_tables import Drawn, drawn_tables, stored
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
 
 EXTRACTOR = shipped_extractor()
-T0 = 1_784_000_000 * NS_PER_S
 SETTLED = (
     "std_msgs/msg/Bool",
     "std_msgs/msg/String",

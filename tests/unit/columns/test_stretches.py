@@ -7,12 +7,11 @@ import sqlite3
 from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING
 
 import pytest
 
 from ros2_memory.columns import scan
-from ros2_memory.columns.fragments import FragmentKind
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -25,6 +24,7 @@ from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
 from tests.support.bags import McapLayout, Msg, boolean, odom, tf, transform, write_mcap
 from tests.support.column_worlds import World, store_file
+from tests.unit.columns.test_fragments import WORDS, Words
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -37,19 +37,6 @@ T0 = 1_700_000_400 * S
 LENGTH = 1200 * S
 """Of a stretch in these tests: one begins at T0."""
 WINDOW = TimeWindow(T0 - LENGTH, T0 + 6 * LENGTH)
-
-
-class Words(NamedTuple):
-    """A value to store: some words."""
-
-    words: str
-
-    @property
-    def memory_bytes(self) -> int:
-        return 100
-
-
-WORDS: Final[FragmentKind[Words]] = FragmentKind("words", (Words,))
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -35,7 +35,6 @@ S = 10**9
 BEGIN = 1_783_998_000 * S
 HOUR = 3600
 LATEST = QuerySettings(now="latest")
-FIELDS = ("position.x", "position.y", "orientation.yaw_deg")
 
 
 def storing(memory: Memory, folder: Path, draw: Random, *, part: float = 1.0) -> Memory:

@@ -98,19 +98,6 @@ def test_a_condition_takes_the_labels_that_meet_it_alone(tmp_path: Path) -> None
     assert (none["rows"], none["all"][0]) == ([], 0)
 
 
-def test_a_condition_on_another_topic_bounds_what_was_seen(tmp_path: Path) -> None:
-    world = draw(6, 90)
-    write(world, tmp_path)
-    memory = asked_of(tmp_path, stored=False)
-    nobody = {"topic": "/odom", "condition_type": "above", "value": 3.0, "field": "position.x"}
-    reply = asked(memory, tmp_path, "find_matches", **ANY, **{"while": nobody})
-    seconds = [nth for nth in range(90) if world.x[nth] > 3.0]
-    rows = rows_of(reply)
-    for label in PLACES:
-        truth = expected(world, seconds, label)
-        assert truth is None or shown(rows[label]) == pytest.approx(truth)
-
-
 def test_topics_of_a_glob_are_counted_as_one(tmp_path: Path) -> None:
     left = [detections((BEGIN + at) * S, ["cup"], topic="/left/seen") for at in range(5)]
     right = [
@@ -165,12 +152,6 @@ def test_json_objects_with_a_list_of_detections_in_texts_are_counted(tmp_path: P
     for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
         rows = rows_of(asked(memory, tmp_path, "find_matches", **asking))
         assert [rows[label]["best_score"] for label in ("cup", "fork")] == [0.8, 0.4]
-
-
-def test_a_topic_without_detections_has_no_rows(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", [text(BEGIN * S, "cup")])
-    reply = asked(memory_of(tmp_path), tmp_path, "find_matches", **{**ANY, "topic": "/chatter"})
-    assert reply["rows"] == []
 
 
 @pytest.mark.parametrize(

@@ -22,9 +22,10 @@ def at_log_time(message: Msg) -> int:
     return message.log_time
 
 
-@pytest.fixture
-def bag_dir(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """1000 s of a robot that says latched when it docks, and every 4 s whether it bumped."""
+    folder = tmp_path_factory.mktemp("bags")
     messages = [odom(T0 + at * S, 0.0, 0.0) for at in range(0, 1001, 2)]
     messages += [boolean(T0 + at * S, value, DOCKED) for at, value in TOGGLES]
     messages += [boolean(T0 + at * S, at >= 700, BUMPER) for at in range(0, 1001, 4)]
@@ -32,8 +33,8 @@ def bag_dir(tmp_path: Path) -> Path:
     for nth in range(2):
         some = [each for each in messages if (each.log_time - T0) // (600 * S) == nth]
         layout = McapLayout(latched=frozenset({DOCKED}))
-        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", some, layout)
-    return tmp_path
+        write_mcap(folder / "rec" / f"rec_{nth}.mcap", some, layout)
+    return folder
 
 
 def matches(bag_dir: Path, topic: str, first: float, last: float, **more: object) -> Any:

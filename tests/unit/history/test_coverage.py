@@ -57,12 +57,6 @@ def test_many_files_are_counted_and_the_last_ones_named() -> None:
     ]
 
 
-def test_a_file_that_is_written_beside_closed_ones_is_named() -> None:
-    active = SetAside(Path("/b/other/other_0.mcap"), "still being written")
-    snapshot = Snapshot(Timeline.of((split(0), split(1))), active=(active,), scanned_at=T0 + 25 * S)
-    assert told(snapshot, 0, 9) == ["still being written and not included: other/other_0.mcap"]
-
-
 def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:
     active = SetAside(Path("/b/copied/copied_0.db3"), "still being written")
     timeline = Timeline.of((split(0), split(1)))

@@ -9,18 +9,15 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.frames import edges_of
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.scan import scan
-from ros2_memory.history.transforms import edges_of_rows, frames_over, sessions_of
+from ros2_memory.history.transforms import frames_over, sessions_of
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, tf, transform, write_mcap
-from tests.support.column_worlds import EVERYTHING, World
+from tests.support.column_worlds import World
 from tests.support.examples import examples
 
 if TYPE_CHECKING:
@@ -62,32 +59,6 @@ def world(folder: Path, cuts: list[int]) -> World:
 def session_of(view: View) -> Session:
     [session] = {sessions_of(view).of(path) for path in view.snapshot.timeline.recordings("/tf")}
     return session
-
-
-@pytest.mark.parametrize("stored", [False, True])
-def test_columns_hold_the_transforms_of_the_messages(tmp_path: Path, stored: bool) -> None:
-    made = world(tmp_path, [13, 30])
-    if stored:
-        assert made.fill() == 3
-    view = View(made.memory, Call())
-    expected = edges_of(
-        edge
-        for found in view.stream.messages(["/tf"], EVERYTHING)
-        for edge in made.memory.extractor.transforms(
-            made.memory.reader.decode(found.record), found.time, static=False
-        )
-    )
-    session = session_of(view)
-    found = [edges_of_rows(view, rows, session) for rows in scan(view, "/tf", EVERYTHING)]
-    assert {pair for edges in found for pair in edges} == expected.keys()
-    for pair, whole in expected.items():
-        parts = [edges[pair] for edges in found if pair in edges]
-        assert [at for edge in parts for at in edge.stamps.tolist()] == whole.stamps.tolist()
-        assert [at for edge in parts for at in edge.log_times.tolist()] == whole.log_times.tolist()
-        translation = np.concatenate([edge.translation for edge in parts])
-        rotation = np.concatenate([edge.rotation for edge in parts])
-        assert translation == pytest.approx(whole.translation, abs=6e-5)
-        assert rotation == pytest.approx(whole.rotation, abs=6e-5)
 
 
 @settings(max_examples=examples(15), deadline=None)

@@ -125,14 +125,13 @@ def test_telemetry_that_is_transient_local_does_not_hold(tmp_path: Path, recalls
     assert set(reply(memory, TELEMETRY, T0 + 365 * 86_400 * S)) == {"error"}
 
 
-@each_way
 @pytest.mark.parametrize(("period_s", "holds"), [(4.9, False), (5.1, True), (60.0, True)])
 def test_what_is_published_every_five_seconds_or_less_often_holds(
-    tmp_path: Path, period_s: float, holds: bool, recalls: bool
+    tmp_path: Path, period_s: float, holds: bool
 ) -> None:
     latched = every(period_s, 120, MAP)
     record(tmp_path / "rec", [*latched, *drive(T0, T0 + 130 * S)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path)
     at = latched[-1].log_time + 3 * S
     found = reply(memory, MAP, at)
     assert ("error" not in found) is holds
@@ -140,12 +139,9 @@ def test_what_is_published_every_five_seconds_or_less_often_holds(
         assert (found["latched"], found["age_s"]) == (True, 3.0)
 
 
-@each_way
-def test_a_map_that_was_published_once_holds_and_says_how_old_it_is(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_map_that_was_published_once_holds_and_says_how_old_it_is(tmp_path: Path) -> None:
     record(tmp_path / "rec", [text(T0 + S, "office", MAP), *drive(T0, T0 + 30 * S)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = remembered(tmp_path)
     found = reply(memory, MAP, T0 + 29 * S)
     assert (found["value"], found["latched"], found["age_s"]) == ({"value": "office"}, True, 28.0)
     assert "error" in reply(memory, MAP, T0)

@@ -172,11 +172,6 @@ def test_before_looks_only_at_what_came_up_to_then(bag_dir: Path) -> None:
         assert last(memory, "contains", "cup", before_s=T0_S + 5).found is None
 
 
-def test_before_must_be_a_moment(bag_dir: Path) -> None:
-    with pytest.raises(InvalidArgumentsError, match="before"):
-        last(memory_of(bag_dir), "contains", "cup", before_s=float("nan"))
-
-
 def test_a_search_that_runs_out_of_time_says_how_far_it_got_and_can_go_on(bag_dir: Path) -> None:
     memory = memory_of(bag_dir)
     found: Match | None = None

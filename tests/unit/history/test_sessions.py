@@ -18,7 +18,7 @@ from ros2_memory.queries import (
     transform,
     value_when,
 )
-from tests.support.bags import Msg, detections, make, odom, tf, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, tf, write_splits
 from tests.support.bags import transform as stamped
 from tests.support.memories import each_way, memory_of
 
@@ -49,17 +49,7 @@ def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
 
 
 def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    by_split: dict[int, list[Msg]] = {}
-    begin = min(each.log_time for each in messages)
-    for each in sorted(messages, key=lambda message: message.log_time):
-        by_split.setdefault((each.log_time - begin) // (split_s * S), []).append(each)
-    for nth, some in by_split.items():
-        write_mcap(folder / f"{folder.name}_{nth}.mcap", some)
-
-
-def remembered(root: Path, *, recalls: bool) -> Memory:
-    return memory_of(root, recalls=recalls)
+    write_splits(folder.parent, messages, split_s, folder.name)
 
 
 def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
@@ -84,21 +74,20 @@ def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
     """The boat stands at 5 m of its map throughout; the other robot drives from 100 m to 110."""
     apart = nav2_days * DAY
     two_robots(tmp_path, BEGIN + apart, BEGIN)
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     assert arrivals(memory, 5.0) == [0.0]
     assert arrivals(memory, 103.0) == [round(apart / S + 6.8, 1)]
     assert visits(memory, Call(), 3.0, 0.0, radius_m=0.3).visits == ()
     assert visits(memory, Call(), 105.0, 0.0, radius_m=0.3).total == 1
 
 
-@each_way
-def test_another_robots_static_transform_places_nothing(tmp_path: Path, recalls: bool) -> None:
+def test_another_robots_static_transform_places_nothing(tmp_path: Path) -> None:
     """A boat without a map has no position in that of another robot."""
     record(tmp_path / "nav2", [static(BEGIN - DAY, "map", "odom", 100.0), *drive(BEGIN - DAY, 20)])
     record(
         tmp_path / "boat", [*moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5), *drive(BEGIN, 20)]
     )
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
     with pytest.raises(NoDataError):
         transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 5 * S)))
@@ -109,14 +98,11 @@ def asked(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> 
     return round(found.transform.translation[0], 3)
 
 
-@each_way
-def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_path: Path) -> None:
     first, second = "rec_20260714T000000Z", "rec_20260714T000001Z"
     for name, x in ((first, 100.0), (second, 500.0)):
         record(tmp_path / name, [static(BEGIN, "map", "odom", x), *drive(BEGIN, 20)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     found = transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(BEGIN + 4 * S)))
     named = {100.0: first, 500.0: second}[found.transform.translation[0]]
     [note] = [note for note in found.notes if "2 sessions" in note]
@@ -129,7 +115,7 @@ def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, reca
     poses = [odom(BEGIN + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
     changed = [static(BEGIN, "map", "odom", 0.0), static(BEGIN + 8 * S, "map", "odom", 50.0)]
     record(tmp_path / "one", [*changed, *poses], split_s=60)
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     there, later = (visits(memory, Call(), x, 0.0, radius_m=1.0).visits for x in (0.0, 50.0))
     assert [((each.arrived or 0) - BEGIN, (each.departed or 0) - BEGIN) for each in there] == [
         (0, 39 * S // 5)
@@ -147,12 +133,12 @@ def test_recordings_joined_by_a_handover_share_their_transforms(
     first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T010000Z"
     record(first, [static(BEGIN, "map", "odom", 7.0), *drive(BEGIN, 20)])
     record(second, [static(BEGIN + 21 * S, "base_link", "laser", 1.0), *drive(BEGIN + 21 * S, 20)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     with pytest.raises(NoDataError):
         asked(memory, BEGIN + 33 * S)
     write_handover(first, Handover(next=second.name))
     write_handover(second, Handover(previous=first.name))
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     assert asked(memory, BEGIN + 33 * S) == 7.0
     assert arrivals(memory, 12.0) == [pytest.approx(30.6, abs=0.3), pytest.approx(9.6, abs=0.3)]
 
@@ -163,7 +149,7 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     record(tmp_path / "fixed", [static(BEGIN, "map", "odom", 7.0)])
     record(tmp_path / "moving", moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5))
     record(tmp_path / "sensors", drive(BEGIN, 20))
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     at = AtTime(unix_from_ns(BEGIN + 4 * S))
     joined = transform(memory, Call(), "map", "base_link", at)
     assert joined.transform.translation[0] == pytest.approx(9.0)
@@ -176,14 +162,13 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     assert note.endswith("those of fixed and moving")
 
 
-@each_way
 @pytest.mark.parametrize("later_s", [0, 30])
-def test_a_loan_is_never_silent(tmp_path: Path, later_s: int, recalls: bool) -> None:
+def test_a_loan_is_never_silent(tmp_path: Path, later_s: int) -> None:
     """Whether `nav2` is the same robot cannot be known; a day apart it is another."""
     base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
     record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
     record(tmp_path / "boat", drive(BEGIN + later_s * S, 60))
-    answer = visits(remembered(tmp_path, recalls=recalls), Call(), 105.0, 0.0)
+    answer = visits(memory_of(tmp_path), Call(), 105.0, 0.0)
     assert answer.total == 1
     assert [note for note in answer.notes if "boat" in note and "those of nav2" in note]
 
@@ -196,21 +181,20 @@ def test_a_recording_of_another_time_lends_nothing(
     base = moving(BEGIN, 60, "odom", "base_link", 0.0, 0.5)
     record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *base])
     record(tmp_path / "boat", drive(BEGIN + apart, 60))
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     assert visits(memory, Call(), 105.0, 0.0).total == 0
     assert visits(memory, Call(), 5.0, 0.0).frame_id == "odom"
 
 
-@each_way
 @pytest.mark.parametrize("has_tf", [False, True])
 def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
-    tmp_path: Path, has_tf: bool, recalls: bool
+    tmp_path: Path, has_tf: bool
 ) -> None:
     """A boat without a map was nowhere in that of the other robot, and a note says so."""
     record(tmp_path / "nav2", [static(BEGIN, "map", "odom", 100.0), *drive(BEGIN, 20, 0.0)])
     base = moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5) if has_tf else []
     record(tmp_path / "boat", [*base, *drive(BEGIN, 20)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = visits(memory, Call(), 105.0, 0.0)
     assert (answer.frame_id, answer.total) == ("map", 0)
     assert visits(memory, Call(), 100.0, 0.0).total == 1
@@ -238,7 +222,7 @@ def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
     boat = moving(BEGIN, 20, "map", "odom", 5.0, -0.5)
     boat += moving(BEGIN, 20, "odom", "base_link", 0.0, 0.5)
     record(tmp_path / "boat", [*boat, *drive(BEGIN, 20)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path, recalls=recalls)
     topic = detections(BEGIN, []).topic
     [found] = find_matches(memory, Call(), topic, "contains", "scissors").sightings
     assert found.thing is not None
@@ -249,23 +233,18 @@ def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
     assert found.robot.position[0] == pytest.approx(102.0)
 
 
-def boolean(at: int, *, on: bool) -> Msg:
-    return Msg("/bumper", "std_msgs/msg/Bool", at, make("std_msgs/msg/Bool", data=on))
-
-
 def two_at_once(root: Path) -> None:
     """Two robots of one time on the same topics: r1 drives 20 m, r2 stands at 50 m and bumps."""
     ticks = [BEGIN + nth * S // 5 for nth in range(101)]
-    bumps = [boolean(at + 1, on=False) for at in ticks]
+    bumps = [boolean(at + 1, False) for at in ticks]
     record(root / "r1", [*drive(BEGIN, 20, 1.0), *bumps])
-    bumps = [boolean(at + 2, on=at == ticks[50]) for at in ticks]
+    bumps = [boolean(at + 2, at == ticks[50]) for at in ticks]
     record(root / "r2", [*[odom(at + S // 10, 50.0, 0.0, 0.0) for at in ticks], *bumps])
 
 
-@each_way
-def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path, recalls: bool) -> None:
+def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
     two_at_once(tmp_path)
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     reply = value_when(
         memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
     )
@@ -275,24 +254,20 @@ def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path, recalls: bool)
     assert not [note for note in reply.notes if "the match is of" in note]
 
 
-@each_way
-def test_a_value_of_another_recording_than_the_match_is_noted(
-    tmp_path: Path, recalls: bool
-) -> None:
-    record(tmp_path / "r1", [boolean(BEGIN + 4 * S + 1, on=True)])
+def test_a_value_of_another_recording_than_the_match_is_noted(tmp_path: Path) -> None:
+    record(tmp_path / "r1", [boolean(BEGIN + 4 * S + 1, True)])
     record(tmp_path / "r2", drive(BEGIN, 20))
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
     assert reply.value is not None
     assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
 
 
-@each_way
-def test_a_frame_without_a_name_is_none(tmp_path: Path, recalls: bool) -> None:
+def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
     """Neither listed, nor a reason to advise another time."""
     nameless = moving(BEGIN, 20, "", "base_link", 0.0, 0.0)
     record(tmp_path / "one", [*nameless, *moving(BEGIN, 20, "odom", "wheel", 0.0, 0.0)])
-    memory = remembered(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     found = frames(memory, Call())
     assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
     assert [note for note in found.notes if "no name" in note and note.endswith("1")]

@@ -121,9 +121,8 @@ def test_no_reply_about_public_bags_from_time_zero_does(
     hold(memory, bag_dir, topic if topic in topics else topics[0])
 
 
-@each_way
-def test_a_search_of_everything_says_that_it_began_at_zero(bag_dir: Path, recalls: bool) -> None:
-    memory = memory_at(bag_dir, recalls)
+def test_a_search_of_everything_says_that_it_began_at_zero(bag_dir: Path) -> None:
+    memory = memory_at(bag_dir, recalls=False)
     reply = asked(memory, bag_dir, "find_matches", topic="/bumper", **SEARCH)
     assert reply["searched_from"] == 0.0
     assert reply["searched_to"] == 9.0
@@ -145,16 +144,14 @@ def test_a_window_that_begins_below_zero_is_clamped(bag_dir: Path, recalls: bool
     assert "-5.000000" in nothing["detail"]
 
 
-@each_pair
 @pytest.mark.parametrize("begin_s", [0, 1_784_000_000])
-@pytest.mark.parametrize(("start", "end"), [(-50, -10), (-1e300, -1e-6), (-5, -5), (-1, 0)])
+@pytest.mark.parametrize(("start", "end"), [(-1e300, -1e-6), (-5, -5), (-1, 0)])
 def test_a_window_below_zero_is_clamped_at_both_ends(
-    tmp_path: Path, recalls: bool, now: Now, begin_s: int, start: float, end: float
+    tmp_path: Path, begin_s: int, start: float, end: float
 ) -> None:
     messages = [odom((begin_s + 1 + n) * S, n * 0.1, 0.0) for n in range(5)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*messages, boolean((begin_s + 1) * S, True)])
-    clock = SettableClock((begin_s + 9) * S)
-    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(now=now), recalls=recalls)
+    memory = memory_of(tmp_path, clock=SettableClock((begin_s + 9) * S))
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "recap", **window)
     assert (told["start"], told["end"], told["events"]) == (0.0, 0.0, [])
@@ -165,14 +162,13 @@ def test_a_window_below_zero_is_clamped_at_both_ends(
         assert "no message of /odom between 0.000000 and 0.000000" in told["detail"]
 
 
-@each_way
 @pytest.mark.parametrize(("start", "end"), [(1.0, 2.0), (1e9, 1e9), (1.9e9, 2e9), (0.0, 2e9)])
 def test_no_span_that_was_searched_ends_before_it_begins(
-    tmp_path: Path, recalls: bool, start: float, end: float
+    tmp_path: Path, start: float, end: float
 ) -> None:
     begin = 1_784_000_000 * S
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [boolean(begin + n * S, True) for n in range(5)])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     window = {"start": start, "end": end}
     told = asked(memory, tmp_path, "find_matches", topic="/bumper", **SEARCH, **window)
     if not end > begin / S > start:

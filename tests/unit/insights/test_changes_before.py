@@ -88,10 +88,9 @@ def test_what_changed_is_listed_the_nearest_first(tmp_path: Path, recalls: bool)
     assert "notes" not in reply
 
 
-@each_way
-def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path, recalls: bool) -> None:
+def test_a_recap_lists_with_each_stop_what_changed_before(tmp_path: Path) -> None:
     write_splits(tmp_path, ALL)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     reply = asked(memory, tmp_path, "recap", start=BEGIN / S, end=BEGIN / S + 60)
     [stop] = [each for each in reply["events"] if each["text"].startswith("stood")]
     assert [each["text"] for each in stop["before"]] == [
@@ -111,10 +110,7 @@ def test_a_window_that_begins_with_the_stop_knows_what_changed_before(tmp_path: 
     assert "/bumper became true" in [each["text"] for each in stop["before"]]
 
 
-@each_way
-def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(tmp_path: Path) -> None:
     calm = [
         *driving(40, 20),
         *(boolean(at(t), False) for t in range(40)),
@@ -122,13 +118,13 @@ def test_that_nothing_changed_is_an_answer_where_topics_are_recorded(
         log_entry(at(3), 20, "motor", "on"),
     ]
     write_splits(tmp_path, calm)
-    reply = before(tmp_path, 20.0, recalls=recalls)
+    reply = before(tmp_path, 20.0)
     assert reply["before"] == []
     assert reply["looked_at"] == ["/bumper", "/diagnostics", "/rosout"]
     assert reply["recorded_topics"] == 4
     assert reply["notes"] == ["nothing changed on the topics looked at in the 10 s before"]
-    assert before(tmp_path, 7.123457, recalls=recalls)["around"] == at(7.123457) / 1e9
-    later = before(tmp_path, 500.0, recalls=recalls)["notes"]
+    assert before(tmp_path, 7.123457)["around"] == at(7.123457) / 1e9
+    later = before(tmp_path, 500.0)["notes"]
     assert "nothing was recorded in the 10 s before" in later
     assert not [each for each in later if "nothing changed" in each]
 
@@ -245,16 +241,15 @@ def test_what_went_wrong_has_room_before_goals_that_merely_succeeded(tmp_path: P
     assert any("before" not in each for each in stops)
 
 
-@each_way
-def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path, recalls: bool) -> None:
+def test_the_first_changes_after_a_moment_are_told_apart(tmp_path: Path) -> None:
     late = [log_entry(at(40 + t), 30, name, "late") for t, name in ((0.4, "a"), (5.2, "f"))]
     late += [log_entry(at(41 + 0.7 * nth), 30, name, "late") for nth, name in enumerate("bcde")]
     write_splits(tmp_path, [*driving(60, 40), *late])
-    reply = before(tmp_path, 40.0, recalls=recalls)
+    reply = before(tmp_path, 40.0)
     assert told(reply) == [("warning of a: late", 0.0)]
     assert [(each["text"], each["s_after"]) for each in reply["after"]] == [
         ("warning of b: late", 1.0),
         ("warning of c: late", 1.7),
         ("warning of d: late", 2.4),
     ]
-    assert before(tmp_path, 50.0, recalls=recalls)["after"] == []
+    assert before(tmp_path, 50.0)["after"] == []

@@ -15,7 +15,7 @@ from tests.support.clocks import SettableClock
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
@@ -47,29 +47,30 @@ def recorded(
     return memory_of(folder, clock=SettableClock((BEGIN + 1000) * S))
 
 
-@pytest.fixture(params=[None, 1.0, 0.0], ids=["no store", "all columns", "few columns"])
-def known(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[[Memory], Memory]:
-    share: float | None = request.param
-    return lambda memory: memory if share is None else with_store(memory, tmp_path, share=share)
+def each_known(memory: Memory) -> Iterator[Memory]:
+    """The memory without a store, with one of all columns, and with one of few."""
+    yield memory
+    for share in (1.0, 0.0):
+        yield with_store(memory, memory.index.bag_dir, share=share)
 
 
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
 def test_a_clock_that_was_set_forward_is_reported_wherever_it_is_asked(
-    tmp_path: Path, known: Callable[[Memory], Memory], when: float
+    tmp_path: Path, when: float
 ) -> None:
-    memory = known(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > when)))
-    at = BEGIN + round(when - 0.05, 1)
-    expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(8.0, abs=0.01)}]
-    assert asked(memory, tmp_path, "data_time_range")["clock_steps"] == expected
-    status = asked(memory, tmp_path, "memory_status")
-    assert status["clock_steps"] == expected
-    assert status["doubts"].endswith("the clock was set 8 s ahead")
-    reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 100)
-    [event] = [each for each in reply["events"] if "clock" in each["text"]]
-    assert event["text"] == "the clock was set forward by 8 s"
-    assert reply["counts"]["clock steps"] == 1
-    later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
-    assert "clock steps" not in later["counts"]
+    for memory in each_known(recorded(tmp_path, shown=lambda t: t + 8.0 * (t > when))):
+        at = BEGIN + round(when - 0.05, 1)
+        expected = [{"at": pytest.approx(at, abs=1e-5), "step_s": pytest.approx(8.0, abs=0.01)}]
+        assert asked(memory, tmp_path, "data_time_range")["clock_steps"] == expected
+        status = asked(memory, tmp_path, "memory_status")
+        assert status["clock_steps"] == expected
+        assert status["doubts"].endswith("the clock was set 8 s ahead")
+        reply = asked(memory, tmp_path, "recap", start=BEGIN, end=BEGIN + 100)
+        [event] = [each for each in reply["events"] if "clock" in each["text"]]
+        assert event["text"] == "the clock was set forward by 8 s"
+        assert reply["counts"]["clock steps"] == 1
+        later = asked(memory, tmp_path, "recap", start=BEGIN + 100, end=BEGIN + 150)
+        assert "clock steps" not in later["counts"]
 
 
 def test_a_suspected_hole_is_read_once(tmp_path: Path) -> None:
@@ -141,10 +142,10 @@ def test_what_only_looks_like_a_step_is_none(
     assert steps(memory, tmp_path) == []
 
 
-@pytest.mark.parametrize("queued", [3, 10, 100])
+@pytest.mark.parametrize("queued", [3, 100])
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
 def test_what_queued_up_while_the_recorder_stalled_is_no_step(
-    tmp_path: Path, known: Callable[[Memory], Memory], when: float, queued: int
+    tmp_path: Path, when: float, queued: int
 ) -> None:
     """Each topic has a queue of so many messages; what is received late was sent in its cadence."""
 
@@ -161,7 +162,8 @@ def test_what_queued_up_while_the_recorder_stalled_is_no_step(
             messages.append(replace(boolean(logged, data=False), publish_time=at))
     write_splits(tmp_path, messages)
     memory = memory_of(tmp_path, clock=SettableClock((BEGIN + 1000) * S))
-    assert steps(known(memory), tmp_path) == []
+    for each in each_known(memory):
+        assert steps(each, tmp_path) == []
 
 
 def stamped(
@@ -188,15 +190,15 @@ def stamped(
 @pytest.mark.parametrize("by", [2.0, 0.8])
 @pytest.mark.parametrize("when", [54.95, 59.95], ids=["in a split", "between two"])
 def test_a_clock_set_while_the_robot_stands_shows_in_stamps_of_another_clock(
-    tmp_path: Path, known: Callable[[Memory], Memory], when: float, by: float
+    tmp_path: Path, when: float, by: float
 ) -> None:
-    memory = known(stamped(tmp_path, delay=lambda t: by * (t > when)))
-    [step] = steps(memory, tmp_path)
-    at = BEGIN + round(when - 0.05, 1)
-    assert step == {
-        "at": pytest.approx(at, abs=1e-5),
-        "step_s": pytest.approx(by, abs=0.01),
-    }
+    for memory in each_known(stamped(tmp_path, delay=lambda t: by * (t > when))):
+        [step] = steps(memory, tmp_path)
+        at = BEGIN + round(when - 0.05, 1)
+        assert step == {
+            "at": pytest.approx(at, abs=1e-5),
+            "step_s": pytest.approx(by, abs=0.01),
+        }
 
 
 def test_pauses_that_are_not_looked_at_are_noted(
@@ -256,46 +258,41 @@ def ahead_notes(reply: dict[str, Any]) -> list[str]:
     return [note for note in reply.get("notes", []) if " ahead at " in note]
 
 
-def test_durations_are_without_what_the_clock_skipped_and_a_note_says_so(
-    tmp_path: Path, known: Callable[[Memory], Memory]
-) -> None:
-    memory = known(set_ahead(tmp_path))
-    span = {"start": BEGIN, "end": BEGIN + 207.9}
-    found = asked(memory, tmp_path, "find_matches", **FLAG)
-    assert found["sightings"][0]["duration_s"] == pytest.approx(199.0, abs=0.02)
-    assert ahead_notes(found) == [
-        f"the clock was set 8 s ahead at {BEGIN + 54.9:.6f}: durations are without that"
-    ]
-    recap = asked(memory, tmp_path, "recap", **span)
-    assert recap["duration_s"] == pytest.approx(199.9, abs=0.02)
-    way = asked(memory, tmp_path, "trajectory_summary", **span)
-    assert way["duration_s"] == pytest.approx(199.9, abs=0.02)
-    assert way["avg_speed"] == pytest.approx(SPEED, abs=0.01)
-    near = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0)
-    bounded = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0, **span)
-    for reply in (near, bounded):
-        assert reply["visits"][0]["duration_s"] == pytest.approx(20.0, abs=0.25)
-    other = {"with_start": BEGIN + 100, "with_end": BEGIN + 200}
-    differs = asked(memory, tmp_path, "compare", start=BEGIN, end=BEGIN + 100, **other)
-    assert differs["duration_s"] == differs["recorded_s"]
-    assert differs["duration_s"] == {"this": pytest.approx(92.0, abs=0.05), "with": 100.0}
-    for reply in (recap, way, near, bounded, differs):
+def test_durations_are_without_what_the_clock_skipped_and_a_note_says_so(tmp_path: Path) -> None:
+    for memory in each_known(set_ahead(tmp_path)):
+        span = {"start": BEGIN, "end": BEGIN + 207.9}
+        found = asked(memory, tmp_path, "find_matches", **FLAG)
+        assert found["sightings"][0]["duration_s"] == pytest.approx(199.0, abs=0.02)
+        assert ahead_notes(found) == [
+            f"the clock was set 8 s ahead at {BEGIN + 54.9:.6f}: durations are without that"
+        ]
+        recap = asked(memory, tmp_path, "recap", **span)
+        assert recap["duration_s"] == pytest.approx(199.9, abs=0.02)
+        way = asked(memory, tmp_path, "trajectory_summary", **span)
+        assert way["duration_s"] == pytest.approx(199.9, abs=0.02)
+        assert way["avg_speed"] == pytest.approx(SPEED, abs=0.01)
+        near = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0)
+        bounded = asked(memory, tmp_path, "visits", x=27.5, y=0.0, radius_m=5.0, **span)
+        for reply in (near, bounded):
+            assert reply["visits"][0]["duration_s"] == pytest.approx(20.0, abs=0.25)
+        other = {"with_start": BEGIN + 100, "with_end": BEGIN + 200}
+        differs = asked(memory, tmp_path, "compare", start=BEGIN, end=BEGIN + 100, **other)
+        assert differs["duration_s"] == differs["recorded_s"]
+        assert differs["duration_s"] == {"this": pytest.approx(92.0, abs=0.05), "with": 100.0}
+        for reply in (recap, way, near, bounded, differs):
+            assert len(ahead_notes(reply)) == 1
+            assert "gap_m" not in reply
+            assert not [note for note in reply["notes"] if "gap" in note]
+
+
+def test_bins_are_without_what_the_clock_skipped(tmp_path: Path) -> None:
+    for memory in each_known(set_ahead(tmp_path)):
+        reply = asked(memory, tmp_path, "find_matches", **FLAG, by="hour")
         assert len(ahead_notes(reply)) == 1
-        assert "gap_m" not in reply
-        assert not [note for note in reply["notes"] if "gap" in note]
-
-
-@pytest.mark.parametrize("by", ["hour", "day"])
-def test_bins_are_without_what_the_clock_skipped(
-    tmp_path: Path, known: Callable[[Memory], Memory], by: str
-) -> None:
-    memory = known(set_ahead(tmp_path))
-    reply = asked(memory, tmp_path, "find_matches", **FLAG, by=by)
-    assert len(ahead_notes(reply)) == 1
-    for column, expected in (("recorded_s", 199.9), ("topic_s", 199.0), ("seconds", 199.0)):
-        at = reply["columns"].index(column)
-        assert reply["all"][at - 1] == pytest.approx(expected, abs=0.11)
-        assert sum(row[at] for row in reply["rows"]) == pytest.approx(expected, abs=0.2)
+        for column, expected in (("recorded_s", 199.9), ("topic_s", 199.0), ("seconds", 199.0)):
+            at = reply["columns"].index(column)
+            assert reply["all"][at - 1] == pytest.approx(expected, abs=0.11)
+            assert sum(row[at] for row in reply["rows"]) == pytest.approx(expected, abs=0.2)
 
 
 def test_windows_that_adjoin_within_a_step_add_up(tmp_path: Path) -> None:

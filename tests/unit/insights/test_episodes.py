@@ -42,9 +42,9 @@ def written(folder: Path, *, stored: bool = False) -> Memory:
     return with_store(memory, folder) if stored else memory
 
 
-@pytest.fixture(params=[False, True], ids=["bags", "store"])
-def memory(tmp_path: Path, request: pytest.FixtureRequest) -> Memory:
-    return written(tmp_path, stored=request.param)
+@pytest.fixture(scope="module", params=[False, True], ids=["bags", "store"])
+def memory(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest) -> Memory:
+    return written(tmp_path_factory.mktemp("bags"), stored=request.param)
 
 
 def test_what_is_damaged_outside_of_the_window_is_no_note(tmp_path: Path) -> None:
@@ -117,25 +117,6 @@ def test_whole_words_are_told_from_parts_of_words(
     memory: Memory, kind: str, value: str, found: set[str]
 ) -> None:
     assert {row["value"] for row in matches(memory, kind, value)} == found
-
-
-def test_another_topic_is_listed_during_each_interval(memory: Memory) -> None:
-    [row] = matches(memory, "contains_word", "pot", end=BEGIN + 100, **{"with": "/action"})
-    assert [(each["start"] - BEGIN, each["value"]) for each in row["with"]] == [
-        (12, "scrub"),
-        (30, "rinse"),
-    ]
-    reply = ask(
-        memory, "find_matches", topic="/docked", condition_type="equals", value=True,
-        **{"with": "/task"},
-    )  # fmt: skip
-    [docked] = reply["sightings"]
-    assert [each["value"] for each in docked["with"]] == [
-        "wash the potato",
-        "use a knife",
-        "use a butter knife",
-        "wash the pot",
-    ]
 
 
 def test_values_are_counted_with_how_long_they_held(memory: Memory) -> None:

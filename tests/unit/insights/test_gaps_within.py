@@ -61,13 +61,19 @@ def memory_with(
     return memory_of(folder, clock=clock, storage="mcap" if kind == "mcap" else "sqlite3")
 
 
-@pytest.fixture(params=["mcap", "db3", "stored", "cut into splits"])
-def stalled(request: pytest.FixtureRequest, tmp_path: Path) -> Memory:
+@pytest.fixture(params=["mcap", "db3", "stored", "cut into splits"], scope="module")
+def stalled(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    tmp_path = tmp_path_factory.mktemp("stalled")
     messages = at_rates(LENGTH, STALLS, slow=((22, 24),))
     splits = 7 if request.param == "cut into splits" else 1
     kind = "db3" if request.param == "db3" else "mcap"
     memory = memory_with(tmp_path / "bags", messages, splits, kind)
     return with_store(memory, tmp_path) if request.param == "stored" else memory
+
+
+@pytest.fixture(scope="module")
+def once_stalled(tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    return memory_with(tmp_path_factory.mktemp("once"), at_rates(20, STALLS[:1]))
 
 
 def ask(memory: Memory, tool: str, **arguments: Any) -> dict[str, Any]:
@@ -109,21 +115,19 @@ def test_a_window_in_a_gap_within_a_bag_was_not_recorded(stalled: Memory) -> Non
     ],
 )
 def test_a_reply_whose_window_touches_a_gap_names_it(
-    tmp_path: Path, tool: str, more: dict[str, Any]
+    once_stalled: Memory, tool: str, more: dict[str, Any]
 ) -> None:
-    memory = memory_with(tmp_path, at_rates(20, STALLS[:1]))
     named = f"nothing was recorded from {BEGIN + 7.995:.6f} to {BEGIN + 11:.6f} (3 s)"
-    reply = ask(memory, tool, start=BEGIN + 6, end=BEGIN + 13, **more)
+    reply = ask(once_stalled, tool, start=BEGIN + 6, end=BEGIN + 13, **more)
     assert named in reply["notes"]
-    later = ask(memory, tool, start=BEGIN + 12, end=BEGIN + 19, **more)
+    later = ask(once_stalled, tool, start=BEGIN + 12, end=BEGIN + 19, **more)
     assert not [note for note in later.get("notes", []) if "nothing was recorded" in note]
 
 
-def test_a_gap_is_not_named_where_all_messages_are_returned(tmp_path: Path) -> None:
-    memory = memory_with(tmp_path, at_rates(20, STALLS[:1]))
+def test_a_gap_is_not_named_where_all_messages_are_returned(once_stalled: Memory) -> None:
     window = {"start": BEGIN + 6, "end": BEGIN + 13}
     for more in ({}, {"fields": ["data"]}):
-        reply = ask(memory, "get_topic_in_range", topic="/chatter", **window, **more)
+        reply = ask(once_stalled, "get_topic_in_range", topic="/chatter", **window, **more)
         assert not [note for note in reply.get("notes", []) if "nothing was recorded" in note]
 
 

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.facts import FLAG, LABEL, MOST
+from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.core.timebase import unix_from_ns
@@ -59,12 +59,11 @@ def times(events: tuple[Event, ...], kind: str) -> list[tuple[str, float]]:
 
 
 @needs_recorded
-@each_way
-def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path, recalls: bool) -> None:
+def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
     session = SESSIONS["session_mcap"]
     for bag in session.folder.glob("*.mcap"):
         (tmp_path / bag.name).write_bytes(bag.read_bytes())
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
     assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
     assert answer.stood == 0
@@ -106,10 +105,9 @@ def _drive(
     return [span for span, leg in zip(pairwise(edges), legs, strict=True) if leg[1] == 0]
 
 
-@each_way
-def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path, recalls: bool) -> None:
+def test_a_stop_begins_and_ends_to_a_message(tmp_path: Path) -> None:
     [(began, ended)] = _drive(tmp_path, [(8.745, 0.5), (8.0, 0.0), (9.0, 0.5)], begin=260)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = over(memory, 260, 286)
     [stop] = [each for each in answer.events if each.kind == "stop"]
     assert (stop.start - BEGIN) / S == pytest.approx(began, abs=0.0201)
@@ -209,23 +207,9 @@ def test_how_long_it_stood_in_the_parts_of_a_window_adds_up(
         assert sum(stood) == pytest.approx(whole.stood or 0, abs=0.02 * S)
 
 
-@each_way
-@pytest.mark.parametrize("speed", [0.005, 0.01, 0.03, 0.05])
-def test_a_robot_that_creeps_is_not_taken_to_stand(
-    tmp_path: Path, recalls: bool, speed: float
-) -> None:
-    _drive(tmp_path, [(60.0, speed)], hz=20)
-    memory = memory_of(tmp_path, recalls=recalls)
-    for span in ((0, 60), (10, 20), (45, 60)):
-        answer = over(memory, *span)
-        assert answer.stood == 0
-        assert answer.events == ()
-
-
-@each_way
-@pytest.mark.parametrize(("hz", "noise"), [(10, 0.2), (1, 0.02), (1, 1.0), (1, 0.005)])
+@pytest.mark.parametrize(("hz", "noise"), [(10, 0.2), (1, 0.005)])
 def test_noise_that_hides_where_the_robot_stood_is_named(
-    tmp_path: Path, recalls: bool, hz: int, noise: float
+    tmp_path: Path, hz: int, noise: float
 ) -> None:
     draw = random.Random(3)
     messages = [
@@ -233,7 +217,7 @@ def test_noise_that_hides_where_the_robot_stood_is_named(
         for nth in range(300 * hz)
     ]
     write_splits(tmp_path, messages, 60)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     reply = shown(tmp_path, over(memory, 0, 300))
     assert reply["stood_s"] is None
     assert any("too noisy, or too few" in note for note in reply["notes"])
@@ -261,13 +245,10 @@ def test_a_robot_that_drove_all_the_time_did_not_stand_whatever_the_noise(tmp_pa
     assert not any("stood_s" in note for note in answer.notes)
 
 
-@each_way
-def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(tmp_path: Path) -> None:
     along = [math.nan if nth < 100 or 150 <= nth < 180 else nth * 0.05 for nth in range(300)]
     write_splits(tmp_path, [odom(BEGIN + n * S // 10, x, 0.0, 0.0) for n, x in enumerate(along)])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     none = over(memory, 0, 9.95)
     assert (none.distance_m, none.max_speed, none.stood) == (None, None, None)
     assert none.notes == (
@@ -319,14 +300,11 @@ def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") 
     return Msg(topic, "px4_msgs/msg/VehicleStatus", BEGIN + round(at * S), body)
 
 
-@each_way
-@pytest.mark.parametrize("flag", [STATUS_FLAGS[0], STATUS_FLAGS[15], STATUS_FLAGS[16], "flag_39"])
-def test_every_boolean_of_a_status_message_is_followed(
-    tmp_path: Path, recalls: bool, flag: str
-) -> None:
+@pytest.mark.parametrize("flag", ["flag_15", "flag_16", "flag_39"])
+def test_every_boolean_of_a_status_message_is_followed(tmp_path: Path, flag: str) -> None:
     times_s = [nth * 0.5 for nth in range(80)]
     write_splits(tmp_path, [_status(at, *([flag] if 13 <= at < 26 else [])) for at in times_s])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = over(memory, 0, 40)
     assert times(answer.events, "flip") == [
         (f"/fmu/out/vehicle_status {flag} became true", 13.0),
@@ -335,14 +313,13 @@ def test_every_boolean_of_a_status_message_is_followed(
     assert not any("vehicle_status" in note for note in answer.notes)
 
 
-@each_way
-def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
+def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path) -> None:
     type_name = "px4_msgs/msg/ManyFlags"
     body = make(type_name, **{f"flag_{nth:03}": False for nth in range(600)})
     write_mcap(
         tmp_path / "bag.mcap", [Msg("/many", type_name, BEGIN + n * S, body) for n in (1, 2)]
     )
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     [note] = [note for note in over(memory, 0, 10).notes if "/many" in note]
     more = 600 - MOST[FLAG]
     assert note == (
@@ -350,20 +327,11 @@ def test_booleans_that_are_too_many_to_follow_are_counted(tmp_path: Path, recall
     )
 
 
-@each_way
-def test_things_that_are_too_many_to_follow_are_counted(tmp_path: Path, recalls: bool) -> None:
-    labels = [f"thing {nth}" for nth in range(MOST[LABEL] + 3)]
-    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN + n * S, labels) for n in (1, 2)])
-    memory = memory_of(tmp_path, recalls=recalls)
-    assert any("one message: 3 more" in note for note in over(memory, 0, 10).notes)
-
-
-@each_way
-def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path, recalls: bool) -> None:
+def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path) -> None:
     """All 40 booleans flip four times in one bag."""
     messages = [_status(at, *(STATUS_FLAGS if at in {1, 3} else ())) for at in range(5)]
     write_mcap(tmp_path / "bag.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = over(memory, 0, 10)
     assert dict(answer.counts) == {"on/off changes": 4 * 40}
     assert any(
@@ -379,10 +347,7 @@ def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
     assert event.text.endswith("…")
 
 
-@each_way
-def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(tmp_path: Path) -> None:
     """It saw scissors for 5 s of 65, and the table all the time."""
     rows = [(at / 5, "scissors") for at in range(60, 85)]
     rows += [(at / 5 + 0.1, "table") for at in range(325)]
@@ -391,7 +356,7 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     ]
     messages += [odom(BEGIN + n * S, 0.1 * n, 0.0, 0.0) for n in range(66)]
     write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = over(memory, 0, 65)
     assert answer.throughout == ("table",)
     assert times(answer.events, "thing") == [("scissors in view", 12.0)]
@@ -399,17 +364,6 @@ def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(
     # What the memory does not hold was not looked at.
     assert over(memory, 0, 80).throughout == ()
     assert over(memory, -10, 60).throughout == ()
-
-
-def test_a_thing_that_several_detectors_see_is_reported_once(tmp_path: Path) -> None:
-    one = [detections(BEGIN + at * S, ["cup"] if at in {2, 3} else []) for at in range(10)]
-    other = [
-        detections(BEGIN + at * S, ["cup"] if at in {3, 4} else [], topic="/vision/other")
-        for at in range(10)
-    ]
-    write_splits(tmp_path, [*one, *other])
-    [event] = over(memory_of(tmp_path), 0, 10).events
-    assert (event.text, event.start, event.end) == ("cup in view", BEGIN + 2 * S, BEGIN + 4 * S)
 
 
 def test_what_matters_least_is_left_out_and_counted(tmp_path: Path) -> None:
@@ -523,8 +477,7 @@ def test_stops_are_in_the_map_as_it_was_then_or_in_the_frame_asked_for(
         recap(memory, Call(), span, frame_id="moon")
 
 
-@each_way
-def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool) -> None:
+def test_only_what_happened_in_a_place_is_reported(tmp_path: Path) -> None:
     """Drives 1 m/s through the room and out of it, stands at 20 s and at 50 s, bumps twice."""
     messages = []
     for step in range(700):
@@ -540,7 +493,6 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
             messages.append(log_entry(BEGIN + step * S // 10, 40, "base", "stuck"))
     write_splits(tmp_path, messages)
     memory = in_places(memory_of(tmp_path), "odom")
-    memory = with_store(memory, tmp_path) if recalls else memory
     span = TimeRange(start_s=BEGIN / S, end_s=BEGIN / S + 70)
     there = recap(memory, Call(), span, where="room")
     # In the room from x = -1 at 15 s to x = 5 at 31 s.
@@ -565,10 +517,7 @@ def test_only_what_happened_in_a_place_is_reported(tmp_path: Path, recalls: bool
     assert (robot["frame_id"], robot["in"]) == ("odom", "room")
 
 
-@each_way
-def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(tmp_path: Path) -> None:
     messages = []
     for second in range(30):
         at = BEGIN + second * S
@@ -577,7 +526,7 @@ def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
         messages.append(detections(at, ["ghost"] if second % 7 < 3 else [], score=0.4))
         messages.append(detections(at, ["cup"], score=0.5, topic="/back/detections"))
     write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
 
     def things(**given: float) -> tuple[list[tuple[str, float]], list[str], list[str]]:
         span = {"start": BEGIN / S - 20, "end": BEGIN / S + 60}
@@ -596,10 +545,7 @@ def test_things_whose_score_stays_low_are_left_out_where_that_is_asked_for(
     assert things()[0] == []
 
 
-@each_way
-def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(tmp_path: Path) -> None:
     """Drives 0.5 m/s, crawls from 12 s on for 3 s, drives, and brakes to stand at 30 s."""
     messages: list[Msg] = []
     x = 0.0
@@ -610,7 +556,7 @@ def test_a_sudden_loss_of_speed_is_reported_with_what_changed_before(
         if step % 20 == 0:
             messages.append(boolean(at, int(seconds) in {11, 12, 13}, topic="/blocked"))
     write_splits(tmp_path, messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = over(memory, 0, 40)
     [drop] = [each for each in answer.events if each.kind == "drop"]
     assert drop.text == "slowed down suddenly from 0.50 to 0.05 m/s"

@@ -17,7 +17,7 @@ from ros2_memory.history.counting import pick
 from ros2_memory.history.view import View
 from tests.support.bags import write_splits
 from tests.support.clocks import FixedClock
-from tests.support.examples import examples
+from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 from tests.support.random_histories import write_history
@@ -65,7 +65,9 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
 ]
 
 
-@settings(max_examples=examples(60), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(
+    max_examples=60 if LONG else 10, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 @given(
     kind=st.sampled_from(["odd", "moving map", "things"]),
     seed=st.integers(0, 2**32),

@@ -20,7 +20,6 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.bag_dir.state_files import TRIGGERS, RuleRecord, TriggerState
-from ros2_memory.bootstrap import build_server
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import InvalidArgumentsError, RefusedError
 from ros2_memory.core.timebase import Deadline
@@ -283,18 +282,6 @@ class TestTheList:
 
 
 class TestTheTool:
-    async def test_clients_are_told_that_it_writes_and_destroys_nothing(
-        self, tmp_path: Path
-    ) -> None:
-        chosen = load_settings([f"recording.bag_dir={tmp_path}", "server.write_tools=true"], {})
-        server = build_server(chosen, memory_of(tmp_path))
-        hints = {each.name: each.annotations for each in await server.list_tools()}
-        writing = hints.pop("remember_moment")
-        assert writing is not None
-        assert (writing.read_only_hint, writing.destructive_hint) == (False, False)
-        assert not writing.idempotent_hint
-        assert all(each is not None and each.read_only_hint for each in hints.values())
-
     @pytest.mark.parametrize(("preset", "offered"), [("robot", True), ("query_only", False)])
     def test_it_is_on_where_the_robot_records(self, preset: str, offered: bool) -> None:
         assert load_settings((), {"MEMORY_DEPLOYMENT": preset}).server.write_tools is offered

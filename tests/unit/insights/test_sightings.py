@@ -30,7 +30,6 @@ from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import (
     boolean,
     command,
@@ -62,19 +61,17 @@ PLACES = {"table": (1.5, 3.5, 0.4), "cup": (1.4, 3.6, 0.8), "scissors": (-2.5, 1
 
 
 @needs_recorded
-@each_way
 @pytest.mark.parametrize(
     ("label", "seen"),
     [("scissors", [(40, 45), (12, 17)]), ("cup", [(5, 29)]), ("table", [(0, 64)])],
 )
 def test_sightings_of_a_recorded_session_are_the_closed_form(
-    tmp_path: Path, label: str, seen: list[tuple[int, int]], recalls: bool
+    label: str, seen: list[tuple[int, int]]
 ) -> None:
     session = SESSIONS["session_mcap"]
-    memory = memory_of(session.folder)
-    if recalls:
-        memory = recalling_elsewhere(memory, tmp_path)
-    answer = find_matches(memory, Call(), "/vision/*/scene_objects", "contains", label)
+    answer = find_matches(
+        memory_of(session.folder), Call(), "/vision/*/scene_objects", "contains", label
+    )
     assert not answer.more
     assert len(answer.sightings) == len(seen)
     for sighting, (first, last) in zip(answer.sightings, seen, strict=True):
@@ -86,15 +83,6 @@ def test_sightings_of_a_recorded_session_are_the_closed_form(
         assert math.dist(sighting.robot.position[:2], position(last)) < 0.05
         assert sighting.thing.frame_id == "odom"
         assert math.dist(sighting.thing.position, PLACES[label]) < 0.05
-
-
-def recalling_elsewhere(memory: Memory, folder: Path) -> Memory:
-    """The same with a catalogue beside none of the bags, which lie where nothing is written."""
-    session = SESSIONS["session_mcap"].folder
-    for bag in session.glob("*"):
-        (folder / bag.name).write_bytes(bag.read_bytes())
-    copied = memory_of(folder)
-    return with_store(copied, folder)
 
 
 def spoken(tmp_path: Path, *said: tuple[float, str]) -> Memory:
@@ -143,10 +131,9 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     assert note in queries.find_last_match(*asked).notes
 
 
-@pytest.mark.parametrize("recalls", [False, True])
-def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path, recalls: bool) -> None:
+def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     place: JsonValue = {"x": 9.0, "y": 9.0}
     asked = (memory, Call(), "/odom", "near_position", place)
     note = (
@@ -187,9 +174,8 @@ def test_a_position_of_a_reply_is_compared_in_its_frame_or_not_at_all(tmp_path: 
             ask()
 
 
-@each_way
 def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
-    tmp_path: Path, recalls: bool
+    tmp_path: Path,
 ) -> None:
     late = BEGIN + 2 * S + 1_800_000
     placed = [
@@ -200,7 +186,7 @@ def test_the_place_of_a_sighting_is_by_its_newest_message_that_can_be_placed(
     seen = [detections(at, ["cup"]) for at in (BEGIN, BEGIN + S, BEGIN + 2 * S, late)]
     poses = [odom(BEGIN + at * S, 0.5 * at, 0.0) for at in range(3)]
     write_mcap(tmp_path / "bag.mcap", [*placed, *seen, *poses])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     for frame_id in (None, "odom"):
         answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", frame_id=frame_id)
         [sighting] = answer.sightings
@@ -226,8 +212,7 @@ def test_of_several_of_a_kind_the_best_has_the_place_and_the_score(tmp_path: Pat
     assert (sighting.thing.position[0], sighting.score) == (2.0, 0.8)
 
 
-@each_way
-def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path, recalls: bool) -> None:
+def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path) -> None:
     """Of a topic that states it every 5 s, over two bags, with a silence in the second one."""
     busy, idle = [10, 15, 25, 30, 55, 65], [0, 5, 20, 60]
     messages = [
@@ -236,7 +221,7 @@ def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path, rec
     ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages[:4])
     write_mcap(tmp_path / "rec" / "rec_1.mcap", messages[4:])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     state = {"topic": "/mode", "condition_type": "equals", "value": "busy"}
     began = BEGIN / S
 
@@ -353,18 +338,6 @@ def test_a_thing_is_reported_in_the_map_where_transforms_lead_there(tmp_path: Pa
     assert again.thing.position == pytest.approx((4.0, 0.0, 0.5))
 
 
-def test_a_reply_reports_how_long_ago_so_that_nobody_has_to_subtract(tmp_path: Path) -> None:
-    memory = spoken(tmp_path, (1, "cup"), (3, "cup"), (4, ""))
-    latest = replace(memory, limits=replace(memory.limits, now="latest"))
-    answer = find_matches(latest, Call(), OBJECTS, "contains", "cup")
-    [shown] = json.loads(Replies(tmp_path, 24_000).answer(answer).text)["sightings"]
-    assert shown["duration_s"] == 2.0
-    assert shown["ago_s"] == 1.0
-    assert shown["count"] == 2
-    assert shown["robot"] is None
-    assert "began_earlier" not in shown
-
-
 def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
     tmp_path: Path,
 ) -> None:
@@ -448,15 +421,12 @@ def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
             assert oldest.total == len(answer.sightings)
 
 
-@each_way
-def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) -> None:
     lines = [(20, "begins"), (30, "slow"), (40, "lost"), (30, "slow"), (20, "ends")]
     logged = [log_entry(BEGIN + n * S, level, "nav", said) for n, (level, said) in enumerate(lines)]
     state = diagnostics(BEGIN + 5 * S, motor=(1, "hot"))
     write_mcap(tmp_path / "rec" / "rec_0.mcap", [*logged, state])
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
 
     def texts(kind: str, value: JsonValue) -> list[object]:
         call = {"condition_type": kind, "value": value, "field": "level", "fields": ["msg"]}
@@ -559,10 +529,9 @@ def test_a_condition_takes_the_path_of_a_field_in_the_message(tmp_path: Path) ->
         assert len(raw) == 1
 
 
-@each_way
 @pytest.mark.parametrize("pause_s", [0.05, 2.0, 8.0])
 def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
-    tmp_path: Path, pause_s: float, recalls: bool
+    tmp_path: Path, pause_s: float
 ) -> None:
     """The bumper is pressed from 40 s on, the recorder is started again at 50 s."""
     for nth in range(2):
@@ -571,7 +540,7 @@ def test_a_sighting_across_a_restart_of_the_recording_has_the_robots_place(
         messages = [odom(at, step * 0.1, float(nth)) for at, step in steps]
         messages += [boolean(at, nth == 1 or step >= 200) for at, step in steps if step % 5 == 0]
         write_mcap(tmp_path / f"run_{nth}" / f"run_{nth}_0.mcap", messages)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     asks = {"topic": "/bumper", "condition_type": "equals", "value": True}
     [found] = asked(memory, tmp_path, "find_matches", **asks)["sightings"]
     assert found["first_seen"] == BEGIN / S + 40

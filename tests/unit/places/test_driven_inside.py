@@ -16,7 +16,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
 
 LEFT = {"x": [-1, 2], "y": [-1, 4]}
@@ -37,14 +37,12 @@ def driven(truth: MovingMap, low: float, high: float) -> float:
     )
 
 
-@pytest.mark.parametrize("split_s", [3.7, 10.0, 300.0])
-@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+@pytest.mark.parametrize("split_s", [3.7, 300.0])
 def test_metres_count_while_the_robot_is_in_a_place_and_corrections_of_the_map_add_none(
-    tmp_path: Path, split_s: float, recalls: bool
+    tmp_path: Path, split_s: float
 ) -> None:
     truth = write_moving_map(tmp_path, 3, seconds=200, split_s=split_s)
     memory = in_places(memory_of(tmp_path))
-    memory = with_store(memory, tmp_path) if recalls else memory
     found = driven_inside(memory, Call(), ALL, where="left half")
     # In odom the drift of the map, which corrects it, is driven too.
     assert found.distance_m == pytest.approx(driven(truth, -1, 2), rel=0.1, abs=0.5)

@@ -16,7 +16,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime
 from ros2_memory.places.visits import visits
 from tests.support.bags import McapLayout, odom, text, tf, transform, write_mcap
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, memory_of
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
 PLACES = (
@@ -32,14 +32,10 @@ def in_places(memory: Memory) -> Memory:
     return replace(memory, limits=replace(memory.limits, places=PLACES))
 
 
-@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
-@pytest.mark.parametrize("seed", range(3))
-def test_visits_in_a_moving_map_are_when_the_robot_was_there(
-    tmp_path: Path, seed: int, recalls: bool
-) -> None:
+@pytest.mark.parametrize("seed", range(2))
+def test_visits_in_a_moving_map_are_when_the_robot_was_there(tmp_path: Path, seed: int) -> None:
     truth = write_moving_map(tmp_path, seed, seconds=300)
     memory = in_places(memory_of(tmp_path))
-    memory = with_store(memory, tmp_path) if recalls else memory
     found = visits(memory, Call(), where="corner", limit=100)
     there = truth.inside(4.0, 3.0, 0.5)
     assert found.where == "corner"

@@ -22,15 +22,16 @@ from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
+from tests.support.bags import Msg, odom, text, tf, transform, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.closed_form import SESSIONS, written_session
-from tests.support.examples import examples
+from tests.support.examples import LONG
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.shared_bags import needs_recorded
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
+EXAMPLES = 12 if LONG else 4
 
 
 def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
@@ -45,11 +46,7 @@ def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list
 
 
 def remembering(folder: Path, messages: list[Msg], *, split_s: float = 10.0) -> Memory:
-    by_split: dict[int, list[Msg]] = {}
-    for each in sorted(messages, key=lambda message: message.log_time):
-        by_split.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
-    for nth, some in by_split.items():
-        write_mcap(folder / f"bag_{nth}.mcap", some)
+    write_splits(folder, messages, split_s)
     return memory_of(folder)
 
 
@@ -64,20 +61,17 @@ def spans(memory: Memory, x: float, y: float = 0.0, **given: Any) -> list[tuple[
     ]
 
 
-@each_way
 @pytest.mark.parametrize(
     "recorded", [False, pytest.param(True, marks=needs_recorded)], ids=["written", "recorded"]
 )
-def test_visits_of_a_session_are_the_closed_form(
-    tmp_path: Path, recorded: bool, recalls: bool
-) -> None:
+def test_visits_of_a_session_are_the_closed_form(tmp_path: Path, recorded: bool) -> None:
     if recorded:
         session = SESSIONS["session_mcap"]
         for bag in session.folder.glob("*.mcap"):
             (tmp_path / bag.name).write_bytes(bag.read_bytes())
     else:
         session = written_session(tmp_path / "written")
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     answer = visits(memory, Call(), 0.0, 4.0, radius_m=0.5)
     lap, half = 2 * math.pi / 0.25, 2 * math.asin(0.5 / 4) / 0.25
     middles = [lap / 2 + lap * nth for nth in range(3)]
@@ -148,12 +142,11 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     assert elsewhere.notes == ()
 
 
-@each_way
-def test_places_may_be_in_utm(tmp_path: Path, recalls: bool) -> None:
+def test_places_may_be_in_utm(tmp_path: Path) -> None:
     north = 5.4e6
     poses = [odom(BEGIN + n * S // 5, 5e5 + n / 10, north) for n in range(150)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
-    memory = memory_of(tmp_path, recalls=recalls)
+    memory = memory_of(tmp_path)
     assert spans(memory, 5e5 + 10, north, radius_m=0.55) == [(19.0, 21.0)]
     # No robot on Earth is here.
     assert not visits(memory, Call(), 1e9, 0.0, radius_m=1e9 - 1e8).visits
@@ -177,9 +170,9 @@ def test_a_robot_that_was_outside_for_a_moment_did_not_leave(tmp_path: Path) -> 
     [(arrived, departed)] = spans(memory, 0.0, radius_m=1.0)
     assert arrived == 0.0
     assert departed == pytest.approx(25.0, abs=0.21)
-    longer = tmp_path / "longer"
-    longer.mkdir()
-    memory = remembering(longer, line((10, 0.0), (5, 1.0), (5, -1.0), (10, 0.0), (30, 1.0)))
+    memory = remembering(
+        tmp_path / "longer", line((10, 0.0), (5, 1.0), (5, -1.0), (10, 0.0), (30, 1.0))
+    )
     assert len(spans(memory, 0.0, radius_m=1.0)) == 2
 
 
@@ -255,7 +248,7 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
         assert not any("were taken in" in note for note in found.notes)
 
 
-@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
@@ -294,7 +287,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
         )
 
 
-@settings(max_examples=examples(12), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
 @example(seed=2013, split_s=5.0)
 @example(seed=7197, split_s=5.0)

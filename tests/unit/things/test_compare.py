@@ -71,18 +71,6 @@ def test_a_thing_that_moved_is_listed_with_both_places(tmp_path: Path) -> None:
     assert reply["duration_s"] == {"this": 29.0, "with": 29.0}
 
 
-def test_things_are_compared_from_the_earlier_window_to_the_later(tmp_path: Path) -> None:
-    forward = compared(tmp_path, moved_mug())
-    back = ask(
-        tmp_path,
-        start=BEGIN,
-        end=BEGIN + 29,
-        with_start=BEGIN + 60,
-        with_end=BEGIN + 89,
-    )
-    assert back["things"] == forward["things"]
-
-
 def test_nothing_differs_between_equal_times(tmp_path: Path) -> None:
     reply = compared(tmp_path, looked(0, 90, HERE, MUG))
     assert reply["things"] == {}

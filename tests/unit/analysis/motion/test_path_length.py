@@ -19,7 +19,7 @@ from ros2_memory.queries import trajectory_summary
 from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import each_way, memory_of
+from tests.support.memories import memory_of
 from tests.unit.analysis.motion.posed import posed, way_of
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def summarise(points: Points, hertz: float, cuts: Sequence[int] | None = None) -
 # Standing
 
 
-@pytest.mark.parametrize(("hertz", "axes"), [(50, 3), (20, 2), (5, 3), (1, 3)])
+@pytest.mark.parametrize(("hertz", "axes"), [(20, 2), (5, 3), (1, 3)])
 def test_long_standing_with_10_mm_of_noise_is_no_way(hertz: int, axes: int) -> None:
     poses = noisy(np.zeros((LONG_S * hertz, 3)), 0.010, axes=axes)
     assert plain_sum(poses) > 15
@@ -93,8 +93,7 @@ def test_a_robot_that_creeps_in_its_noise_gets_where_it_gets() -> None:
 # Driving
 
 
-@pytest.mark.parametrize("hertz", [20, 50])
-@pytest.mark.parametrize("speed", [0.03, 0.1, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize(("speed", "hertz"), [(0.03, 20), (0.1, 50), (0.5, 20), (2.0, 50)])
 def test_without_noise_lines_and_arcs_have_their_length(speed: float, hertz: int) -> None:
     for poses in (line(speed, hertz, 60), arc(speed, hertz, 60)):
         found = summarise(poses, hertz)
@@ -104,8 +103,7 @@ def test_without_noise_lines_and_arcs_have_their_length(speed: float, hertz: int
         assert found.max_speed == pytest.approx(speed, rel=0.002)
 
 
-@pytest.mark.parametrize("hertz", [20, 30, 50])
-@pytest.mark.parametrize("speed", [0.1, 0.15, 0.25, 0.5, 1.0, 2.0])
+@pytest.mark.parametrize(("speed", "hertz"), [(0.1, 50), (0.15, 20), (0.5, 30), (2.0, 20)])
 def test_with_5_mm_of_noise_a_way_is_within_3_percent(speed: float, hertz: int) -> None:
     for seed, poses in enumerate(
         (
@@ -131,7 +129,7 @@ def test_short_legs_come_out_as_much_too_short_as_the_docs_say(
     leg_m: float, speed: float, least: float, most: float
 ) -> None:
     poses = through([(0, 0, 0), (leg_m, 0, 0)] * round(60 * speed / leg_m), speed, 50)
-    for seed in range(5):
+    for seed in range(2):
         found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
         assert least < found.totals.distance_m / plain_sum(poses) - 1 < most
 
@@ -139,7 +137,7 @@ def test_short_legs_come_out_as_much_too_short_as_the_docs_say(
 def test_short_stops_and_goes_come_out_as_much_too_long_as_the_docs_say() -> None:
     x = np.cumsum(np.tile(np.repeat([0.0, 0.3], 100), 30)) / 50
     poses = np.column_stack([x, 0 * x, 0 * x])
-    for seed in range(5):
+    for seed in range(2):
         found = summarise(noisy(poses, 0.005, seed, axes=2), 50)
         assert 0 < found.totals.distance_m / x[-1] - 1 < 0.04
 
@@ -237,9 +235,9 @@ def history(
     return bags
 
 
-def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, Any]]:
+def replies(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     """What trajectory_summary and recap say of everything."""
-    memory = memory_of(folder, recalls=recalls)
+    memory = memory_of(folder)
     span = TimeRange(start_s=BEGIN / S - 1, end_s=BEGIN / S + 1000)
     shown = Replies(folder, 24_000)
     way = json.loads(shown.answer(trajectory_summary(memory, Call(), span)).text)
@@ -247,15 +245,12 @@ def replies(folder: Path, *, recalls: bool) -> tuple[dict[str, Any], dict[str, A
     return way, told
 
 
-@each_way
-def test_the_noise_of_a_stationary_robot_is_noted_and_not_driven(
-    tmp_path: Path, recalls: bool
-) -> None:
+def test_the_noise_of_a_stationary_robot_is_noted_and_not_driven(tmp_path: Path) -> None:
     off = np.random.default_rng(4).normal(0, 0.001, (3000, 2))
     messages = [odom(BEGIN + nth * S // 50, x, y) for nth, (x, y) in enumerate(off.tolist())]
     for nth in range(6):
         write_mcap(tmp_path / f"bag_{nth}.mcap", messages[nth * 500 : nth * 500 + 500])
-    way, told = replies(tmp_path, recalls=recalls)
+    way, told = replies(tmp_path)
     summed = plain_sum(np.column_stack([off, np.zeros(3000)]))
     assert (way["distance_m"], told["distance_m"]) == (0.0, 0.0)
     assert way["max_speed"] == 0.0
@@ -265,21 +260,19 @@ def test_the_noise_of_a_stationary_robot_is_noted_and_not_driven(
         assert any(note.startswith("the positions are noisy") for note in reply["notes"])
 
 
-@each_way
 @pytest.mark.parametrize(("noise_m", "doubted"), [(1.0, True), (0.02, False)])
 def test_noise_that_cannot_be_taken_off_is_noted(
-    tmp_path: Path, noise_m: float, doubted: bool, recalls: bool
+    tmp_path: Path, noise_m: float, doubted: bool
 ) -> None:
     poses = noisy(line(1.0, 1, 300), noise_m, axes=2).tolist()
     messages = [odom(BEGIN + nth * S, x + 50, y) for nth, (x, y, _) in enumerate(poses)]
     for nth in range(3):
         write_mcap(tmp_path / f"bag_{nth}.mcap", messages[nth * 101 : nth * 101 + 101])
-    for reply in replies(tmp_path, recalls=recalls):
+    for reply in replies(tmp_path):
         notes = [each for each in reply.get("notes", []) if "distance_m may be too long" in each]
         assert bool(notes) == doubted
 
 
-@each_way
 @pytest.mark.parametrize(
     ("later", "driven_m", "gap_m", "note"),
     [
@@ -297,10 +290,9 @@ def test_what_a_gap_a_jump_or_a_reset_leads_across_is_not_driven(
     driven_m: float,
     gap_m: float | None,
     note: str,
-    recalls: bool,
 ) -> None:
     history(tmp_path, [(0, 0.0, 10.0), later])
-    for reply in replies(tmp_path, recalls=recalls):
+    for reply in replies(tmp_path):
         assert (reply["distance_m"], reply.get("gap_m")) == (driven_m, gap_m)
         assert not note or any(note in each for each in reply["notes"])
 
@@ -332,7 +324,7 @@ def fast(seconds: float, top: float, hertz: float) -> Points:
     return np.column_stack([x, 0 * x, 0 * x])
 
 
-@pytest.mark.parametrize("hertz", [0.5, 1, 2, 10, 50])
+@pytest.mark.parametrize("hertz", [0.5, 2, 50])
 def test_driving_through_the_origin_and_stopping_there_is_no_reset(hertz: float) -> None:
     rest = np.zeros((max(round(3 * hertz), 3), 3))
     home = fast(4.0, 2.0, hertz)
@@ -373,12 +365,11 @@ def test_messages_lost_on_the_way_home_are_no_reset(lost: int) -> None:
 # Waypoints
 
 
-@each_way
-@pytest.mark.parametrize("split_s", [3.0, 5.0, 7.0, 60.0])
-def test_a_turning_point_is_a_waypoint(tmp_path: Path, split_s: float, recalls: bool) -> None:
+@pytest.mark.parametrize("split_s", [3.0, 7.0])
+def test_a_turning_point_is_a_waypoint(tmp_path: Path, split_s: float) -> None:
     legs = [(10.0 * nth, 10.0 * (nth % 2), 10.0 * ((nth + 1) % 2)) for nth in range(5)]
     history(tmp_path, legs, split_s=split_s)
-    way, _ = replies(tmp_path, recalls=recalls)
+    way, _ = replies(tmp_path)
     assert way["distance_m"] == 50.0
     turns = [round(point["x"], 6) for point in way["waypoints"]]
     # Where a leg ends and the next one begins there are two messages.

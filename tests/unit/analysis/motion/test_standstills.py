@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.motion.standstills import DRIFTED_M, Standstill
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.examples import examples
+from tests.support.examples import LONG, examples
 from tests.unit.analysis.motion.posed import posed, stood_in
 
 Poses = list[tuple[int, tuple[float, float, float]]]
@@ -96,7 +96,7 @@ def worlds(draw: st.DrawFn, noise: float = 0.0) -> World:
     )
 
 
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=150 if LONG else 25, deadline=None)
 @given(worlds())
 def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     period = made.period + 1e-6
@@ -115,7 +115,7 @@ def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
 def test_noise_moves_the_ends_of_a_standstill_by_less_than_a_second(
     hz: int, noise: float, speed: float
 ) -> None:
-    for phase in range(16):
+    for phase in range(0, 16, 3):
         legs = [(8.0, speed), (7.3, 0.0), (8.0, speed)]
         made = world(legs, hz=hz, begin=100 + phase / 8, noise=noise)
         [found] = spans(standstills_of(made.poses))
@@ -140,7 +140,7 @@ def test_a_robot_that_turns_in_circles_with_few_poses_does_not_stand(
     assert standstills_of([(n * S // hz, place) for n, place in enumerate(at)]) == ()
 
 
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=150 if LONG else 25, deadline=None)
 @given(st.one_of(worlds(), worlds(noise=0.01)), SLICES)
 def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
     whole, parts = (
@@ -158,7 +158,7 @@ def test_long_standing_with_noise_of_a_centimetre_is_one_standstill() -> None:
     assert math.dist(found.box.centre, (0, 2, 0)) < 0.01
 
 
-@pytest.mark.parametrize("speed", [0.004, 0.005, 0.0065, 0.008, 0.01, 0.015, 0.02, 0.03, 0.05])
+@pytest.mark.parametrize("speed", [0.004, 0.0065, 0.01, 0.05])
 @pytest.mark.parametrize("hz", [10, 50])
 def test_a_robot_that_creeps_does_not_stand(speed: float, hz: int) -> None:
     poses = world([(361.0, speed)], hz=hz).poses
@@ -227,7 +227,7 @@ def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
     assert sum(each.end - each.start for each in found) <= poses[-1][0] - poses[0][0]
 
 
-@settings(max_examples=examples(150), deadline=None)
+@settings(max_examples=150 if LONG else 25, deadline=None)
 @given(restless(), SLICES)
 def test_standstills_under_any_noise_are_in_order_and_disjoint(poses: Poses, blocks: int) -> None:
     found = standstills_of(poses)
