@@ -93,10 +93,11 @@ INTERRUPTIONS: Final = MappingProxyType(
         "died": "ros2 bag record died",
         "hung": "ros2 bag record hung",
         "unclean": "the recorder ended without a shutdown",
+        "paused": "recording was paused: the disk was full, or unmounted",
     }
 )
 """How a recording may end unexpectedly, and the words for it."""
-Interruption: TypeAlias = Literal["died", "hung", "unclean"]
+Interruption: TypeAlias = Literal["died", "hung", "unclean", "paused"]
 """A key of `INTERRUPTIONS`."""
 
 
@@ -106,16 +107,29 @@ class Loss:
 
     `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
     may never have been published either), or rosbag2's own count; or they were deleted by request,
-    or since they had `expired` (`retention.topics`).
+    or since they had `expired` (`retention.topics`). Of a publisher that was `refused`, as its QoS
+    did not fit the subscription, it is not known how many there were, and `lost` 0.
     The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
-    noticed, with a key of `INTERRUPTIONS`. How many messages it cost is not known, and `lost` 0.
+    noticed, or while it was `paused`, with a key of `INTERRUPTIONS`. How many messages it cost is
+    not known, and `lost` 0.
     """
 
     topic: str
     start: Int64
     stop: Int64
     lost: Count
-    by: Literal["counter", "stamps", "rosbag2", "forgotten", "expired", "died", "hung", "unclean"]
+    by: Literal[
+        "counter",
+        "stamps",
+        "rosbag2",
+        "refused",
+        "forgotten",
+        "expired",
+        "died",
+        "hung",
+        "unclean",
+        "paused",
+    ]
 
 
 LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)

@@ -44,7 +44,7 @@ from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
-from ros2_memory.history.robots import contradicting_frames, mixed_recordings
+from ros2_memory.history.robots import are_of_one_recorder, contradicting_frames, mixed_recordings
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
@@ -322,7 +322,10 @@ def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
     )
     for pair, topic in pairs[:MAX_NAMED]:
         first, second = pair.names
-        differ = f"; each has different messages on {topic}, as from two robots" if topic else ""
+        why = (
+            "after a clock was set back" if are_of_one_recorder(memory, pair) else "from two robots"
+        )
+        differ = f"; each has different messages on {topic}, as {why}" if topic else ""
         yield warning(
             f"recordings {first} and {second} overlap from {iso_local(pair.start)} to "
             f"{iso_local(pair.end)}, and are answered together{differ}",

@@ -140,6 +140,17 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
             lost = sum(topics.values())
             they = "it was" if lost == 1 else "they were"
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
+    refused: dict[str, list[tuple[Ns, Ns]]] = {}
+    for loss in losses:
+        if loss.by == "refused":
+            refused.setdefault(loss.topic, []).append((loss.start, loss.stop - 1))
+    for topic in sorted(refused)[:MAX_NAMED]:
+        spans = [_span_text(*span) for span in united(refused[topic], _EDGE_NS)]
+        yield (
+            f"messages of a publisher of {topic} were not recorded from "
+            f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS did not fit the subscription: "
+            "how many is not known"
+        )
 
 
 def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) -> Iterator[str]:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, has_own_name, is_kept_apart
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -57,6 +58,8 @@ _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = 
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: the parent of each static frame of a recording that is closed."""
+SET_BACK: Final = "the clock was set back between recordings"
+"""The begin of a sentence on recordings that one recorder made, and that overlap in time."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
@@ -116,6 +119,19 @@ def mixed_recordings(memory: Memory, call: Call) -> tuple[Mixed, ...]:
     return tuple(mixed)
 
 
+def are_of_one_recorder(memory: Memory, pair: Overlapping) -> bool:
+    """Whether this bag directory's recorder made both, one after the other by its list.
+
+    Then they overlap in time since the clock was set back.
+    """
+    own = OwnRecordings(memory.index.bag_dir)
+    try:
+        made = {*own.in_order()}
+    except OSError:
+        return False
+    return made.issuperset(map(own.name_of, (pair.first, pair.second)))
+
+
 def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
     """Returns frames that have one parent in one recording and another in another one.
 
@@ -145,7 +161,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
 
 
 def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
-    """Returns sentences where robots are plainly mixed into one history, a minute old at most.
+    """Returns sentences where robots, or times, are plainly mixed; a minute old at most.
 
     With a week of bags a new check takes 0.1 s, and the page asks every few seconds.
     """
@@ -162,13 +178,19 @@ def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
     mixed = [
         recordings for recordings in mixed_recordings(memory, call) if recordings.topic is not None
     ]
-    if mixed:
-        names = sorted({name for recordings in mixed for name in recordings.pair.names})
-        first = mixed[0]
+    one = [recordings for recordings in mixed if are_of_one_recorder(memory, recordings.pair)]
+    several = [recordings for recordings in mixed if recordings not in one]
+    for overlapping, what, but in (
+        (several, "robots are mixed", "answers treat them as one robot"),
+        (one, SET_BACK, "one recorder made them, one after the other"),
+    ):
+        if not overlapping:
+            continue
+        names = sorted({name for recordings in overlapping for name in recordings.pair.names})
+        first = overlapping[0]
         yield (
-            f"robots are mixed: {listed(names)} overlap in time (from "
-            f"{iso_local(first.pair.start)}), each with different messages on {first.topic}, but "
-            f"answers treat them as one robot{ADVICE}"
+            f"{what}: {listed(names)} overlap in time (from {iso_local(first.pair.start)}), each "
+            f"with different messages on {first.topic}, but {but}{ADVICE}"
         )
     contradictions = contradicting_frames(memory, call)
     if contradictions:

@@ -100,7 +100,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
             *problems_of(snapshot, heartbeat, wall),
             *_describe_unheard(heard, latest),
             *missing_data(view),
-            *(("robots are mixed (see notes)",) if mixed else ()),
+            *dict.fromkeys(f"{sentence.partition(':')[0]} (see notes)" for sentence in mixed),
             *describe_gaps(view, TimeWindow.everything(), explained=True),
             *describe_lost(memory.index.bag_dir, TimeWindow.everything()),
         ),

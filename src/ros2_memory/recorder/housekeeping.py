@@ -255,7 +255,7 @@ class Housekeeping(Housekeeper):
     def note_restart(self, first: Ns, how: Interruption) -> None:
         """Records that a recording ended unexpectedly, and another one begins."""
         now = self._clock.now()
-        if self._triggers is not None:
+        if self._triggers is not None and how != "paused":
             self._triggers.note_restart(now, now)
         self._note_interruption(min(first, now), now, how)
 

@@ -341,7 +341,10 @@ class RecordingSessions:
         self._events.report_output(session.name, lines)
         for line in lines:
             if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
-                self._orders.reception.refused(session.name, line.topic)
+                # Of two policies that do not fit only one is named: a volatile publisher may be
+                # best effort, but then another line says that.
+                best_effort = "DURABILITY" not in line.text
+                self._orders.reception.refused(session.name, line.topic, best_effort=best_effort)
             elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
                 self._orders.reception.lost(session.name, line.topic, line.count or 0)
 

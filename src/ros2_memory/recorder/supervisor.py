@@ -108,6 +108,7 @@ class Supervisor:
         self._room_requested = False
         self._splits_closed = False
         self._interruptions: list[tuple[Ns, Interruption]] = []
+        self._paused_at: Ns | None = None  # since when nothing is recorded, by the wall clock
         self.stopped = True
         self._due_s: dict[str, float] = {}
         self._last = self._now()
@@ -216,7 +217,7 @@ class Supervisor:
         was_away, is_away = self._disk.away, self._disk.is_away(recordings)
         self._reception.may_write = not is_away
         if is_away and not was_away:
-            self._sessions.end_all(now)
+            self._end_for_now(now)
             self._events.fail(
                 "disk_gone",
                 f"recording is paused: the disk of {self._bag_dir} has been unmounted, and another "
@@ -270,13 +271,17 @@ class Supervisor:
         is_waiting = self._housekeeper.is_making_room() and free >= least // 2
         if free < least and not is_waiting:
             self._paused = True
-            self._sessions.end_all(now)
+            self._end_for_now(now)
             self._events.fail(
                 "recording_paused",
                 f"recording is paused: {free} bytes are free on the disk, and {least} are "
                 f"required (retention.min_free_gb); it resumes by itself at {enough}",
             )
             self._write_heartbeat()
+
+    def _end_for_now(self, now: ClockReading) -> None:
+        self._sessions.end_all(now)
+        self._paused_at = now.wall if self._paused_at is None else self._paused_at
 
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
@@ -359,6 +364,9 @@ class Supervisor:
         self._rotate_now = False
         self._reception.skip_latched(())
         self._sessions.begin(now)
+        if self._paused_at is not None:
+            self._add_interruption(self._paused_at, "paused")
+            self._paused_at = None
         self._topic_watch.began(now)
         self._silence.began(now.monotonic_s, SETTLE_S)
 

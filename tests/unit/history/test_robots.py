@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
@@ -63,6 +64,25 @@ def test_one_topic_twice_at_once_with_messages_of_its_own_is_two_robots(
     assert "blue, red overlap in time" in note
     assert "/odom" in note
     assert "robots are mixed (see notes)" in asked(memory, tmp_path, "memory_status")["doubts"]
+
+
+def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Path) -> None:
+    own = OwnRecordings(tmp_path)
+    names = ("rec_20231114T221340Z", "rec_20231114T221330Z")
+    for number, name in enumerate(names):
+        write_mcap(tmp_path / name / f"{name}_0.mcap", drive(10.0 * number))
+        own.begin(name)
+        assert own.complete(name)
+    memory = memory_of(tmp_path)
+    assert warned(memory) == []
+    status = asked(memory, tmp_path, "memory_status")
+    assert status["doubts"] == "the clock was set back between recordings (see notes)"
+    (note,) = [note for note in status["notes"] if "one recorder made them" in note]
+    assert ", ".join(sorted(names)) in note
+    # A copy that nobody listed may be of another robot.
+    for name in names:
+        (tmp_path / name).rename(tmp_path / f"{name}_copy")
+    assert len(warned(memory_of(tmp_path))) == 1
 
 
 @pytest.mark.parametrize(

@@ -158,6 +158,18 @@ def test_what_was_lost_is_in_the_status_and_a_memory_that_lost_some_is_not_whole
     )
 
 
+def test_what_a_publisher_sent_that_did_not_fit_is_said_to_be_missing(tmp_path: Path) -> None:
+    memory = remembering(tmp_path)
+    spans = [(BEGIN + 10 * S, BEGIN + 11 * S + 1), (BEGIN + 13 * S, BEGIN + 14 * S + 1)]
+    append_losses(tmp_path, [Loss("/odom", *span, 0, "refused") for span in spans])
+    sentence = (
+        f"messages of a publisher of /odom were not recorded from {BEGIN // S + 10}.000000 to "
+        f"{BEGIN // S + 14}.000000 (4 s), as its QoS did not fit the subscription: how many is not "
+        "known"
+    )
+    assert shown(memory, tmp_path)["doubts"] == sentence
+
+
 def test_what_an_unexpected_end_cost_is_in_the_status_with_the_gap(tmp_path: Path) -> None:
     for name, seconds in (("a", range(20)), ("b", range(37, 50)), ("c", range(60, 70))):
         (tmp_path / name).mkdir()

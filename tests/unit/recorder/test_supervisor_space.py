@@ -78,9 +78,10 @@ class TestSpace:
         assert world.heartbeat()["state"] == "paused"
 
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
-        world, _ = self.world(tmp_path)
+        world, housekeeping = self.world(tmp_path)
         world.started(3)
         world.free = 900
+        paused = world.wall
         world.run(3)
         world.free = 1100
         world.run(10)
@@ -89,6 +90,9 @@ class TestSpace:
         world.run(3)
         assert len(world.running) == 1
         assert world.heartbeat()["state"] == "recording"
+        [(since, how)] = housekeeping.restarts
+        assert how == "paused"
+        assert 0 <= since - paused <= 2 * NS_PER_S
 
     def test_what_is_free_and_cannot_be_measured_is_no_full_disk(self, tmp_path: Path) -> None:
         world = World(tmp_path).started(3)
@@ -156,7 +160,8 @@ class TestUnmounted:
         assert list(world.bag_dir.iterdir()) == []
 
     def test_it_goes_on_by_itself_when_the_disk_is_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path / "bags").started(3)
+        housekeeping = PlayedHousekeeper()
+        world = World(tmp_path / "bags", housekeeper=housekeeping).started(3)
         aside = self.unmounted(world)
         world.run(20)
         self.mounted(world, aside)
@@ -169,6 +174,7 @@ class TestUnmounted:
         beat = world.heartbeat()
         assert beat["state"] == "recording"
         assert "has been unmounted" in beat["last_error"]
+        assert [how for _, how in housekeeping.restarts] == ["paused"]
 
     def test_what_was_lost_when_it_went_is_written_down_once_it_is_back(
         self, tmp_path: Path
@@ -184,7 +190,7 @@ class TestUnmounted:
         self.mounted(world, aside)
         world.run(20)
         lost = [(loss.topic, loss.lost, loss.by) for loss in read_losses(bag_dir, MIN_NS, MAX_NS)]
-        assert lost == [("*", 0, "hung"), ("/door", 3, "rosbag2")]
+        assert lost == [("*", 0, "hung"), ("*", 0, "paused"), ("/door", 3, "rosbag2")]
 
     def test_one_that_comes_and_goes_is_waited_for_longer_each_time(self, tmp_path: Path) -> None:
         world = World(tmp_path / "bags").started(3)

@@ -20,6 +20,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.text import counted, listed
+from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.reception.measure import (
     Arrivals,
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.core.timebase import Ns
     from ros2_memory.storage.base import BagReader
 
 DEFAULT_DEPTH: Final = 10
@@ -85,7 +85,7 @@ def qos_overrides(
     plan: QueuePlan,
     *,
     latched: Collection[str],
-    weakest: Collection[str] = (),
+    best_effort: Collection[str] = (),
     volatile: Collection[str] = (),
 ) -> str:
     """Returns YAML for `--qos-profile-overrides-path`.
@@ -95,19 +95,22 @@ def qos_overrides(
         plan: the depths of their queues.
         latched: the topics that count as latched and may have many publishers. All of their
             messages are asked for, unless their publishers are known to be volatile, or it is one
-            of `volatile`.
-        weakest: topics with a publisher that was refused. They are asked for with what fits every
-            publisher: rosbag2 itself asks for more where it knows none of them yet.
+            of `best_effort` or `volatile`.
+        best_effort: topics with a publisher that was refused, or is best effort. They are asked for
+            with what fits every publisher: rosbag2 itself asks for more where it has not discovered
+            all of them, and a split names only those that it had. Who subscribes with best effort
+            is sent no earlier messages, so they are volatile as well.
         volatile: topics whose earlier messages are not asked for again, though they are latched.
     """
-    profiles = {topic: _profile(DEFAULT_DEPTH) for topic in weakest}
+    volatile = {*volatile, *best_effort}
+    profiles = {topic: _profile(plan.depth(topic)) for topic in best_effort}
     for topic, flow in flows.items():
         profiles[topic] = _profile(
             plan.depth(topic),
-            reliable=flow.offered.reliable,
+            reliable=flow.offered.reliable and topic not in best_effort,
             latched=flow.offered.latched and topic not in volatile,
         )
-    for topic in latched:
+    for topic in {*latched}.difference(best_effort):
         offered = flows[topic].offered if topic in flows else None
         if offered is None or (offered.latched and topic not in volatile):
             reliable = offered is None or offered.reliable
@@ -129,8 +132,14 @@ def _profile(
 DEEPEN_EVERY_S: Final = 60.0
 """At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""
 ASK_AGAIN_S: Final = 300.0
-"""At most so often a recording is rotated for the QoS of the same topic."""
+"""So long no recording is rotated for a topic of which one refused the weakest QoS, too."""
+ASKED_FOR: Final = 8
+"""So many recordings ask for what fits the publisher that was last refused, or best effort. What
+splits name are the publishers that were discovered in time, often not all: they do not show that it
+has gone."""
 QUEUE_BYTES: Final = 64 * 2**20
+_UNNOTICED_NS: Final[Ns] = 5 * NS_PER_S
+"""So long a publisher may have sent before rosbag2 says that it was refused."""
 _PLANS_KEPT: Final = 8
 _LOOKED_AT: Final = 3
 _MOST_UNWRITTEN: Final = 1000
@@ -153,8 +162,20 @@ class _Recording:
     plan: QueuePlan
     refused: set[str] = field(default_factory=set)
     """Topics with a publisher that this recording's subscription does not fit."""
+    asked_anew: frozenset[str] = frozenset()
+    """Topics that it asked for with what fits every publisher."""
     span: tuple[Ns, Ns] = (0, 0)
     """First and last log time of what it has."""
+
+
+class _Anew(NamedTuple):
+    """How a topic with a publisher that offers less is asked for, and by how many recordings.
+
+    Without `best_effort` only its durability did not fit.
+    """
+
+    best_effort: bool
+    recordings: int = ASKED_FOR
 
 
 class Reception:
@@ -194,7 +215,7 @@ class Reception:
         self._lock = threading.Lock()
         self.may_write = True
         self._flows: dict[str, TopicFlow] = {}
-        self._asked_anew: set[str] = set()
+        self._asked_anew: dict[str, _Anew] = {}
         self._skipped = frozenset[str]()
         self._recordings: dict[str, _Recording] = {}
         self._deepened_s: float | None = None
@@ -210,17 +231,32 @@ class Reception:
         """Returns the QoS overrides for a recording that is about to start."""
         with self._lock:
             plan = self._plan_queues()
-            self._recordings[recording] = _Recording(plan)
+            anew = self._asked_anew
+            self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
-            latched = [topic for topic in self._latched if topic not in self._asked_anew]
-            # A latched topic that is asked for as volatile would lose what was published before.
-            weakest = self._asked_anew.difference(self._latched)
-            alone = (name for name, flow in self._flows.items() if flow.offered.publishers == 1)
-            volatile = {*self._volatile, *self._skipped.intersection(alone)}
+            # A latched topic that is asked for as volatile would lose what was published before:
+            # rosbag2 decides by the publishers that it finds.
+            adapting = {
+                topic for topic in self._latched if topic in anew and not anew[topic].best_effort
+            }
+            flows = {topic: flow for topic, flow in self._flows.items() if topic not in adapting}
+            best_effort = {
+                topic
+                for topic, asked in anew.items()
+                if asked.best_effort or topic not in {*flows, *adapting}
+            }
+            alone = (name for name, flow in flows.items() if flow.offered.publishers == 1)
+            volatile = {*self._volatile, *self._skipped.intersection(alone), *anew}
+            latched = [topic for topic in self._latched if topic not in adapting]
+            self._asked_anew = {
+                topic: asked._replace(recordings=asked.recordings - 1)
+                for topic, asked in anew.items()
+                if asked.recordings > 1
+            }
             return qos_overrides(
-                self._flows, plan, latched=latched, weakest=weakest, volatile=volatile
+                flows, plan, latched=latched, best_effort=best_effort, volatile=volatile
             )
 
     def skip_latched(self, topics: Collection[str]) -> None:
@@ -290,18 +326,20 @@ class Reception:
                 raise RecorderError(f"losses cannot be written: {reason}") from error
             self._unwritten.clear()
 
-    def refused(self, recording: str, topic: str) -> None:
+    def refused(self, recording: str, topic: str, *, best_effort: bool = True) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
 
-        The state of the topic is dropped: the next recording asks for what fits every publisher, or
-        of a latched topic adapts to those that it finds, until a split shows what they offer.
+        The next recordings ask for what fits every publisher; without `best_effort` for what fits a
+        volatile one, or, of a topic that counts as latched, adapt to the publishers they find. What
+        that publisher sent is missing from each split of this recording, until it ends.
         """
         with self._lock:
             state = self._recordings.get(recording)
             if state is not None:
                 state.refused.add(topic)
-            self._flows.pop(topic, None)
-            self._asked_anew.add(topic)
+            before = self._asked_anew.get(topic)
+            best_effort |= before is not None and before.best_effort
+            self._asked_anew[topic] = _Anew(best_effort)
 
     def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
         """Returns why a recording should be rotated now; None where it need not be."""
@@ -312,7 +350,8 @@ class Reception:
             refused = frozenset(
                 topic
                 for topic in state.refused
-                if now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
+                if topic not in state.asked_anew
+                or now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
             )
             if refused:
                 sentence = (
@@ -355,6 +394,7 @@ class Reception:
     def _measure(self, recording: str, path: Path) -> None:
         try:
             split = measure_split(self._reader, path, end_only=not recording)
+            summary = self._reader.summarize(path)
         except (EpisodicError, OSError) as error:
             # The file is reported where it matters; its successor shows the same topics.
             _log.debug("split_not_measured", file=str(path), reason=str(error))
@@ -369,14 +409,21 @@ class Reception:
                 if state is None or topic not in state.refused:
                     old_flow = self._flows.get(topic)
                     self._flows[topic] = flow if old_flow is None else old_flow.joined(flow)
-                    self._asked_anew.discard(topic)
+                    if not flow.offered.reliable:
+                        self._asked_anew[topic] = _Anew(best_effort=True)
             short = self._plan_queues().cut_short - before
             self._losses.unclear(split.arrivals.keys() - split.progress.keys())
             if recording:
                 self._arrivals.measured(split)
             if state is not None and split.arrivals:
-                first, _ = state.span
-                state.span = first or split.start, split.end
+                # Of a large split only the end is measured.
+                start, (first, last) = summary.start, state.span
+                since = max(first or start, min(last or start, start) - _UNNOTICED_NS)
+                self._unwritten += (
+                    Loss(topic, since, split.end + 1, 0, "refused")
+                    for topic in sorted(state.refused)
+                )
+                state.span = first or start, split.end
         if recording:
             self._report_losses(lambda: self._losses.measured(recording, split.progress))
         for topic in sorted(short):

@@ -7,10 +7,14 @@ from pathlib import Path
 import pytest
 import yaml
 
+from ros2_memory.bag_dir.state_files import Loss, read_losses
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.recorder.reception import measure
-from ros2_memory.recorder.reception.measure import OfferedQos, measure_split
+from ros2_memory.recorder.reception import reception as reception_module
+from ros2_memory.recorder.reception.measure import OfferedQos, TopicFlow, measure_split
 from ros2_memory.recorder.reception.reception import (
     ASK_AGAIN_S,
+    ASKED_FOR,
     DEEPEN_EVERY_S,
     Reception,
     newest_splits,
@@ -89,8 +93,79 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
 def test_a_topic_taken_for_latched_that_is_not_adapts_too() -> None:
     made = reception()
     made.overrides("a")
-    made.refused("a", "/tf_static")
+    made.refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
+
+
+def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_heard(
+    tmp_path: Path,
+) -> None:
+    """A split names the publishers that its recording had discovered, often not all."""
+    made, topics = reception(), ("/map", "/tf_static")
+    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
+    latched = write_mcap(tmp_path / "a.mcap", messages, McapLayout(latched=frozenset(topics)))
+    made.overrides("a")
+    made.learn("a", latched)
+    for topic in topics:
+        made.refused("a", topic)
+        made.refused("a", topic, best_effort=False)  # the other policy of the same publisher
+    rotation = made.rotation_due("a", 50.0)
+    assert rotation is not None
+    made.rotation_begun(rotation, 50.0)
+    for name in ("b", "c"):
+        asked = profiles(made, name)
+        assert {(each["reliability"], each["durability"]) for each in asked.values()} == {
+            ("best_effort", "volatile")
+        }
+        made.learn(name, latched)
+    for nth in range(ASKED_FOR - 2):
+        profiles(made, f"later_{nth}")
+    asked = profiles(made, "d")
+    assert {each["reliability"] for each in asked.values()} == {"reliable"}
+    assert {each["durability"] for each in asked.values()} == {"transient_local"}
+    # This one had not asked for the weakest: it need not wait.
+    made.refused("d", "/map")
+    assert made.rotation_due("d", 51.0) is not None
+
+
+def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_has_gone(
+    tmp_path: Path,
+) -> None:
+    made = reception()
+    splits = [split(tmp_path / f"a_{nth}.mcap", 5, 4) for nth in range(2)]
+    made.overrides("a")
+    made.learn("a", splits[0])
+    weaker = TopicFlow(OfferedQos(reliable=False, latched=False, publishers=2), 10, 700)
+    with pytest.MonkeyPatch.context() as patch:
+        measured = measure_split(McapReader(), splits[0])._replace(flows={"/odom": weaker})
+        patch.setattr(reception_module, "measure_split", lambda *_, **__: measured)
+        made.learn("a", splits[0])
+    made.learn("a", splits[1])
+    assert profiles(made, "b")["/odom"]["reliability"] == "best_effort"
+
+
+def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -> None:
+    made = reception()
+    messages = [odom(T0 + at * NS, 1.0, 2.0, topic="/map") for at in range(9)]
+    layout = McapLayout(latched=frozenset(["/map"]))
+    made.overrides("a")
+    made.learn("a", write_mcap(tmp_path / "a.mcap", messages, layout))
+    made.refused("a", "/map", best_effort=False)
+    asked = profiles(made, "b")["/map"]
+    assert (asked["reliability"], asked["durability"]) == ("reliable", "volatile")
+
+
+def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
+    made = Reception(McapReader(), bag_dir=tmp_path, background=Inline())
+    made.overrides("a")
+    made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
+    made.refused("a", "/odom")
+    made.overrides("b")
+    made.learn("b", split(tmp_path / "b_0.mcap", 5, 4))
+    assert read_losses(tmp_path, MIN_NS, MAX_NS) == []
+    made.learn("a", split(tmp_path / "a_1.mcap", 5, 8))
+    last = T0 + 39 * NS // 5
+    assert read_losses(tmp_path, MIN_NS, MAX_NS) == [Loss("/odom", T0, last + 1, 0, "refused")]
 
 
 def test_of_a_huge_split_the_end_shows_rates_and_no_holes(
