@@ -105,6 +105,10 @@ class TestAge:
         going = by_hours(plan, held)
         assert plan.newest not in {each.path for each in going}
 
+    def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
+        before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
+        assert expired(stock(*before, after), LIMITS) == ()
+
     def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
         boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
