@@ -254,7 +254,7 @@ class BagAccess:
                 read.append(tables)
             yield from tables
             self.check_deadline()
-        if is_lasting and remembered_tables is None:
+        if is_lasting and remembered_tables is None and size <= DECODED_BYTES:
             remembered.put(key, read, size)
 
 
