@@ -378,20 +378,21 @@ class BagTable:
     def _counted_form(self, path: str, context: ScanContext) -> Classification | None:
         """Returns a file's classification; None if there is none, or another file counts.
 
-        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Both
-        stay where that was interrupted. One that is not read is reported once it is clear that it
-        stays.
+        While a split is compressed `x.mcap` and `x.mcap.zstd` both lie there: one bag, twice. Two
+        complete ones that have been there for three splits are kept on purpose: both count.
         """
         self._hidden.discard(path)
         classification, other = self._classified.get(path), self._classified.get(other_form(path))
         if classification is None or other is None or classification.state > other.state:
             return classification
-        if classification.state == other.state and not path.endswith(COMPRESSED):
+        forms = (self._files.get(form) for form in (path, other_form(path)))
+        is_kept = not any(notes is not None and notes.grew_lately(context) for notes in forms)
+        if is_kept and classification.state is FileState.UNREAD:
             return classification
-        if classification.state is FileState.UNREAD:
-            forms = (self._files.get(form) for form in (path, other_form(path)))
-            if not any(notes is not None and notes.grew_lately(context) for notes in forms):
-                return classification
+        if classification.state == other.state and (
+            (is_kept and classification.state is FileState.CLOSED) or not path.endswith(COMPRESSED)
+        ):
+            return classification
         self._hidden.add(path)
         return None
 

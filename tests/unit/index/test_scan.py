@@ -6,12 +6,9 @@ import os
 from pathlib import Path
 
 import pytest
-import zstandard
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.index.scan import ScanResult, Tree
-from tests.support.bags import odom, write_splits
-from tests.support.memories import asked, memory_of
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -189,17 +186,3 @@ def _beyond_the_longest_path(root: Path) -> str:
         here = below
     os.close(here)
     return name
-
-
-def test_a_split_that_stays_in_both_forms_counts_once(tmp_path: Path) -> None:
-    """The recorder was killed after it had compressed a split, before it deleted the other form."""
-    begin = 1_784_000_000 * S
-    write_splits(tmp_path, [odom(begin + n * S, 0.1 * n, 0.0) for n in range(30)])
-    path = tmp_path / "rec" / "rec_1.mcap"
-    Path(f"{path}.zstd").write_bytes(zstandard.compress(path.read_bytes()))
-    for file in path.parent.iterdir():
-        os.utime(file, ns=(begin, begin))
-    memory = memory_of(tmp_path, storage="rosbag2")
-    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
-    assert odometry["count"] == 30
-    assert asked(memory, tmp_path, "data_time_range")["bags"] == 3
