@@ -49,7 +49,7 @@ DAY_NS: Final[Ns] = 86_400 * NS_PER_S
 _FETCHED_BYTES: Final = 1 << 20
 """How much of compressed columns that a scan wants next is read at once."""
 DECODED_BYTES: Final = 8 << 20
-"""How much of a bag that is not stored is remembered, at most."""
+"""The tables of a bag that is not stored are remembered if they take no more memory than this."""
 _FEW_DAYS_NS: Final = 3 * DAY_NS
 """Of windows up to this long, only the parts of the days that they touch are looked up."""
 _DROPPED: Final = "beyond the share of the store (store.max_share)"
