@@ -282,16 +282,27 @@ class Scanner:
             by_part.update(zip(parts, bounds, strict=True))
         return by_part
 
+    @property
+    def _store_of_parts(self) -> ColumnStore:
+        """The store that has the parts.
+
+        Raises:
+            GoneError: there is none.
+        """
+        if self.store is None:
+            raise GoneError
+        return self.store
+
     def _zones(self, topic: int, parts: IntArray, path: str) -> Zones:
         """Returns the zones of a column in some parts of a topic."""
-        assert self.store is not None  # noqa: S101 - there are no parts without one
+        store = self._store_of_parts
         key = (topic, path)
         zones, newest = self.caches.zones.get(key) or (Zones.of([], []), 0)
         asked = int(parts.max(initial=0))
         if asked > newest:
-            failures = self.store.failures
-            zones = zones.joined(self.store.zones(topic, path, newest))
-            if self.store.failures == failures:
+            failures = store.failures
+            zones = zones.joined(store.zones(topic, path, newest))
+            if store.failures == failures:
                 # Not each part has each column, so what was asked for counts, too.
                 newest = max([asked, *zones.parts[-1:].tolist()])
                 self.caches.zones.put(key, (zones, newest), zones.memory_bytes)
@@ -307,9 +318,8 @@ class Scanner:
         Raises:
             GoneError: it was deleted meanwhile.
         """
-        assert self.store is not None  # noqa: S101 - there are no parts without one
-        offset = self.store.offset
-        topic = self.store.topic(head.topic)
+        offset = self._store_of_parts.offset
+        topic = self._store_of_parts.topic(head.topic)
         if topic is None:
             raise GoneError
         packed = partial(self.packed, head, together=together)
@@ -369,16 +379,16 @@ class Scanner:
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
-        assert self.store is not None  # noqa: S101 - as above
         cached = self.caches.packed.get((head.number, path))
         if cached is None:
             numbers = [head.number, *(part.number for part in together if part.topic == head.topic)]
-            failures = self.store.failures
-            read = self.store.packed(head.topic, path, numbers)
+            store = self._store_of_parts
+            failures = store.failures
+            read = store.packed(head.topic, path, numbers)
             others = [number for number in numbers if number not in read]
             # A part that is gone has no columns either: only of one that is there it says anything.
-            present = self.store.packed(head.topic, LOG_TIME, others) if others else {}
-            if self.store.failures != failures:
+            present = store.packed(head.topic, LOG_TIME, others) if others else {}
+            if store.failures != failures:
                 raise GoneError
             read.update(dict.fromkeys(present, _ABSENT))
             for number, packed in read.items():
@@ -400,7 +410,6 @@ class Scanner:
         cached = self.caches.read.get(key)
         if cached is not None:
             return cast("Column", cached)
-        assert self.store is not None  # noqa: S101 - as above
         stored = b""
         # The one value of a constant is its least, unless it is a text.
         is_constant = packed.codec.endswith(" constant") and not packed.codec.startswith("text")
@@ -413,7 +422,7 @@ class Scanner:
             column = unpack(packed.codec, packed.count, packed.zone.least, data)
         except (ValueError, LookupError, struct.error) as error:
             # Else each question about the part would fail, for ever.
-            self.store.give_up(error)
+            self._store_of_parts.give_up(error)
             raise GoneError from error
         self.caches.read.put(key, column, column_bytes(column))
         return column
@@ -426,14 +435,13 @@ class Scanner:
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
-        assert self.store is not None  # noqa: S101 - as above
         stored = self.caches.fetched.get((head.number, path))
         if stored is None:
             numbers = [part.number for part in together if part.topic == head.topic]
             nth = numbers.index(head.number) if head.number in numbers else 0
             goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
             numbers = numbers[nth:] if goes_on else [head.number]
-            fetched = self.store.part_data(numbers, path, _FETCHED_BYTES)
+            fetched = self._store_of_parts.part_data(numbers, path, _FETCHED_BYTES)
             for number, data in fetched.items():
                 self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
             stored = fetched.get(head.number)
