@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 import zstandard
+from mcap import records as mcap_records
+from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 from mcap.writer import Writer
 
@@ -361,6 +363,35 @@ class TestWhatAWriterMayDo:
 
         (topic,) = McapReader().summarize(raw_mcap(tmp_path / "a.mcap", fill)).topics
         assert topic.latched is latched
+
+    def test_a_chunk_of_declarations_alone_may_have_empty_message_indexes(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", [], declared=[("/chatter", STRING)])
+        data = path.read_bytes()
+        start = FOOTER.unpack_from(data, len(data) - 8 - FOOTER.size)[2]
+        [channel] = McapReader().channels(path)
+        declared, beside, summary = RecordBuilder(), RecordBuilder(), RecordBuilder()
+        schema = mcap_records.Schema(1, channel.schema.text, "ros2msg", STRING)
+        for section in (declared, summary):
+            schema.write(section)
+            mcap_records.Channel(1, "/chatter", "cdr", {}, 1).write(section)
+        content = declared.end()
+        mcap_records.Chunk("", content, 0, 0, 0, len(content)).write(beside)
+        at = start - RECORD.size - 4  # where the data ended
+        chunk_size = beside.count
+        mcap_records.MessageIndex(1, []).write(beside)
+        mcap_records.DataEnd(0).write(beside)
+        mcap_records.Statistics(0, 1, {}, 1, 0, 0, 0, 0, 1).write(summary)
+        size, places = len(content), {1: at + chunk_size}
+        mcap_records.ChunkIndex(chunk_size, at, "", size, 0, 15, places, 0, size).write(summary)
+        front = data[:at] + beside.end()
+        footer = FOOTER.pack(Opcode.FOOTER, 20, len(front), 0, 0)
+        path.write_bytes(front + summary.end() + footer + data[-8:])
+        reader = McapReader()
+        assert reader.summarize(path).silent == ("/chatter",)
+        assert reader.summarize(path).notes == ()
+        assert read(reader, path) == []
 
     def test_attachments_and_metadata_between_the_messages_are_passed_over(
         self, tmp_path: Path

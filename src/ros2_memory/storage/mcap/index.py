@@ -408,7 +408,8 @@ def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
     if not counts.keys() <= channels.keys() or len(chunks) > MAX_CHUNKS:
         raise DoubtError
     filled = [chunk for chunk in chunks if chunk.channels]
-    if counts and len(filled) < len(chunks):  # some have no message indexes
+    # Some have no message indexes, or all of these are empty.
+    if chunks and (not counts or len(filled) < len(chunks)):
         raise DoubtError
     declared_channels = frozenset(channels)
     if not all(map(declared_channels.issuperset, {chunk.channels for chunk in filled})):
