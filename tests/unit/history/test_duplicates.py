@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from hypothesis import example, given
@@ -18,9 +19,12 @@ from ros2_memory.history.duplicates import (
     deduplicate_forward,
 )
 from ros2_memory.storage.base import Channel, Record, Schema
+from tests.support.bags import boolean, write_mcap
+from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
 CHANNEL = Channel("/bumper", "cdr", Schema("std_msgs/msg/Bool"))
 EVERYWHERE = [(MIN_NS, MAX_NS)]
@@ -69,6 +73,18 @@ def test_what_lies_outside_of_the_overlap_is_kept_both_ways(
     assert list(deduplicate_backward(reversed(messages), spans))[::-1] == forwards
     outside = [each for each in messages if not spans[0][0] <= each.time < spans[0][1]]
     assert not Counter(map(id, outside)) - Counter(map(id, forwards))
+
+
+@each_way
+def test_messages_without_a_publish_time_are_no_copies(tmp_path: Path, recalls: bool) -> None:
+    """Some writers state 0 for a publish time that they do not know."""
+    for nth, robot in enumerate(("ann", "bob")):
+        alike = [boolean(S + n * S // 10 + nth * MS, data=False) for n in range(20)]
+        unknown = [replace(message, publish_time=0) for message in alike]
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", unknown)
+    memory = memory_of(tmp_path, recalls=recalls)
+    [bumper] = asked(memory, tmp_path, "list_recorded_topics")
+    assert bumper["count"] == 40
 
 
 def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:

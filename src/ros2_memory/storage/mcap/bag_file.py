@@ -712,4 +712,5 @@ def _record(
 ) -> Record:
     if payload.startswith(FRAME_MAGIC):
         payload = uncompressed(channel, payload)
-    return Record(channel, log_time, publish_time if publish_time < MAX_NS else log_time, payload)
+    published = publish_time if 0 < publish_time < MAX_NS else log_time
+    return Record(channel, log_time, published, payload)

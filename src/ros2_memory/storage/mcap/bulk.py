@@ -243,8 +243,8 @@ def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
 
 
 def _published(stated: IntArray, logged: IntArray) -> IntArray:
-    # An unsigned time past the signed range has become negative.
-    is_impossible = (stated < 0) | (stated == MAX_NS)
+    # An unsigned time past the signed range has become negative. Some writers write 0 for unknown.
+    is_impossible = (stated <= 0) | (stated == MAX_NS)
     return np.where(is_impossible, logged, stated) if is_impossible.any() else stated
 
 
