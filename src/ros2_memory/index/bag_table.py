@@ -5,6 +5,7 @@ One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, o
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -15,6 +16,7 @@ from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
+from ros2_memory.index.copied_files import is_copy
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
@@ -111,6 +113,7 @@ class BagTable:
         self._patrol: list[str] = []
         self._scanned: ScanResult | None = None
         self._timeline = Timeline()
+        self._compared: dict[tuple[BagFile, BagFile], bool] = {}
 
     def update(self, context: ScanContext, *, patrolling: bool) -> TableChange:
         """Scans for what may have changed; `patrolling` also checks some of what did not.
@@ -139,7 +142,10 @@ class BagTable:
 
     def snapshot(self, now: Ns) -> Snapshot:
         """Returns what is known since the last scan."""
-        timeline, scanned = self._without_superseded(), self._scanned or ScanResult()
+        copies = self._copies()
+        left_out = {bag.file: bag for bag in (*copies, *self._superseded())}
+        timeline = self._timeline.changed(left_out.values(), ())
+        scanned = self._scanned or ScanResult()
         aside: dict[FileState, list[SetAside]] = {}
         silent = set(timeline.silent)
         empty: list[Path] = []
@@ -161,10 +167,19 @@ class BagTable:
             scanned_at=now,
             problem=scanned.problem,
             metadata_folders=tuple(sorted(scanned.metadata_folders)),
+            copies=copies,
         )
 
-    def _without_superseded(self) -> Timeline:
-        """Returns the timeline without the bags in whose place thinned days answer, if any do."""
+    def _copies(self) -> tuple[BagFile, ...]:
+        """Returns the bags that are copies of others in their folder; compares each once."""
+        compared, self._compared = self._compared, {}
+        for pair in self._timeline.alike:
+            with suppress(OSError):
+                self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
+        return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
+
+    def _superseded(self) -> Iterable[BagFile]:
+        """Returns the bags in whose place thinned days answer."""
         superseded = read_superseded(self._bag_dir)
         days = {name: self._bag_named(name) for name in superseded.days}
         whole = {
@@ -173,8 +188,7 @@ class BagTable:
             if day is not None and (day.size, day.mtime_ns) == superseded.days[name]
         }
         names = (name for name, day in superseded.bags.items() if day in whole)
-        bags = [*filter(None, map(self._bag_named, names))]
-        return self._timeline.changed(bags, ()) if bags else self._timeline
+        return filter(None, map(self._bag_named, names))
 
     def _bag_named(self, name: str) -> BagFile | None:
         """Returns the bag at a path below the bag directory, if that answers."""

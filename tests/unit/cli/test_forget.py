@@ -248,6 +248,17 @@ class TestForeignBags:
         forget(1, 40, 100, "--yes", "--topic", "/odom")
         assert McapReader().summarize(path).count == 1
 
+    @pytest.mark.parametrize("more", [[], ["--topic", "/odom"]])
+    def test_a_copy_beside_a_bag_is_named_or_goes_too(
+        self, bag_dir: Path, forget: Forget, more: list[str]
+    ) -> None:
+        path = bag_dir / "rec_1" / "rec_3.mcap"
+        copy = path.with_name("rec_3 (copy).mcap")
+        shutil.copy2(path, copy)
+        assert "stays: rec_1/rec_3 (copy).mcap" in forget(1, 55, 100, "--yes", *more).out
+        forget(0, 55, 100, "--yes", "retention.foreign=delete", *more)
+        assert not copy.exists() or not [*McapReader().summarize(copy).of("/odom")]
+
     @pytest.mark.parametrize("folder", ["latched", "moments/x", "moments/x/rec_1"])
     def test_in_folders_of_the_recorder_too_they_go_once_they_are_adopted(
         self, bag_dir: Path, folder: str, forget: Forget, exits: Program

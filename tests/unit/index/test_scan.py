@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.index.scan import ScanResult, Tree
+from tests.support.bags import odom, write_mcap
+from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -186,3 +189,32 @@ def _beyond_the_longest_path(root: Path) -> str:
         here = below
     os.close(here)
     return name
+
+
+def write_odometry(path: Path, speed: float) -> Path:
+    begin = 1_784_000_000 * S
+    poses = [odom(begin + n * S, speed * n, 0.0) for n in range(10)]
+    write_mcap(path, poses)
+    os.utime(path, ns=(begin, begin))
+    return path
+
+
+@each_way
+def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) -> None:
+    path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
+    for name in ("rec_0 (copy).mcap", "another.mcap"):
+        shutil.copy2(path, path.with_name(name))
+    memory = memory_of(tmp_path, recalls=recalls)
+    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 10
+    assert [bag.file for bag in memory.index.snapshot().bags] == [str(path)]
+    path.unlink()
+    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 10
+
+
+def test_runs_of_a_simulation_with_equal_times_are_no_copies(tmp_path: Path) -> None:
+    write_odometry(tmp_path / "run_1.mcap", 0.1)
+    write_odometry(tmp_path / "run_2.mcap", 0.2)
+    [odometry] = asked(memory_of(tmp_path), tmp_path, "list_recorded_topics")
+    assert odometry["count"] == 20

@@ -310,7 +310,7 @@ class _Forget:
     def _raw_bags(self, snapshot: Snapshot) -> Iterator[BagFile]:
         """Yields the bags with all messages in them, also those that do not count."""
         handovers: dict[Path, Handover] = {}
-        for bag in snapshot.bags:
+        for bag in (*snapshot.bags, *snapshot.copies):
             if bag.sidecar_ns:
                 if bag.recording not in handovers:
                     handovers[bag.recording] = read_handover(bag.recording).handover
