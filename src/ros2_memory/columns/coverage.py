@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.columns.store import ColumnStore, State, StoredBag, relative
+from ros2_memory.columns.store import BagKey, ColumnStore, State, StoredBag, relative
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 
 if TYPE_CHECKING:
@@ -187,9 +187,7 @@ class Covering:
             stored_bag = stored.get(relative(bag.file, root))
             if (
                 stored_bag is not None
-                and stored_bag.size == bag.size
-                and stored_bag.mtime_ns == bag.mtime_ns
-                and stored_bag.sidecar_ns == bag.sidecar_ns
+                and stored_bag.key == BagKey.of(bag, self._bag_dir)
                 and bag.state is BagState.CLOSED
             ):
                 numbers[nth], is_hashed[nth] = offset + stored_bag.row, stored_bag.hashed

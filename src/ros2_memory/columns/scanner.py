@@ -172,7 +172,7 @@ class Scanner:
         self._covering = None if store is None else Covering(store, bag_dir)
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
-        self._damaged: dict[tuple[str, int, Ns], str] = {}
+        self._damaged: dict[tuple[str | Ns, ...], str] = {}
         # They follow from columns alone, and are of use where these were dropped.
         self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
@@ -183,13 +183,13 @@ class Scanner:
             return
         if len(self._damaged) >= _MOST_DAMAGED:
             self._damaged.clear()
-        self._damaged[bag.file, bag.size, bag.mtime_ns] = error.reason
+        self._damaged[bag.identity] = error.reason
 
     def damaged_parts(self, bags: Sequence[BagFile]) -> list[tuple[BagFile, str]]:
         """Returns the bags of which a part was found lost since the program began, and why."""
         if not self._damaged:
             return []
-        reasons = ((bag, self._damaged.get((bag.file, bag.size, bag.mtime_ns))) for bag in bags)
+        reasons = ((bag, self._damaged.get(bag.identity)) for bag in bags)
         return [(bag, reason) for bag, reason in reasons if reason is not None]
 
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:

@@ -68,17 +68,23 @@ DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
 
 
 class BagKey(NamedTuple):
-    """Identifies the bytes of a bag: a file below the bag directory, as `stat` showed it."""
+    """Identifies the bytes of a bag: a file below the bag directory, as `stat` showed it.
+
+    And its first and last log time: another file may have been given the size and mtime of it.
+    """
 
     path: str
     size: int
     mtime_ns: Ns
     sidecar_ns: Ns
+    first_ns: Ns
+    last_ns: Ns
 
     @classmethod
     def of(cls, bag: BagFile, bag_dir: Path) -> BagKey:
         """Returns the key of a bag of the index."""
-        return cls(relative(bag.file, str(bag_dir)), bag.size, bag.mtime_ns, bag.sidecar_ns)
+        path, *rest = bag.identity
+        return cls(relative(path, str(bag_dir)), *rest)
 
 
 def relative(path: str, bag_dir: str) -> str:
@@ -89,6 +95,9 @@ def relative(path: str, bag_dir: str) -> str:
     inner = path.removeprefix(f"{bag_dir.rstrip(os.sep)}{os.sep}")
     # SQLite stores text as UTF-8, which the bytes of a file name need not be.
     return inner if inner.isascii() else inner.encode("utf-8", "backslashreplace").decode()
+
+
+_KEY: Final = ", ".join(BagKey._fields)
 
 
 class State(NamedTuple):
@@ -118,12 +127,9 @@ class StoredBag(NamedTuple):
     `row` is its number less the store's `offset`: a week of these is made at once.
     """
 
-    path: str
-    size: int
-    mtime_ns: Ns
-    sidecar_ns: Ns
+    key: BagKey
     row: int
-    hashed: int
+    hashed: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -221,13 +227,13 @@ class ColumnStore(Database):
         """Returns the bags that are stored, by their paths; among some, or all of them."""
         condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
         rows = self._rows(
-            list[tuple[str, int, Ns, Ns, int, int]](),
-            "SELECT path, size, mtime_ns, sidecar_ns, id, hashed FROM bag"
-            f" WHERE definitions IN ('', ?) {condition}",
+            list[tuple[int, int, str, int, Ns, Ns, Ns, Ns]](),
+            f"SELECT id, hashed, {_KEY} FROM bag WHERE definitions IN ('', ?) {condition}",
             self._definitions,
             *(() if paths is None else (json.dumps(paths),)),
         )
-        return {bag.path: bag for bag in map(StoredBag._make, rows)}
+        stored = (StoredBag(BagKey._make(key), row, bool(hashed)) for row, hashed, *key in rows)
+        return {bag.key.path: bag for bag in stored}
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
@@ -252,8 +258,8 @@ class ColumnStore(Database):
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
-        query = "SELECT path, size, mtime_ns, sidecar_ns FROM bag WHERE first_ns < ?"
-        return [BagKey(*row) for row in self._rows(list[tuple[str, int, Ns, Ns]](), query, before)]
+        query = f"SELECT {_KEY} FROM bag WHERE first_ns < ?"
+        return [*map(BagKey._make, self._rows(list[tuple[str | int, ...]](), query, before))]
 
     def paths(self) -> list[str]:
         """Returns the paths of all bags, also of those that are stored in part."""
@@ -479,7 +485,7 @@ class ColumnStore(Database):
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
             rows = connection.execute(
-                "SELECT path, size, mtime_ns, sidecar_ns, hashed FROM bag"
+                f"SELECT {_KEY}, hashed FROM bag"
                 " WHERE definitions IN ('', ?) AND path IN (SELECT value FROM json_each(?))"
                 f" AND id NOT IN ({UNMERGED})",
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),

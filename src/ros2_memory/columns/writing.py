@@ -232,11 +232,10 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
     """Inserts a bag; returns its number."""
     key, bag, hashed, _ = to_store
     summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
-    times = (bag.start, bag.end, _messages_of(bag))
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
         " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, *times, hashed, definitions, summary, bag.summary.packed),
+        (*key, _messages_of(bag), hashed, definitions, summary, bag.summary.packed),
     )
     return int(cursor.lastrowid or 0)
 

@@ -155,6 +155,11 @@ class BagFile(NamedTuple):
     sidecar_ns: Ns = 0
 
     @property
+    def identity(self) -> tuple[str, int, Ns, Ns, Ns, Ns]:
+        """What tells the messages that count from those that its file had at any other time."""
+        return self.file, self.size, self.mtime_ns, self.sidecar_ns, self.start, self.end
+
+    @property
     def path(self) -> Path:
         """The path; mostly the same object each time."""
         return _path(self.file)

@@ -222,7 +222,7 @@ class BagAccess:
         self.check_deadline()
         part = _indexed_part(bag, TimeWindow.everything() if around else window)
         remembered = self.memory.columns.caches.decoded
-        key = (bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns, topic, part, hashed, columns)
+        key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         remembered_tables = remembered.get(key) if is_lasting else None
         read_now = decoded(

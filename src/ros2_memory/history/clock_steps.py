@@ -201,8 +201,7 @@ def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
     topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
-    states = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in bags]
-    key = (topic, pause.start, pause.end, *states)
+    key = (topic, pause.start, pause.end, *[bag.identity for bag in bags])
     scanner = view.memory.columns
     remembered = scanner.caches.clock_steps.get(key)
     if remembered is None:

@@ -32,9 +32,9 @@ if TYPE_CHECKING:
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
 
-Unchanged: TypeAlias = "dict[str, tuple[BagFile, int]]"
-"""By path, the bag and the inode of closed files that do not change any more, or not since their
-columns were stored.
+Unchanged: TypeAlias = "dict[str, tuple[BagFile, int, Ns]]"
+"""By path, the bag, the inode and the ctime of closed files that do not change any more, or not
+since their columns were stored.
 
 Those are most of a week, so no more is kept of them. Should a file change, the notes on it are made
 as if it had been read, and it is classified again.
@@ -194,8 +194,7 @@ class BagTable:
         """Returns the bag at a path below the bag directory, if that answers."""
         path = str(self._bag_dir / name)
         if path in self._unchanged:
-            bag, _ = self._unchanged[path]
-            return bag
+            return self._unchanged[path][0]
         classification = self._counted.get(path)
         return None if classification is None else classification.bag
 
@@ -224,7 +223,7 @@ class BagTable:
             return
         for path, stamp in [*scanned.stamps.items()]:
             before = self._stamp(path)
-            if before and settled(stamp.mtime_ns, context.now) and stamp.matches(before):
+            if before and settled(stamp.mtime_ns, context.now) and stamp == before:
                 del scanned.stamps[path]
             else:
                 self._reactivate(path, context)
@@ -236,19 +235,16 @@ class BagTable:
         """Makes of an unchanged file what would be known had it been read."""
         stamp = self._stamp(path)
         if stamp is not None:
-            bag, _ = self._unchanged.pop(path)
+            bag, *_ = self._unchanged.pop(path)
             notes = self._files[path] = FileNotes.first(path, stamp, context.now)
             notes.restore(bag.summary)
             classification = Classification(FileState.CLOSED, bag)
             self._classified[path] = self._counted[path] = classification
 
     def _stamp(self, path: str) -> Stamp | None:
-        """Returns the stamp of an unchanged file; None for any other.
-
-        Its ctime is 0: that counts only where a file could not be read.
-        """
-        bag, inode = self._unchanged.get(path, (None, 0))
-        return bag and Stamp(bag.size, bag.mtime_ns, 0, inode, bag.sidecar_ns)
+        """Returns the stamp of an unchanged file; None for any other."""
+        bag, inode, ctime = self._unchanged.get(path, (None, 0, 0))
+        return bag and Stamp(bag.size, bag.mtime_ns, ctime, inode, bag.sidecar_ns)
 
     def _drop(self, paths: Iterable[str]) -> set[str]:
         """Drops the state of files; returns those that were classified."""
@@ -287,7 +283,8 @@ class BagTable:
         if classification.bag is not None:
             if self._packs:
                 classification.bag.summary.pack()
-            self._unchanged[path] = classification.bag, self._files.pop(path).stamp.inode
+            stamp = self._files.pop(path).stamp
+            self._unchanged[path] = classification.bag, stamp.inode, stamp.ctime_ns
 
     def _take_known(
         self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
@@ -313,7 +310,7 @@ class BagTable:
                 and schema.topics
                 and not (compressed and other_form(path) in compressed)
             ):
-                self._unchanged[bag.file] = bag, stamp.inode
+                self._unchanged[bag.file] = bag, stamp.inode, stamp.ctime_ns
                 bags.append(bag)
                 del stamps[path]
         return bags

@@ -185,12 +185,10 @@ class FileNotes:
             self.grew_at = None  # another file under the same name
         elif stamp.size > self.stamp.size or (self.grew_at is not None and self.grew_at > now):
             self.grew_at = now  # also again after the clock was set back
-        # Permissions change only the ctime.
         patience = RETRY_SOON_NS if self.is_transient else RETRY_NS
-        is_retried = self.fault is not None and (
-            stamp.ctime_ns != self.stamp.ctime_ns or abs(now - self.seen_at) >= patience
-        )
-        is_outdated = is_retried or not self.trusted or stamp.content != self.stamp.content
+        is_retried = self.fault is not None and abs(now - self.seen_at) >= patience
+        # Also by its ctime alone: size and mtime may be those of the bag that it replaced.
+        is_outdated = is_retried or not self.trusted or stamp != self.stamp
         if is_outdated:
             self.closing, self.summary, self.fault = None, None, None
             self.is_transient = False

@@ -77,10 +77,6 @@ class Stamp(NamedTuple):
         """Returns whether a bag is as it was when it was read."""
         return self.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
 
-    def matches(self, before: Stamp) -> bool:
-        """Returns whether the file is as before, but for the ctime, which permissions change."""
-        return self.inode == before.inode and self.content == before.content
-
 
 @dataclass(frozen=True, slots=True)
 class ScanResult:

@@ -237,7 +237,7 @@ class Inventory:
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
         """Yields the bags of which the index keeps rows."""
         rows = self._unchanged
-        for bag, inode in known.unchanged.values():
+        for bag, inode, _ in known.unchanged.values():
             stored, stamp = rows.get(bag.file), (inode, bag.size, bag.mtime_ns)
             if stored is None or (stored.inode, stored.size, stored.written) != stamp:
                 stored = self._stored(bag.file, bag, bag.mtime_ns, (inode, bag.size), known.now)

@@ -39,12 +39,13 @@ def open_regular(path: Path) -> int:
 
 
 class FileKey(NamedTuple):
-    """Identifies the content of a file: with another size, time or inode it is another."""
+    """Identifies the content of a file: whatever is written into it changes its ctime."""
 
     path: str
     size: int
     mtime_ns: int
     inode: int
+    ctime_ns: int
 
 
 class OpenFile:
@@ -62,7 +63,8 @@ class OpenFile:
         self._descriptor = open_regular(path)
         status = os.fstat(self._descriptor)
         self.size = status.st_size
-        self.key = FileKey(str(path), status.st_size, status.st_mtime_ns, status.st_ino)
+        times = status.st_mtime_ns, status.st_ino, status.st_ctime_ns
+        self.key = FileKey(str(path), status.st_size, *times)
 
     def __enter__(self) -> Self:
         """Returns the open file."""

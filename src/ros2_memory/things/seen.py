@@ -307,14 +307,13 @@ class Watching:
                 also_before=_TOGETHER_NS,
             ).data
         # Parts, as these, are of certain recordings.
-        bags = [(bag.file, bag.size, bag.mtime_ns, bag.sidecar_ns) for bag in around.bags]
-        key = (around.window.start, digest, tuple(bags))
+        key = (around.window.start, digest, tuple(bag.identity for bag in around.bags))
         data = scanner.caches.sights.get(key)
         if data is None:
             before = self._view.notes.added
             data = self._read(around)
             if self._view.notes.added == before:
-                scanner.caches.sights.put(key, data, 200 + len(data) + 100 * len(bags))
+                scanner.caches.sights.put(key, data, 200 + len(data) + 100 * len(around.bags))
         return data
 
     def _digest(self, around: _Surroundings) -> str:

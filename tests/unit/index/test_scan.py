@@ -191,9 +191,9 @@ def _beyond_the_longest_path(root: Path) -> str:
     return name
 
 
-def write_odometry(path: Path, speed: float) -> Path:
+def write_odometry(path: Path, speed: float, later: int = 0) -> Path:
     begin = 1_784_000_000 * S
-    poses = [odom(begin + n * S, speed * n, 0.0) for n in range(10)]
+    poses = [odom(begin + later + n * S, speed * n, 0.0) for n in range(10)]
     write_mcap(path, poses)
     os.utime(path, ns=(begin, begin))
     return path
@@ -218,3 +218,24 @@ def test_runs_of_a_simulation_with_equal_times_are_no_copies(tmp_path: Path) -> 
     write_odometry(tmp_path / "run_2.mcap", 0.2)
     [odometry] = asked(memory_of(tmp_path), tmp_path, "list_recorded_topics")
     assert odometry["count"] == 20
+
+
+@each_way
+def test_another_bag_written_over_one_of_its_size_and_mtime_is_read_anew(
+    tmp_path: Path, recalls: bool
+) -> None:
+    path = write_odometry(tmp_path / "rec" / "rec_0.mcap", 0.1)
+    memory = memory_of(tmp_path, recalls=recalls)
+
+    def driven() -> float:
+        of_all = {"start": 1_784_000_000, "end": 1_784_000_099}
+        return float(asked(memory, tmp_path, "trajectory_summary", **of_all)["distance_m"])
+
+    assert driven() == 0.9
+    before, other = path.stat(), write_odometry(tmp_path / "other", 0.2, later=S).read_bytes()
+    with path.open("r+b") as stream:
+        stream.write(other)
+    os.utime(path, ns=(before.st_mtime_ns, before.st_mtime_ns))
+    assert path.stat()[:7] == before[:7]
+    memory.index.refresh()
+    assert driven() == 1.8
