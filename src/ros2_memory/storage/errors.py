@@ -150,8 +150,11 @@ MAX_SECTION_BYTES: Final = 64 << 20
 """The size of one record or of a summary section, which is read into memory as a whole."""
 MAX_CHUNK_MESSAGES: Final = 1_000_000
 """More take more memory than their chunk, and seconds to index."""
-MAX_CHANNELS: Final = 5_000
+MAX_TOPICS: Final = 5_000
 """The largest robots have some hundred topics; every list and search goes through all of them."""
+MANY_TOPICS: Final = f"it may be whole, but has more than the {MAX_TOPICS} topics that are read"
+MAX_CHANNELS: Final = 1 << 16
+"""The numbers that MCAP has for channels: a topic may have one for each time it was subscribed."""
 MAX_NAMES_CHARS: Final = 1 << 20
 """Names of all topics and types of one file, which stay in memory as long as the bag exists."""
 MAX_TEXTS_BYTES: Final = 32 << 20

@@ -40,11 +40,12 @@ from ros2_memory.storage.base import (
 )
 from ros2_memory.storage.cache import ByteLru, shared
 from ros2_memory.storage.errors import (
-    MAX_CHANNELS,
+    MANY_TOPICS,
     MAX_CHUNK_MB,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
     MAX_TEXTS_BYTES,
+    MAX_TOPICS,
     ContradictionError,
     LostError,
     SizeLimit,
@@ -289,7 +290,7 @@ class SqliteBags:
         definitions = _definitions(base)
         # From a list of names above.
         query = f"SELECT id, {', '.join(texts)} FROM topics ORDER BY id LIMIT ?"  # noqa: S608
-        rows = base.execute(query, (MAX_CHANNELS + 1,))
+        rows = base.execute(query, (MAX_TOPICS + 1,))
         channels: dict[int, Channel] = {}
         for row in rows:
             value = dict(zip(("id", *texts), row, strict=True))
@@ -305,8 +306,8 @@ class SqliteBags:
                     tuple((key, str(value[name])) for name, key in _METADATA if value.get(name)),
                 )
             )
-        if len(channels) > MAX_CHANNELS:
-            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
+        if len(channels) > MAX_TOPICS:
+            raise UnreadableError(MANY_TOPICS)
         if sum(len(c.topic) + len(c.type) for c in channels.values()) > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
         return channels
@@ -338,7 +339,7 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
     if not _columns(base, "message_definitions") >= set(_DEFINITION_TEXTS):
         return {}
     require_short_texts(base, "message_definitions", _DEFINITION_TEXTS)
-    rows = base.execute(_DEFINITIONS, (MAX_DEFINITION_BYTES + 1, MAX_CHANNELS))
+    rows = base.execute(_DEFINITIONS, (MAX_DEFINITION_BYTES + 1, MAX_TOPICS))
     return {
         str(name): Schema(
             full_name(str(name)), str(encoding), str(text).encode()[: MAX_DEFINITION_BYTES + 1]

@@ -20,8 +20,8 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import topic_range
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.errors import (
-    MAX_CHANNELS,
     MAX_CHUNK_MESSAGES,
+    MAX_TOPICS,
     SizeLimit,
     UnreadableError,
     max_decompressed_bytes,
@@ -169,13 +169,19 @@ class TestChunks:
         assert times == [*range(count), *range(100, 100 + count)]
 
     def test_a_bag_of_more_topics_than_any_robot_has_is_not_read(self, tmp_path: Path) -> None:
-        many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_CHANNELS + 2)]
-        with pytest.raises(BagError, match="declares more than 5000 topics"):
+        many = [channel(n, 1, f"/t{n}") for n in range(1, MAX_TOPICS + 2)]
+        with pytest.raises(BagError, match="may be whole, but has more than the 5000 topics"):
             McapReader().summarize(bag(tmp_path, STRINGS[0], *many, string_message()))
         assert (
             McapReader().summarize(bag(tmp_path, STRINGS[0], *many[:-1], string_message())).count
             == 1
         )
+
+    def test_a_topic_may_have_any_number_of_channels(self, tmp_path: Path) -> None:
+        many = [channel(n, 1, "/chatter") for n in range(1, MAX_TOPICS + 2)]
+        path = bag(tmp_path, STRINGS[0], *many, string_message())
+        [chatter] = McapReader().summarize(path).topics
+        assert (chatter.topic, chatter.count) == ("/chatter", 1)
 
     def test_chunks_beyond_those_that_are_kept_in_mind_are_left_out(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -324,7 +330,7 @@ class TestSqlite:
                 ((n, f"/t{n}") for n in range(10, 5010)),
             )
             base.commit()
-        with pytest.raises(BagError, match="declares more than 5000 topics"):
+        with pytest.raises(BagError, match="more than the 5000 topics"):
             Rosbag2Reader().summarize(path)
 
     @pytest.mark.parametrize(

@@ -416,13 +416,13 @@ class McapBags:
             _ContradictedError: the message indexes do not agree with the records.
         """
         columns: list[Column] = []
-        missing: list[int] = []
+        missing: set[int] = set()
         for channel in chunk.channels.intersection(wanted):
             column = self._indexes.get((file.key, chunk.offset, channel))
             if isinstance(column, Column):
                 columns.append(column)
             else:
-                missing.append(channel)
+                missing.add(channel)
         if not missing:
             return columns
         if chunk.index_places is None:

@@ -26,10 +26,11 @@ from mcap.writer import MCAP0_MAGIC
 from ros2_memory.storage.base import Channel, Closing, Schema
 from ros2_memory.storage.cache import shared
 from ros2_memory.storage.errors import (
-    MAX_CHANNELS,
+    MANY_TOPICS,
     MAX_DEFINITION_BYTES,
     MAX_NAMES_CHARS,
     MAX_SECTION_BYTES,
+    MAX_TOPICS,
     UnreadableError,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile
@@ -159,10 +160,8 @@ class Declarations:
         """Returns the channels by id; one whose schema is not in the file has an empty schema.
 
         Raises:
-            UnreadableError: they are more than any robot has.
+            UnreadableError: they are of more topics than any robot has.
         """
-        if len(self._channels) > MAX_CHANNELS:
-            raise UnreadableError(f"it declares more than {MAX_CHANNELS} topics")
         names = sum(
             len(channel.topic) + len(channel.message_encoding)
             for channel in self._channels.values()
@@ -170,7 +169,7 @@ class Declarations:
         types = sum(len(schema.name) for schema in self._schemas.values())
         if names + types > MAX_NAMES_CHARS:
             raise UnreadableError("its topics and types have longer names than any can have")
-        return {
+        channels = {
             number: shared(
                 Channel(
                     channel.topic,
@@ -182,6 +181,9 @@ class Declarations:
             )
             for number, channel in self._channels.items()
         }
+        if len({(channel.topic, channel.type) for channel in channels.values()}) > MAX_TOPICS:
+            raise UnreadableError(MANY_TOPICS)
+        return channels
 
 
 # The bags of one robot declare the same, byte for byte.
