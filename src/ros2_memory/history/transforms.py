@@ -449,6 +449,7 @@ def _pairs_by_table(
             part = rows.part
             pairs = None if part is None else scanner.caches.pairs.get(part)
             if pairs is None:
+                before = view.notes.added
                 pair_sets = of_columns(
                     view, rows, lambda part_rows: pairs_in(part_rows.table, part_rows.index)
                 )
@@ -457,8 +458,8 @@ def _pairs_by_table(
                     if pair_sets is None
                     else frozenset[Pair]().union(*pair_sets)
                 )
-            if part is not None:
-                scanner.caches.pairs.put(part, pairs, 200 + 200 * len(pairs))
+                if part is not None and view.notes.added == before:
+                    scanner.caches.pairs.put(part, pairs, 200 + 200 * len(pairs))
             yield pairs
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -16,11 +17,12 @@ from ros2_memory.analysis.frames import static_at
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS
 from ros2_memory.history.context import Call
 from ros2_memory.history.transforms import sessions_of, static_transforms
-from ros2_memory.history.view import AtTime, View
+from ros2_memory.history.view import AtTime, TimeRange, View
+from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
-from tests.support.bags import Msg, detections, tf, transform, write_mcap
+from tests.support.bags import Msg, detections, odom, tf, transform, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of
+from tests.support.memories import each_way, memory_of
 from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
@@ -101,6 +103,22 @@ def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) ->
     assert asked(reader, "/tf_static") == set()
     bag(tmp_path, 3, [static(2, "eye", 2.0)])
     assert place() == 2.0
+
+
+@each_way
+def test_transforms_that_cannot_be_decoded_are_named_each_time(
+    tmp_path: Path, recalls: bool
+) -> None:
+    moved = [
+        tf(T0 + n * S // 10, transform(T0 + n * S // 10, "odom", "base_link", (0.1 * n, 0.0, 0.0)))
+        for n in range(100)
+    ]
+    moved[50] = replace(moved[50], body=b"\0\1\0\0\1")
+    bag(tmp_path, 0, [*moved, *(odom(T0 + n * S // 10, 0.1 * n, 0.0) for n in range(100))])
+    memory = memory_of(tmp_path, recalls=recalls)
+    for _ in range(2):
+        notes = recap(memory, Call(), TimeRange(start_s=T0 / 1e9, end_s=T0 / 1e9 + 9)).notes
+        assert any("messages of /tf could not be decoded" in note for note in notes)
 
 
 def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_alone(
