@@ -48,7 +48,7 @@ _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
 _WIDE: Final = frozenset({"wchar", "wstring"})
-"""Types of IDL that rosbags parses, and makes no deserializer for."""
+"""Types that rosbags makes no deserializer for: it parses them in IDL, and in `.msg` as messages."""
 _EVENT: Final = "_Event"
 _HALVES: Final = ("Request", "Response")
 _SERVICE_HEADER: Final = re.compile(r"={80}\nSRV: .*\n")
@@ -178,7 +178,7 @@ class Typestores:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 definitions.update(definition)
             fields = [field for _, field in definitions[name][1]]
-            if wide := _WIDE.intersection(map(_primitive, fields)):
+            if wide := _WIDE.intersection(map(_short_name, fields)):
                 raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
             unrolled += sum(map(_unrolled, fields))
             if unrolled > MAX_UNROLLED:
@@ -399,6 +399,11 @@ def _unsigned(field: FieldDesc) -> FieldDesc:
     if field[0] == Nodetype.ARRAY:
         return (Nodetype.ARRAY, (byte, field[1][1]))
     return (Nodetype.SEQUENCE, (byte, field[1][1])) if field[0] == Nodetype.SEQUENCE else byte
+
+
+def _short_name(field: FieldDesc) -> str:
+    """Returns the name of a type without its package, of a field alone or in an array."""
+    return (_primitive(field) or _nested_type(field) or "").rpartition("/")[2]
 
 
 def _primitive(field: FieldDesc) -> str | None:

@@ -259,6 +259,10 @@ class TestHostileDefinitions:
         whole = f"module a_msgs {{ module msg {{ struct A {{ {kind} x; }}; }}; }};"
         assert "which is not decoded" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
 
+    @pytest.mark.parametrize("kind", ["wstring", "wstring[]", "wstring[2]"])
+    def test_wide_characters_of_msg_files(self, kind: str) -> None:
+        assert "which is not decoded" in reason(lookup("a_msgs/msg/A", f"{kind} x\n"))
+
     @pytest.mark.parametrize(
         "statement",
         [
