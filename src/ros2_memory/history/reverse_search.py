@@ -20,6 +20,7 @@ from ros2_memory.analysis.conditions import (
     is_unknown_below,
     parse_condition,
     refusal_for,
+    summarising,
 )
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
@@ -290,22 +291,24 @@ class _TableCandidates(NamedTuple):
 
 
 class CandidateRows:
-    """Finds the times of messages that may meet a condition, before a moment.
+    """Finds the times of messages of a window that may meet a condition.
 
     Attributes:
         ruled_out: whether a message was left out, because its columns do not meet the condition.
         has_looked: whether any message was looked at.
     """
 
-    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
+    def __init__(
+        self, view: View, topics: Sequence[str], condition: Condition, window: TimeWindow
+    ) -> None:
         self.ruled_out = False
         self.has_looked = False
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
-        self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
+        self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
         self._ready: list[tuple[Ns, str]] = []
         self._group: list[_Candidate] = []
         self._view = view
-        self._until = until
+        self._window = window
         self._test = RowCondition(view, condition)
 
     def windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
@@ -347,13 +350,12 @@ class CandidateRows:
         """Yields when messages of a topic may match, table by table, the newest first."""
 
         def reached(last: Ns) -> None:
-            self._left[topic] = min(last + 1, self._until)
+            self._left[topic] = min(last + 1, self._window.stop)
 
-        window = TimeWindow(MIN_NS, self._until)
         for rows in scan(
             self._view,
             topic,
-            window,
+            self._window,
             newest_first=True,
             may_match=self._may_match,
             may_be_empty=True,
@@ -413,25 +415,28 @@ class ReverseSearch:
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
-        candidates = CandidateRows(self._view, self.topics, self.condition, until)
+        everything = TimeWindow(MIN_NS, until)
+        candidates = CandidateRows(self._view, self.topics, self.condition, everything)
         noted_before = self._view.notes.keys()
         try:
-            for window, topics in candidates.windows():
-                messages = self._view.stream.messages(topics, window, newest_first=True)
-                for stored in filter(self.matches, messages):
-                    self._view.notes.retract_outside(
-                        TimeWindow(stored.time, MAX_NS), keep=noted_before
-                    )
+            for stored in self._read(candidates):
+                if self.matches(stored):
+                    since = TimeWindow(stored.time, MAX_NS)
+                    self._view.notes.retract_outside(since, keep=noted_before)
                     self._view.stream.find_first_copy(stored)
-                    self.note_undecodable()
+                    self.note_untested(since.intersect(everything))
                     return stored
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
-        everything = TimeWindow(MIN_NS, until)
         self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
         return None
+
+    def _read(self, candidates: CandidateRows) -> Iterator[StoredMessage]:
+        """Yields the messages that may meet a condition, newest first, and those between them."""
+        for window, topics in candidates.windows():
+            yield from self._view.stream.messages(topics, window, newest_first=True)
 
     def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
@@ -445,11 +450,11 @@ class ReverseSearch:
         if not is_found and self._failures and not self._has_decoded and not ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
-                self.note_undecodable()
+                self._note_undecodable(MIN_NS)
             raise with_notes(self._view, window, undecodable(failure))
-        self.note_undecodable()
         if not is_found:
             self.require_testable()
+        self.note_untested(window)
 
     def require_testable(self) -> None:
         """Checks that some value of the topics can meet the condition: else "never" is no answer.
@@ -466,6 +471,18 @@ class ReverseSearch:
                 return
             refusals.append(refusal)
         raise InvalidArgumentsError(f"{self.topics[0]}: {refusals[0]}")
+
+    def require_met(self, until: Ns) -> None:
+        """Checks that a message before a moment meets the condition, or that its topics may.
+
+        Raises:
+            InvalidArgumentsError: none does, and no value of the topics can.
+        """
+        try:
+            self.require_testable()
+        except InvalidArgumentsError:
+            # The topic may have had other messages before.
+            self.newest(until)
 
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
@@ -506,8 +523,30 @@ class ReverseSearch:
                     self._failures[key] = alone, stored.time
                 return None
 
-    def note_undecodable(self, since: Ns = MIN_NS) -> None:
-        """Notes which topics have messages from a moment on that could not be tested."""
+    def note_untested(self, window: TimeWindow) -> None:
+        """Notes which topics have messages in a window that could not be tested, or not wholly."""
+        self._note_undecodable(window.start)
+        try:
+            self._note_summarised(window)
+        except QueryTimeoutError:
+            self._view.notes.add_lack("out of time: long arrays may not have been searched")
+
+    def _note_summarised(self, window: TimeWindow) -> None:
+        for topic in self.topics if self.condition.looks_at_numbers else ():
+            newest = self._view.stream.newest(topic, TimeWindow.everything())
+            value = None if newest is None else self._view.value(newest)
+            for condition in summarising(self.condition, value):
+                candidates = self._read(CandidateRows(self._view, [topic], condition, window))
+                values = ((stored.time, self._view.value(stored)) for stored in candidates)
+                last = next((time for time, value in values if condition.matches(value)), None)
+                if last is not None:
+                    array, _, _ = (condition.field or "").rpartition(".")
+                    self._view.notes.add_lack(
+                        f"{topic}: where {array} is long it is only summarised, last at "
+                        f"{unix_text(last)}, and its numbers are not searched"
+                    )
+
+    def _note_undecodable(self, since: Ns) -> None:
         for (topic, type_name), (error, newest) in self._failures.items():
             if newest >= since:
                 self._view.notes.complete = False
