@@ -303,6 +303,11 @@ class Condition:
         return any(map(test.matches, targets))
 
     @property
+    def array(self) -> str:
+        """The dot-path of the list from which the field picks an element, else the field."""
+        return _PICKED.sub("", self.field or "")
+
+    @property
     def looks_at_numbers(self) -> bool:
         """Whether numbers in arrays are compared; of a whole value no boolean is meant by them."""
         test = self.test
@@ -339,12 +344,11 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     return tuple(dict.fromkeys(texts))
 
 
-def summarising(condition: Condition, value: JsonValue) -> list[Condition]:
-    """Returns what messages meet that only summarise an array whose numbers are looked at.
+def summarising(field: str | None, value: JsonValue) -> list[Condition]:
+    """Returns what messages meet that only summarise an array at or below a field.
 
     Which arrays these are is told by one value.
     """
-    field = _PICKED.sub("", condition.field or "")
     paths = [*_dot_paths(value, "")]
     if field:
         below = (_dot_paths(target, f"{field}.") for target in at_field(value, field))

@@ -43,7 +43,7 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
@@ -311,7 +311,7 @@ class CandidateRows:
         self._window = window
         self._test = RowCondition(view, condition)
 
-    def windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+    def _windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
         """Yields the times at which a match can lie, newest first, and of which topics it would be.
 
         They do not overlap.
@@ -325,6 +325,11 @@ class CandidateRows:
                 # The first that may match mostly does; where many do not, more are read at once.
                 most, self._group = min(2 * most, _MOST_TOGETHER), []
             self._group.append(_Candidate(time, topic))
+
+    def messages(self) -> Iterator[StoredMessage]:
+        """Yields the messages at the times at which a match can lie, newest first."""
+        for window, topics in self._windows():
+            yield from self._view.stream.messages(topics, window, newest_first=True)
 
     @property
     def reached(self) -> Ns:
@@ -385,6 +390,24 @@ class CandidateRows:
         return rows.times[may]
 
 
+def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
+    """Notes when arrays at or below some fields were too long to be more than summarised."""
+    newest = view.stream.newest(topic, TimeWindow.everything())
+    value = None if newest is None else view.value(newest)
+    try:
+        for condition in chain(*(summarising(field, value) for field in fields)):
+            candidates = CandidateRows(view, [topic], condition, window).messages()
+            long = next((at for at in candidates if condition.matches(view.value(at))), None)
+            if long is not None:
+                array, _, _ = (condition.field or "").rpartition(".")
+                view.notes.add_lack(
+                    f"{topic}: where {array} is long it is only summarised, last at "
+                    f"{unix_text(long.time)}, and its numbers are not looked at"
+                )
+    except QueryTimeoutError:
+        view.notes.add_lack(f"{topic}: out of time: some arrays may be only summarised")
+
+
 class ReverseSearch:
     """A search for one condition on the topics of a name or glob.
 
@@ -419,7 +442,7 @@ class ReverseSearch:
         candidates = CandidateRows(self._view, self.topics, self.condition, everything)
         noted_before = self._view.notes.keys()
         try:
-            for stored in self._read(candidates):
+            for stored in candidates.messages():
                 if self.matches(stored):
                     since = TimeWindow(stored.time, MAX_NS)
                     self._view.notes.retract_outside(since, keep=noted_before)
@@ -432,11 +455,6 @@ class ReverseSearch:
             raise out_of_time(self._view, candidates.reached) from error
         self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
         return None
-
-    def _read(self, candidates: CandidateRows) -> Iterator[StoredMessage]:
-        """Yields the messages that may meet a condition, newest first, and those between them."""
-        for window, topics in candidates.windows():
-            yield from self._view.stream.messages(topics, window, newest_first=True)
 
     def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
         """Ends a search that looked everywhere in a window, and notes what could not be tested.
@@ -526,25 +544,8 @@ class ReverseSearch:
     def note_untested(self, window: TimeWindow) -> None:
         """Notes which topics have messages in a window that could not be tested, or not wholly."""
         self._note_undecodable(window.start)
-        try:
-            self._note_summarised(window)
-        except QueryTimeoutError:
-            self._view.notes.add_lack("out of time: long arrays may not have been searched")
-
-    def _note_summarised(self, window: TimeWindow) -> None:
         for topic in self.topics if self.condition.looks_at_numbers else ():
-            newest = self._view.stream.newest(topic, TimeWindow.everything())
-            value = None if newest is None else self._view.value(newest)
-            for condition in summarising(self.condition, value):
-                candidates = self._read(CandidateRows(self._view, [topic], condition, window))
-                values = ((stored.time, self._view.value(stored)) for stored in candidates)
-                last = next((time for time, value in values if condition.matches(value)), None)
-                if last is not None:
-                    array, _, _ = (condition.field or "").rpartition(".")
-                    self._view.notes.add_lack(
-                        f"{topic}: where {array} is long it is only summarised, last at "
-                        f"{unix_text(last)}, and its numbers are not searched"
-                    )
+            note_summarised(self._view, topic, [self.condition.array], window)
 
     def _note_undecodable(self, since: Ns) -> None:
         for (topic, type_name), (error, newest) in self._failures.items():

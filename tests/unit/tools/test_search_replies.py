@@ -188,6 +188,10 @@ def test_that_a_long_array_was_not_searched_is_said_whatever_the_newest_is(
     assert any(
         said.startswith(note) for said in asked(memory, tmp_path, "find_matches", **bumped)["notes"]
     )
+    window = {"topic": "/octets", "fields": ["data"], "start": T0_S, "end": T0_S + 30}
+    for by in ({}, {"by": "hour"}):
+        numbers = asked(memory, tmp_path, "get_topic_in_range", **window, **by)
+        assert any(said.startswith(note) for said in numbers["notes"])
     # After that all was searched.
     later = asked(memory, tmp_path, "find_matches", **given, start=T0_S + 16)
     assert (later["total"], "notes" in later) == (0, False)
