@@ -315,6 +315,14 @@ def boolean(ns: int, data: bool, topic: str = "/bumper") -> Msg:
     return Msg(topic, "std_msgs/msg/Bool", ns, make("std_msgs/msg/Bool", data=data))
 
 
+def octets(ns: int, held: Iterable[int], topic: str = "/octets") -> Msg:
+    """Bytes, which from 51 on are only summarised."""
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    data = np.array([*held], np.uint8)
+    body = make("std_msgs/msg/UInt8MultiArray", layout=layout, data=data)
+    return Msg(topic, "std_msgs/msg/UInt8MultiArray", ns, body)
+
+
 def log_entry(ns: int, level: int, name: str, message: str) -> Msg:
     """An entry of /rosout: 20 INFO, 30 WARN, 40 ERROR."""
     body = make(

@@ -15,6 +15,7 @@ import re
 import struct
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -38,6 +39,7 @@ _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LISTED_PATHS: Final = 16
 _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+_PICKED: Final = re.compile(r"(\.-?\d+)+$")
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
     "contains_word": 'condition_type "contains_word", value "pot", which is not in "potato"',
@@ -301,6 +303,20 @@ class Condition:
         return any(map(test.matches, targets))
 
     @property
+    def array(self) -> str:
+        """The dot-path of the list from which the field picks an element, else the field."""
+        return _PICKED.sub("", self.field or "")
+
+    @property
+    def looks_at_numbers(self) -> bool:
+        """Whether numbers in arrays are compared; of a whole value no boolean is meant by them."""
+        test = self.test
+        if isinstance(test, NearPosition) or _plain_text(test) is not None:
+            return False
+        is_number = isinstance(test, Equals) and test.boolean is None
+        return self.field is not None or is_number
+
+    @property
     def can_be_refused(self) -> bool:
         """Whether some values have a shape that cannot match; see `refusal_for`."""
         test = self.test
@@ -326,6 +342,27 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
         if isinstance(leaf, str) and test.matches(leaf)
     ]
     return tuple(dict.fromkeys(texts))
+
+
+def summarising(field: str | None, value: JsonValue) -> list[Condition]:
+    """Returns what messages meet that only summarise an array at or below a field.
+
+    Which arrays these are is told by one value.
+    """
+    paths = [*_dot_paths(value, "")]
+    if field:
+        below = (_dot_paths(target, f"{field}.") for target in at_field(value, field))
+        paths = [field, *chain.from_iterable(below)]
+    arrays = [path for path in dict.fromkeys(paths) if any(map(_is_array, at_field(value, path)))]
+    sizes = [f"{path}.{size}" for path in arrays for size in ("bytes", "numbers")]
+    return [Condition(Beyond(-1, above=True), size) for size in sizes]
+
+
+def _is_array(value: JsonValue) -> bool:
+    """Whether a value is an array of numbers or booleans, or may be, or the summary of one."""
+    if isinstance(value, list):
+        return not value or isinstance(value[0], bool | int | float)
+    return isinstance(value, Summary)
 
 
 def parse_condition(
@@ -587,7 +624,7 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
     return (
         _refusal_for_summary(condition, targets)
         or _refusal_for_number(condition, targets)
-        or _refusal_for_text(condition, targets)
+        or _refusal_for_kind(condition, targets)
     )
 
 
@@ -631,20 +668,31 @@ def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> s
     )
 
 
-def _refusal_for_text(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why a text that spells no number meets none of these; None where it may."""
-    text = _plain_text(condition.test)
-    is_narrow = condition.field is not None or isinstance(condition.test, Equals)
-    if text is None or not is_narrow or any(map(_has_unknown_part, targets)):
+def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
+    """Returns why all of these are of another kind than what is looked for; None where one is."""
+    test = condition.test
+    if isinstance(test, Beyond):
+        met, given = {int, float}, f"{'above' if test.above else 'below'} compares numbers"
+    elif isinstance(test, NearPosition) or (isinstance(test, Contains) and not condition.field):
         return None
+    else:
+        value = test.value if isinstance(test, Equals) else test.needle
+        if _plain_text(test) is not None:
+            met, kind = {str}, "text"
+        elif isinstance(test, Equals) and not isinstance(value, str):
+            met, kind = {bool, int, float}, "boolean" if isinstance(value, bool) else "number"
+        else:
+            return None
+        given = f"{abbreviate(value)} is a {kind}"
     kinds = {type(leaf) for target in targets for leaf in leaves(target)}
-    if not kinds or not kinds <= {bool, int, float}:
+    if not kinds or kinds & met or any(map(_has_unknown_part, targets)):
         return None
     where = "the values" if condition.field is None else f"the values of field {condition.field!r}"
-    given = f"and {abbreviate(text)} is a text"
+    name, wanted = ("texts", "a text") if str in kinds else ("numbers", "a number")
     if kinds == {bool}:
-        return f"{where} are booleans, {given}: the value must be true or false"
-    return f"{where} are numbers, {given}: the value must be a number"
+        name, wanted = "booleans", "true or false"
+    needed = "" if isinstance(test, Beyond) else f": the value must be {wanted}"
+    return f"{where} are {name}, and {given}{needed}"
 
 
 def _plain_text(test: Test) -> str | None:

@@ -347,12 +347,7 @@ def parse_time(text: str, now: float) -> float:
         if clock := _TIME_OF_DAY.fullmatch(words):
             midnight = datetime.fromtimestamp(now).astimezone().date()
             date = midnight - timedelta(days=clock[1] == "yesterday")
-            of_day = clock[2] or "00:00"
-            if of_day in {"24:00", "24:00:00"}:  # the end of a day in ISO 8601
-                date, of_day = date + timedelta(days=1), "00:00"
-            whole, dot, fraction = of_day.partition(".")
-            of_day = f"{whole}.{fraction:0<6}" if dot else whole
-            return datetime.combine(date, time.fromisoformat(of_day)).timestamp()
+            return unix_from_text(f"{date}T{clock[2] or '00:00'}")
         return unix_from_text(text)
     raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
 

@@ -86,8 +86,9 @@ def decoded(
 
     In one group there is one table for each topic, type and definition with messages; a bag that
     decompresses to less than `GROUP_BYTES` is one group. Tables of later groups may overlap earlier
-    ones in time, as the chunks of the file do. Lazy: nothing is opened before the first group is
-    requested. In memory are one group and one buffer of the reader.
+    ones in time, as the chunks of the file do, but a table has all messages of a log time. Lazy:
+    nothing is opened before the first group is requested. In memory are one group and one buffer
+    of the reader.
 
     Args:
         reader: reads the bag.
@@ -128,8 +129,8 @@ def decoded(
                 yield batch
             elif batch.sizes.size:
                 if group.is_full_before(batch):
-                    yield group.tables()
-                    group = _Group(reader, skip_undecodable)
+                    full, group = group, _Group(reader, skip_undecodable)
+                    yield full.tables(group)
                 group.add(kinds.read(batch), batch)
             del batch  # and its buffer, before the next is read
         tables = group.tables()
@@ -248,14 +249,26 @@ class _Group:
             table = replace(table, columns={}, elements={}, left_out=parts[0].left_out)
         parts.append(table)
 
-    def tables(self) -> list[Table]:
-        """Returns the tables, each of all its parts."""
+    def tables(self, following: _Group | None = None) -> list[Table]:
+        """Returns the tables, each of all its parts.
+
+        The messages of each topic's last log time are left to the next group, unless they are many:
+        which one of them is meant is told by its number among those of one table.
+        """
         self._buffer = b""
-        tables = []
+        tables, room = [], GROUP_BYTES // 4
         while self._parts:
-            _, parts = self._parts.popitem()
-            tables.append(joined(parts))
-        return tables[::-1]
+            key, parts = self._parts.popitem()
+            table = joined(parts)
+            if following is not None:
+                begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
+                last = table.rows(np.arange(begin, len(table)))
+                if last.memory_bytes <= room:
+                    room -= last.memory_bytes
+                    following._parts[key] = [last]
+                    table = table.rows(np.arange(begin))
+            tables.append(table)
+        return [table for table in reversed(tables) if len(table)]
 
 
 def _pieces_of(batch: Batch) -> Iterator[Batch]:

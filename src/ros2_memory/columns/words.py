@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
-    """Returns what `exact_at` of an extractor gives of a field of each row, without one `exact`.
+    """Returns what `history.held_values.HeldValues` says of a field of each row, as JSON text.
 
     None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
     number: then the messages have to be read.
@@ -25,11 +25,10 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
     shape = shape_of(table, extractor)
     if shape is None:
         return None
-    name: str | None = None
     try:
         node = shape.value if field is None else shape.find(field)
-        if field is None and node is not None and is_object(node):
-            [(name, node)] = children(node)
+        if node is not None and is_object(node):
+            [(_, node)] = children(node)
     except (UnknownShapeError, ValueError):  # more than one part
         return None
     if (
@@ -43,13 +42,9 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
         texts = values.texts(node)
     elif node.kind in {Kind.BOOLEAN, Kind.INTEGER} and (column := values.numbers(node)) is not None:
         distinct, codes = np.unique(column.values, return_inverse=True)
-        whole = [
-            json.dumps(value if name is None else {name: value}) for value in distinct.tolist()
-        ]
-        return Texts(codes.astype(np.uint32), tuple(whole))
+        return Texts(codes.astype(np.uint32), tuple(map(json.dumps, distinct.tolist())))
     else:
         texts = None
     if texts is None:
         return None
-    words = tuple(json.dumps(value if name is None else {name: value}) for value in texts.words)
-    return Texts(texts.codes, words)
+    return Texts(texts.codes, tuple(map(json.dumps, texts.words)))

@@ -37,6 +37,8 @@ _DATE_WITHOUT_DASHES: Final = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-
 # Not every text that `datetime` reads: it takes 17840232 for a day of the year 1784.
 _ISO: Final = re.compile(r"(?:[0-9]{4}-|[0-9]{8}T)[-+0-9:.,TWZ ]*")
 _SECONDS: Final = re.compile(r":\d\d:\d\d(?:[.,](\d+))?")
+_END_OF_DAY: Final = re.compile(r"(?<=[T ])24:00(?::00)?(?![:.,0-9])")
+"""Midnight as the end of a day in ISO 8601, which `datetime` does not read."""
 _LONGEST_TIME: Final = 64
 _MINUTE_S: Final = 60.0
 _END_S: Final = 1.125e-6
@@ -132,9 +134,10 @@ def unix_from_text(text: str) -> float:
     weekday, written = _without_weekday(text.strip() if len(text) <= _LONGEST_TIME else "")
     if _DIGITS.fullmatch(written):
         return float(written)
+    begins, is_end = _END_OF_DAY.subn("00:00", written if _ISO.fullmatch(written) else "")
     try:
-        read = datetime.fromisoformat(written if _ISO.fullmatch(written) else "")
-        seconds = read.timestamp()
+        read = datetime.fromisoformat(begins)
+        seconds = (read + timedelta(days=is_end)).timestamp()
     except (ValueError, OverflowError, OSError):
         raise ValueError("is not a valid time in ISO 8601, such as 2026-11-20T14:05:00") from None
     if weekday is not None and weekday != _WEEKDAYS[read.weekday()]:

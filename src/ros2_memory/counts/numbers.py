@@ -29,6 +29,7 @@ from ros2_memory.counts.held import count_values
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
+from ros2_memory.history.reverse_search import note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
@@ -178,6 +179,7 @@ class PieceNumbers:
         for rows in self._pending:
             self._add(rows, MIN_NS if self.since is None else self.since)
         self._pending.clear()
+        note_summarised(self._view, self._topic, self._fields, window)
 
     def parts(self, field: int, piece: int) -> Sequence[Part]:
         """Returns the parts of a piece that hold numbers of a field, in any order."""

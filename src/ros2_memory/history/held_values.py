@@ -22,6 +22,7 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.scan import blocks, of_columns, scan
+from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.to_json import round_real
 
 if TYPE_CHECKING:
@@ -55,10 +56,8 @@ class Held(NamedTuple):
 
     @property
     def exact(self) -> JsonValue:
-        """The value; of a message that has one part alone, that."""
+        """The value."""
         value: JsonValue = json.loads(self.word)
-        if isinstance(value, dict) and len(value) == 1:
-            [value] = value.values()
         return value
 
     @property
@@ -112,7 +111,7 @@ class HeldValues:
         newest = view.stream.newest(topic, TimeWindow.everything())
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
-            value = Held(self._json_at(message, newest.type), 0, 0, ended=True).exact
+            value = self._said(message, newest.type)
             if isinstance(value, list | dict | None):
                 of_field = "" if field is None else f"field {field} of "
                 raise InvalidArgumentsError(
@@ -237,14 +236,20 @@ class HeldValues:
             self._check(stored.time)
             message = self._view.bags.decode(stored)
             if message is not None:
-                word = self._json_at(message, stored.type)
+                word = json.dumps(self._said(message, stored.type))
                 yield _Run(word, stored.time, stored.time)
 
-    def _json_at(self, message: object, type_name: str) -> str:
-        extractor = self._view.extractor
-        if self._field is None:
-            return json.dumps(_as_said(extractor.exact(message, type_name)))
-        return json.dumps(_as_said(extractor.exact_at(message, type_name, self._field)))
+    def _said(self, message: object, type_name: str) -> JsonValue:
+        """Returns what a message says: of what has one part alone, that; but no array's size."""
+        extractor, field = self._view.extractor, self._field
+        value = (
+            extractor.exact(message, type_name)
+            if field is None
+            else extractor.exact_at(message, type_name, field)
+        )
+        if isinstance(value, dict) and len(value) == 1 and not isinstance(value, Summary):
+            [value] = value.values()
+        return _as_said(value)
 
     def _goes_on(self, older: _Run, newer: _Run) -> bool:
         return older.word == newer.word and self._end_of(older, newer) == (newer.first, True)

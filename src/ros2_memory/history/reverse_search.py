@@ -20,6 +20,7 @@ from ros2_memory.analysis.conditions import (
     is_unknown_below,
     parse_condition,
     refusal_for,
+    summarising,
 )
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
@@ -42,7 +43,7 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
@@ -290,25 +291,27 @@ class _TableCandidates(NamedTuple):
 
 
 class CandidateRows:
-    """Finds the times of messages that may meet a condition, before a moment.
+    """Finds the times of messages of a window that may meet a condition.
 
     Attributes:
         ruled_out: whether a message was left out, because its columns do not meet the condition.
         has_looked: whether any message was looked at.
     """
 
-    def __init__(self, view: View, topics: Sequence[str], condition: Condition, until: Ns) -> None:
+    def __init__(
+        self, view: View, topics: Sequence[str], condition: Condition, window: TimeWindow
+    ) -> None:
         self.ruled_out = False
         self.has_looked = False
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
-        self._left: dict[str, Ns] = dict.fromkeys(topics, min(until, newest + 1))
+        self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
         self._ready: list[tuple[Ns, str]] = []
         self._group: list[_Candidate] = []
         self._view = view
-        self._until = until
+        self._window = window
         self._test = RowCondition(view, condition)
 
-    def windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
+    def _windows(self) -> Iterator[tuple[TimeWindow, Sequence[str]]]:
         """Yields the times at which a match can lie, newest first, and of which topics it would be.
 
         They do not overlap.
@@ -322,6 +325,11 @@ class CandidateRows:
                 # The first that may match mostly does; where many do not, more are read at once.
                 most, self._group = min(2 * most, _MOST_TOGETHER), []
             self._group.append(_Candidate(time, topic))
+
+    def messages(self) -> Iterator[StoredMessage]:
+        """Yields the messages at the times at which a match can lie, newest first."""
+        for window, topics in self._windows():
+            yield from self._view.stream.messages(topics, window, newest_first=True)
 
     @property
     def reached(self) -> Ns:
@@ -347,13 +355,12 @@ class CandidateRows:
         """Yields when messages of a topic may match, table by table, the newest first."""
 
         def reached(last: Ns) -> None:
-            self._left[topic] = min(last + 1, self._until)
+            self._left[topic] = min(last + 1, self._window.stop)
 
-        window = TimeWindow(MIN_NS, self._until)
         for rows in scan(
             self._view,
             topic,
-            window,
+            self._window,
             newest_first=True,
             may_match=self._may_match,
             may_be_empty=True,
@@ -381,6 +388,24 @@ class CandidateRows:
             may = may[rows.index]
         self.ruled_out |= not may.all()
         return rows.times[may]
+
+
+def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
+    """Notes when arrays at or below some fields were too long to be more than summarised."""
+    newest = view.stream.newest(topic, TimeWindow.everything())
+    value = None if newest is None else view.value(newest)
+    try:
+        for condition in chain(*(summarising(field, value) for field in fields)):
+            candidates = CandidateRows(view, [topic], condition, window).messages()
+            long = next((at for at in candidates if condition.matches(view.value(at))), None)
+            if long is not None:
+                array, _, _ = (condition.field or "").rpartition(".")
+                view.notes.add_lack(
+                    f"{topic}: where {array} is long it is only summarised, last at "
+                    f"{unix_text(long.time)}, and its numbers are not looked at"
+                )
+    except QueryTimeoutError:
+        view.notes.add_lack(f"{topic}: out of time: some arrays may be only summarised")
 
 
 class ReverseSearch:
@@ -413,23 +438,21 @@ class ReverseSearch:
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
-        candidates = CandidateRows(self._view, self.topics, self.condition, until)
+        everything = TimeWindow(MIN_NS, until)
+        candidates = CandidateRows(self._view, self.topics, self.condition, everything)
         noted_before = self._view.notes.keys()
         try:
-            for window, topics in candidates.windows():
-                messages = self._view.stream.messages(topics, window, newest_first=True)
-                for stored in filter(self.matches, messages):
-                    self._view.notes.retract_outside(
-                        TimeWindow(stored.time, MAX_NS), keep=noted_before
-                    )
+            for stored in candidates.messages():
+                if self.matches(stored):
+                    since = TimeWindow(stored.time, MAX_NS)
+                    self._view.notes.retract_outside(since, keep=noted_before)
                     self._view.stream.find_first_copy(stored)
-                    self.note_undecodable()
+                    self.note_untested(since.intersect(everything))
                     return stored
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
-        everything = TimeWindow(MIN_NS, until)
         self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
         return None
 
@@ -445,11 +468,11 @@ class ReverseSearch:
         if not is_found and self._failures and not self._has_decoded and not ruled_out:
             failure, _ = next(iter(self._failures.values()))
             if len(self._failures) > 1:
-                self.note_undecodable()
+                self._note_undecodable(MIN_NS)
             raise with_notes(self._view, window, undecodable(failure))
-        self.note_undecodable()
         if not is_found:
             self.require_testable()
+        self.note_untested(window)
 
     def require_testable(self) -> None:
         """Checks that some value of the topics can meet the condition: else "never" is no answer.
@@ -466,6 +489,18 @@ class ReverseSearch:
                 return
             refusals.append(refusal)
         raise InvalidArgumentsError(f"{self.topics[0]}: {refusals[0]}")
+
+    def require_met(self, until: Ns) -> None:
+        """Checks that a message before a moment meets the condition, or that its topics may.
+
+        Raises:
+            InvalidArgumentsError: none does, and no value of the topics can.
+        """
+        try:
+            self.require_testable()
+        except InvalidArgumentsError:
+            # The topic may have had other messages before.
+            self.newest(until)
 
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
@@ -506,8 +541,13 @@ class ReverseSearch:
                     self._failures[key] = alone, stored.time
                 return None
 
-    def note_undecodable(self, since: Ns = MIN_NS) -> None:
-        """Notes which topics have messages from a moment on that could not be tested."""
+    def note_untested(self, window: TimeWindow) -> None:
+        """Notes which topics have messages in a window that could not be tested, or not wholly."""
+        self._note_undecodable(window.start)
+        for topic in self.topics if self.condition.looks_at_numbers else ():
+            note_summarised(self._view, topic, [self.condition.array], window)
+
+    def _note_undecodable(self, since: Ns) -> None:
         for (topic, type_name), (error, newest) in self._failures.items():
             if newest >= since:
                 self._view.notes.complete = False

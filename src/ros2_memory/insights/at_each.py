@@ -18,7 +18,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
-from ros2_memory.core.timebase import Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import START_SLACK_NS, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.coverage import recorded_reach
 from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_window
 from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt, OneAnswer
@@ -122,13 +122,17 @@ def in_each(
     whole = search_window(span, memory.now(wall, snapshot.latest, call))
     first, last = recorded_reach(snapshot, whole) or (0, -1)
     windows = hours_of_days(whole.intersect(TimeWindow(first, last + 1)), *between)
+    begins = {window.start for window in windows}
     fixed_memory = replace(memory, index=OneSnapshot(memory.index, snapshot))
     answers: list[InWindow] = []
     notes: tuple[str, ...] = ()
     for window in windows:
         answer: OneAnswer
         try:
-            answer = ask(fixed_memory, TimeRange.over(window))
+            # Of all hours of a day, what comes as they end is of the next ones.
+            early = START_SLACK_NS if window.stop in begins else 0
+            part = replace(window, stop=window.stop - early)
+            answer = ask(fixed_memory, TimeRange.over(part))
         except NoDataError as error:
             answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
         except QueryTimeoutError:

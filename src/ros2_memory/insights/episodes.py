@@ -6,7 +6,6 @@ An episode belongs to a window, or to a scope, by whether it held in it, or when
 
 from __future__ import annotations
 
-import json
 from collections import deque
 from dataclasses import replace
 from itertools import islice, takewhile
@@ -130,7 +129,7 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
             pending = None
         if held is None or held.stop <= start:
             return
-        if condition.matches(json.loads(held.word)) and scope.holds_at(held.start):
+        if condition.matches({"value": held.exact}) and scope.holds_at(held.start):
             following = newer or values.named_after(held.stop)
             after = None if following is None else spell_of(following)
             pending = Episode(spell_of(held), None, after)

@@ -354,7 +354,7 @@ def find_runs(
                 reached = block.first if len(runs_by_topic) == 1 else block.last
                 if enough is not None and _has_enough(runs_by_topic, enough, reached):
                     runs = _newest_first(runs_by_topic)
-                    search.note_undecodable(runs[enough - 1].first)
+                    search.note_untested(replace(scope.window, start=runs[enough - 1].first))
                     return SearchedRuns(runs, reached)
     except QueryTimeoutError:
         runs = [run for topic_runs in runs_by_topic.values() for run in topic_runs.cut()]
@@ -364,7 +364,7 @@ def find_runs(
     runs = _newest_first(runs_by_topic)
     if enough is not None and len(runs) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
-        search.note_undecodable(runs[enough - 1].first)
+        search.note_untested(replace(scope.window, start=runs[enough - 1].first))
         return SearchedRuns(runs, reached)
     search.close(scope.window, is_found=bool(runs), ruled_out=tester.ruled_out)
     return SearchedRuns(runs)

@@ -303,6 +303,7 @@ class Scope:
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
+            state.require_met(window)
             known = state.known_in(window)
             unknown = unknown_times(view, window, known, f"what {condition.topic} said")
             self.unknown = united([*self.unknown, *unknown])
@@ -405,6 +406,15 @@ class _ConditionStates:
     def compared_frames(self) -> tuple[str, ...]:
         """The note on the frames in which the condition compared positions, if it did."""
         return compared_frames(self._view, self._search.topics, self._condition)
+
+    def require_met(self, window: TimeWindow) -> None:
+        """Checks that messages may meet the condition, and notes those that cannot be tested.
+
+        Raises:
+            InvalidArgumentsError: none of them can.
+        """
+        self._search.require_met(window.stop)
+        self._search.note_untested(window)
 
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when the topics said something: without silences, unless that holds on."""

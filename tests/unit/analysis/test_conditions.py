@@ -349,7 +349,11 @@ LISTED = "position, orientation, position.x"
     [
         # A field that values have or may have.
         *((ODOM, "equals", 1, field, None) for field in ("position", "position.x")),
-        *((SEEN, "equals", 1, f"detections.{field}", None) for field in ("label", "0.label")),
+        *(
+            (SEEN, "equals", 1, f"detections.{field}", "1 is a number: the value must be a text")
+            for field in ("label", "0.label")
+        ),
+        (SEEN, "equals", "1", "detections.label", None),
         (NOTHING_SEEN, "equals", 1, "detections.label", None),
         *(({"value": None}, "equals", 1, field, None) for field in ("value", "value.anything")),
         *((ODOM, "equals", 1, f, LISTED) for f in ("data", "position.w", "pose.position", "nope")),
@@ -374,6 +378,11 @@ LISTED = "position, orientation, position.x"
                 ({"value": True}, kind, "false", None, None),
             )
         ),
+        # A limit is asked of numbers alone.
+        ({"value": "12"}, "above", 3, "value", "are texts, and above compares numbers"),
+        ({"value": True}, "below", 3, "value", "are booleans, and below compares numbers"),
+        ({"value": [None, True]}, "below", 3, "value", None),
+        (ODOM, "above", 3, "position", None),
         (ODOM, "equals", "cup", None, "must be a number"),
         (ODOM, "contains", "cup", None, None),
     ],
@@ -405,6 +414,8 @@ def test_what_matches_is_never_refused(value: JsonValue, field: str) -> None:
         ("contains", "cup"),
         ("contains", "1"),
         ("contains", 2),
+        ("equals", True),
+        ("equals", "1"),
         ("near_position", {"x": 1, "y": 1}),
     ]
     for kind, wanted in tests:

@@ -181,6 +181,18 @@ def test_a_time_that_occurs_twice_is_the_first_of_the_two(berlin: str) -> None:
     assert unix_from_text("2026-10-25T02:30+01:00") == first + 3600
 
 
+@pytest.mark.parametrize("rest", ["", "Z", "+01:00"])
+def test_midnight_is_also_the_end_of_the_day_before(berlin: str, rest: str) -> None:
+    for day, after in (("2026-03-29", "2026-03-30"), ("2026-12-31", "2027-01-01")):
+        at = unix_from_text(f"{after}T00:00{rest}")
+        assert unix_from_text(f"{day}T24:00{rest}") == at
+        assert unix_from_text(f"{day} 24:00:00{rest}") == at
+    assert unix_from_text("Tue 2026-11-17 24:00") == unix_from_text("2026-11-18T00:00")
+    for text in ("2026-11-17T24:01", "2026-11-17T24:00:01", "2026-11-17T24:00:00.5"):
+        with pytest.raises(ValueError, match="not a valid time"):
+            unix_from_text(text)
+
+
 def test_unix_seconds_in_quotes_are_read_where_they_can_be_no_date() -> None:
     assert unix_from_text("1795161600.25") == 1_795_161_600.25
     assert unix_from_text("20261120T080000Z") == 1_795_161_600.0

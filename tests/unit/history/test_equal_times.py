@@ -10,13 +10,26 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.columns import decode
 from ros2_memory.core.timebase import MAX_NS
-from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
+from ros2_memory.storage.mcap import bulk
+from ros2_memory.storage.mcap_reader import McapReader
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    detections,
+    make,
+    odom,
+    text,
+    write_mcap,
+)
 from tests.support.examples import LONG
 from tests.support.memories import asked, assert_same_counts, memory_of, with_store
 from tests.support.random_histories import MS, S
@@ -193,3 +206,26 @@ def test_of_one_log_time_the_first_recording_by_name_speaks_first(
     plain = memory_of(tmp_path)
     for memory in (plain, with_store(plain, tmp_path), with_store(plain, tmp_path, part=0.5)):
         assert counted(memory, tmp_path) == (2, 2.0)
+
+
+@pytest.mark.parametrize("recalls", [False, True], ids=["bags", "store"])
+def test_a_message_is_told_from_others_of_its_time_wherever_a_large_bag_is_cut(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recalls: bool
+) -> None:
+    """A recorder of simulated time gives five messages each second of it."""
+    monkeypatch.setattr(decode, "GROUP_BYTES", 260_000)
+    monkeypatch.setattr(bulk, "BATCH_BYTES", 20_000)
+    layout = make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    kind = "std_msgs/msg/Float32MultiArray"
+    messages = [
+        Msg("/numbers", kind, T0 + nth // 5 * S, make(kind, layout=layout, data=held))
+        # Too long for columns, which have their least and greatest number alone.
+        for nth, held in enumerate(np.arange(200_000, dtype=np.float32).reshape(50, 4_000))
+    ]
+    path = write_mcap(tmp_path / "rec" / "rec_0.mcap", messages, McapLayout(chunk_size=20_000))
+    assert len([*decode.decoded(McapReader(), path)]) > 2
+    memory = memory_of(tmp_path, recalls=recalls)
+    wanted = {"topic": "/numbers", "condition_type": "equals", "field": "data.700"}
+    for nth in range(0, 50, 2):
+        found = asked(memory, tmp_path, "find_matches", **wanted, value=4_000 * nth + 700)
+        assert [row["first_seen"] for row in found["sightings"]] == [T0 / S + nth // 5]

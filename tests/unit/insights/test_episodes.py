@@ -10,9 +10,18 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.history import held_values
 from ros2_memory.history.held_values import HeldValues
 from ros2_memory.insights import sightings
-from tests.support.bags import McapLayout, battery, boolean, odom, text, write_mcap, write_splits
+from tests.support.bags import (
+    McapLayout,
+    battery,
+    boolean,
+    octets,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
 from tests.support.mcap_surgery import spoil_chunk
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -185,6 +194,19 @@ def test_a_topic_without_a_single_value_is_refused_by_name(
     assert "/odom (nav_msgs/msg/Odometry) is no text, number or boolean" in reply["detail"]
 
 
+@each_way
+def test_the_size_of_a_long_array_is_no_value_of_it(tmp_path: Path, *, recalls: bool) -> None:
+    said = [octets((BEGIN + n) * S, [n] * 60) for n in range(10)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", said)
+    memory = memory_of(tmp_path, recalls=recalls)
+    given = {"topic": "/octets", "start": BEGIN, "end": BEGIN + 9}
+    for how in ({"changes": True}, {"by": "value"}):
+        reply = ask(memory, "get_topic_in_range", **given, **how, fields=["data"])
+        assert "field data of /octets" in reply["detail"]
+        reply = ask(memory, "get_topic_in_range", **given, **how, fields=["data.7"])
+        assert len(reply["changes"] if "changes" in how else reply["rows"]) == 10
+
+
 def test_an_unknown_topic_beside_is_named(memory: Memory) -> None:
     reply = ask(
         memory, "find_matches", topic="/task", condition_type="contains", value="pot",
@@ -299,9 +321,9 @@ def test_texts_that_are_too_long_for_a_state_are_sightings(tmp_path: Path) -> No
 def test_values_that_are_too_long_to_be_held_are_named(
     memory: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(held_values, "_MOST_CHARS", 80)
+    monkeypatch.setattr(held_values, "_MOST_CHARS", 40)
     window = {"start": BEGIN, "end": BEGIN + 319}
     reply = ask(memory, "get_topic_in_range", topic="/task", by="value", **window)
     assert [row[0] for row in reply["rows"]] == ["use a butter knife", "wash the pot"]
-    [note] = [each for each in reply["notes"] if "more than 80 characters" in each]
+    [note] = [each for each in reply["notes"] if "more than 40 characters" in each]
     assert f"only what is after {BEGIN + 200}.000000 is counted" in note

@@ -13,7 +13,7 @@ import pytest
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.insights.at_each import hours_of_days
 from ros2_memory.tools.arguments import _as_hours
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.rooms import S, asked_of, draw, write
 
@@ -90,6 +90,15 @@ def test_each_window_has_the_answer_that_it_has_alone(
         for key in sums:
             sums[key] += alone[key]
     assert reply.get("all", {}) == pytest.approx(sums, abs=0.01)
+
+
+@pytest.mark.parametrize("hours", ["00:00-24:00", "12:00-12:00"])
+def test_what_comes_as_hours_end_and_begin_counts_once(tmp_path: Path, hours: str) -> None:
+    ticks = [text((MIDNIGHT + 3600 * nth) * S, "tick") for nth in range(24 * DAYS + 1)]
+    write_mcap(tmp_path / "bag.mcap", ticks)
+    given = {"topic": "/chatter", "start": MIDNIGHT, "end": MIDNIGHT + DAYS * DAY_S}
+    reply = asked(memory_of(tmp_path), tmp_path, "get_topic_in_range", **given, between=hours)
+    assert reply["all"]["total"] == len(ticks)
 
 
 def _without_ages(value: Any) -> Any:

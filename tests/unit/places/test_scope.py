@@ -17,8 +17,17 @@ from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.visits import visits
 from ros2_memory.places.where import WhileCondition
 from ros2_memory.queries import position
-from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap, write_splits
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.bags import (
+    Msg,
+    boolean,
+    detections,
+    octets,
+    odom,
+    text,
+    write_mcap,
+    write_splits,
+)
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
 
 CUPS = "/vision/scene/scene_objects"
@@ -77,6 +86,44 @@ def test_matches_of_a_topic_with_two_types_count_whichever_came_last(
         memory, Call(), "/mixed", "contains", "cup", during=(undocked,)
     ).sightings
     assert found.last == BEGIN + 5 * S
+
+
+@each_way
+@pytest.mark.parametrize(
+    ("during", "said"),
+    [
+        ({"topic": "/odom", "condition_type": "above", "value": 1, "field": "nope"}, "no field"),
+        (
+            {"topic": "/octets", "condition_type": "equals", "value": 1, "field": "data"},
+            "only summarised",
+        ),
+        ({"topic": "/dock", "condition_type": "equals", "value": "yes"}, "true or false"),
+    ],
+)
+def test_what_no_message_of_another_topic_can_meet_is_refused(
+    tmp_path: Path, during: dict[str, object], said: str, *, recalls: bool
+) -> None:
+    said_then = [
+        odom(BEGIN, 0.0, 0.0),
+        octets(BEGIN, [1] * 60),
+        boolean(BEGIN, True, topic="/dock"),
+    ]
+    write_mcap(tmp_path / "rec_0.mcap", [*said_then, text(BEGIN + S, "cup")])
+    memory = memory_of(tmp_path, recalls=recalls)
+    cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup", "while": during}
+    for by in ({}, {"by": "hour"}):
+        refused = asked(memory, tmp_path, "find_matches", **cup, **by)
+        assert said in refused["detail"]
+
+
+def test_a_condition_is_met_by_messages_of_the_type_that_a_topic_had_before(
+    tmp_path: Path,
+) -> None:
+    before = [odom(BEGIN, 5.0, 0.0, topic="/was"), text(BEGIN + S, "cup")]
+    write_mcap(tmp_path / "rec_0.mcap", [*before, text(BEGIN + 9 * S, "now", "/was")])
+    during = {"topic": "/was", "condition_type": "above", "value": 1, "field": "position.x"}
+    cup = {"topic": "/chatter", "condition_type": "contains", "value": "cup", "while": during}
+    assert asked(memory_of(tmp_path), tmp_path, "find_matches", **cup)["total"] == 1
 
 
 def test_matches_count_while_the_robot_is_in_a_place(tmp_path: Path) -> None:
