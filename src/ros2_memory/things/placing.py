@@ -133,7 +133,10 @@ class Placer:
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
             messages = joined_detected([self.rows.of(rows) for rows in of_topic])
-            is_named = any(is_named_for_detections(rows.table.channel.type) for rows in of_topic)
+            is_named = any(
+                is_named_for_detections(rows.table.channel.type) and self.rows.have_labels(rows)
+                for rows in of_topic
+            )
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
