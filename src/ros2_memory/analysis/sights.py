@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
+from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -50,11 +51,14 @@ MAX_SPOTS: Final = 128
 """Of more of a label at once, detections are left out as if they had no place."""
 _MANY_PAIRS: Final = 200
 """So many are compared sooner as arrays."""
-_MAX_LABELS: Final = 512
-_MAX_LABEL_CHARS: Final = 120
+MAX_LABELS: Final = 512
+"""Of more in a slice one more is kept, which shows that others are left out."""
+MAX_LABEL_CHARS: Final = 256
+"""A longer one is cut, and ends with an ellipsis."""
 _MAX_COMPARED: Final = 128
 """Of more detections of a message that lie so near in x, not all are compared."""
-_MAX_AWAY_M: Final = 1e6
+_MAX_AWAY_M: Final = 1e8
+"""From the origin: UTM has ten thousand kilometres, and squares of more are beyond 63 bits."""
 _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
@@ -321,22 +325,21 @@ def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
     # Those that none has are of other messages, which may be forgotten.
-    used = np.unique(seen.labels).tolist()
-    names = sorted({seen.names[code][:_MAX_LABEL_CHARS] for code in used})
+    used, nth_used = np.unique(seen.labels, return_inverse=True)
+    shown = [shortened(seen.names[code], MAX_LABEL_CHARS) for code in used.tolist()]
+    names = sorted({*shown})
     number = {name: nth for nth, name in enumerate(names)}
-    codes = np.zeros(len(seen.names), np.int64)
-    codes[used] = [number[seen.names[code][:_MAX_LABEL_CHARS]] for code in used]
-    label = codes[seen.labels]
+    label = np.array([number[name] for name in shown], np.int64)[nth_used]
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
     scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
     detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
-    if len(names) > _MAX_LABELS:
+    if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
         before = np.repeat(begins, np.diff(begins, append=len(rows)))
-        detections = rows_of(detections, (np.arange(len(rows)) - before < _MAX_LABELS)[nth])
+        detections = rows_of(detections, (np.arange(len(rows)) - before <= MAX_LABELS)[nth])
     return detections, tuple(names)
 
 
