@@ -192,8 +192,8 @@ def _labels_left_out(known: KnownThings) -> list[str]:
     if len(sights.labels) <= MAX_LABELS:
         return []
     # A slice, a topic and a label are the first columns of both.
-    labels, _ = distinct_rows(np.concatenate((sights.spots[:, :3], sights.unplaced[:, :3])).T)
-    _, slice_of = distinct_rows(labels[:, :2].T)
+    labels, _ = distinct_rows([*np.concatenate((sights.spots[:, :3], sights.unplaced[:, :3])).T])
+    _, slice_of = distinct_rows([*labels[:, :2].T])
     if np.bincount(slice_of).max() <= MAX_LABELS:
         return []
     return [f"of more than {MAX_LABELS} labels in 10 s, the others are left out"]
