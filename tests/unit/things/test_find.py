@@ -396,6 +396,20 @@ def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
     assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
 
 
+@pytest.mark.parametrize("beside_m", [0.0, 0.02, 0.6])
+def test_a_place_is_looked_at_from_where_it_was_seen_however_poses_are_divided(
+    tmp_path: Path, beside_m: float
+) -> None:
+    """The robot stands where four cells of poses meet: what it is off by is another cell."""
+    before, after = (0.99, -0.01, -0.02), (0.99 + beside_m, -0.01 + beside_m, -0.02 + beside_m)
+    stay = [("book", 4.0, 1.5), ("vase", 4.0, -1.0)]
+    seen = looked(0, 20, before, ("mug", 3.0, 0.5), *stay)
+    write_splits(tmp_path, [*seen, *looked(20, 50, after, *stay)])
+    [mug] = ask(tmp_path, label="mug")["things"]
+    state = "not_looked_at_since" if beside_m > 0.5 else "not_seen_where_expected"
+    assert state in mug["still_there"]
+
+
 def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:
     write_splits(tmp_path, looked(0, 60, HERE, ("mug", 3.0, 0.5)))
     [thing] = ask(tmp_path, label="mug", end=BEGIN + 25)["things"]
