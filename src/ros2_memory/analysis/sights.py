@@ -194,10 +194,6 @@ class Sights:
     tables: tuple[Ints, ...]
     slices: int = 0
 
-    def with_fixes(self, fixes: Ints) -> Sights:
-        """Returns these sights with other fixes."""
-        return replace(self, tables=(*self.tables[:-1], fixes))
-
     def only(self, *kinds: type[IntEnum]) -> Sights:
         """Returns these sights with the rows of some tables alone."""
         tables = tuple(
@@ -291,8 +287,8 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     return Sights((topic,), labels, tables)
 
 
-def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
-    """Returns where odometry was in the map at some log times (`Fix`).
+def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
+    """Returns where odometry was in the map at some log times, and nothing else.
 
     Args:
         times: ns.
@@ -302,7 +298,8 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
     said = np.rint(np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)).astype(np.int64)
     x, y, yaw = poses.T
     columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
-    return np.stack(columns, axis=1)
+    none = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
+    return Sights((), (), (*none, np.stack(columns, axis=1)))
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:

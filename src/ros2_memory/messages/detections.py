@@ -97,6 +97,8 @@ def _walked(
     if depth == 0 or not isinstance(value, str | list | dict):
         return value
     if isinstance(value, str):
+        if not looks_like_json(value):  # most are names
+            return value
         parsed = _from_json(value)
         kept = _walked(parsed, frame, depth - 1, least, detections)
         return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
@@ -134,16 +136,8 @@ def _walked_object(
             detections += [
                 Detection(element) for element in inner if isinstance(element, str) and element
             ]
-        is_worth_it = _may_hold_detections(inner)
-        fields[name] = _walked(inner, frame, depth - 1, least, detections) if is_worth_it else inner
+        fields[name] = _walked(inner, frame, depth - 1, least, detections)
     return value if all(map(is_, fields.values(), value.values())) else fields
-
-
-def _may_hold_detections(value: JsonValue) -> bool:
-    """Returns whether a field is worth a look: most are numbers and names."""
-    if isinstance(value, str):
-        return looks_like_json(value)
-    return isinstance(value, dict | list)
 
 
 def looks_like_json(text: str) -> bool:
@@ -230,8 +224,8 @@ def _placed(
 
 
 def _from_json(text: str) -> JsonValue:
-    """Parses a string that is JSON; None for any other."""
-    if len(text) > _MAX_JSON_CHARS or not looks_like_json(text):
+    """Parses a string that is JSON; None for one that is not, or is too long."""
+    if len(text) > _MAX_JSON_CHARS:
         return None
     try:
         value: JsonValue = json.loads(text)

@@ -31,7 +31,6 @@ from ros2_memory.things.instances import (
     spellings,
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
-from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
@@ -402,11 +401,7 @@ class _Finder:
         """
         sights = self.known.estimate.sights
         best = int(sights.spots[rows, Spot.BEST].max())
-        first, end = (
-            np.searchsorted(sights.scores[:, Score.SPOT], rows, side=side)
-            for side in ("left", "right")
-        )
-        scores = sights.scores[in_ranges(first, end - first)]
+        scores = sights.scores[np.isin(sights.scores[:, Score.SPOT], rows)]
         if not len(scores):
             return None, None
         counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)
