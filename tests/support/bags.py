@@ -58,9 +58,13 @@ OTHER_ROBOTS: Final = {
         + "".join(f"bool {name}\n" for name in STATUS_FLAGS)
         + "uint8 gcs_connection_lost_counter\n"
     ),
+    "apriltag_msgs/msg/AprilTagDetection": "string family\nint32 id\nfloat32 decision_margin\n",
+    "apriltag_msgs/msg/AprilTagDetectionArray": (
+        "std_msgs/Header header\nAprilTagDetection[] detections\n"
+    ),
     "px4_msgs/msg/ManyFlags": "".join(f"bool flag_{nth:03}\n" for nth in range(600)),
 }
-"""Types that carry a pose in ways of their own (of one some of its fields), or many booleans."""
+"""Types that carry a pose in ways of their own, many booleans, or detections without a label."""
 
 
 @cache

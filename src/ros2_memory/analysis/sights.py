@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
+from ros2_memory.core.text import shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -50,11 +51,14 @@ MAX_SPOTS: Final = 128
 """Of more of a label at once, detections are left out as if they had no place."""
 _MANY_PAIRS: Final = 200
 """So many are compared sooner as arrays."""
-_MAX_LABELS: Final = 512
-_MAX_LABEL_CHARS: Final = 120
+MAX_LABELS: Final = 512
+"""Of more in a slice one more is kept, which shows that others are left out."""
+MAX_LABEL_CHARS: Final = 256
+"""A longer one is cut, and ends with an ellipsis."""
 _MAX_COMPARED: Final = 128
 """Of more detections of a message that lie so near in x, not all are compared."""
-_MAX_AWAY_M: Final = 1e6
+_MAX_AWAY_M: Final = 1e8
+"""From the origin: UTM has ten thousand kilometres, and squares of more are beyond 63 bits."""
 _MAX_SCORE: Final = 1e6
 _NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
@@ -190,10 +194,6 @@ class Sights:
     tables: tuple[Ints, ...]
     slices: int = 0
 
-    def with_fixes(self, fixes: Ints) -> Sights:
-        """Returns these sights with other fixes."""
-        return replace(self, tables=(*self.tables[:-1], fixes))
-
     def only(self, *kinds: type[IntEnum]) -> Sights:
         """Returns these sights with the rows of some tables alone."""
         tables = tuple(
@@ -287,8 +287,8 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
     return Sights((topic,), labels, tables)
 
 
-def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
-    """Returns where odometry was in the map at some log times (`Fix`).
+def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
+    """Returns where odometry was in the map at some log times, and nothing else.
 
     Args:
         times: ns.
@@ -298,7 +298,8 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Ints:
     said = np.rint(np.nan_to_num(np.minimum(sigma_m, _MAX_AWAY_M) * 1000, nan=-1)).astype(np.int64)
     x, y, yaw = poses.T
     columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
-    return np.stack(columns, axis=1)
+    none = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
+    return Sights((), (), (*none, np.stack(columns, axis=1)))
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
@@ -321,22 +322,21 @@ def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:
     """Returns the detections, and the names of their labels."""
     # Those that none has are of other messages, which may be forgotten.
-    used = np.unique(seen.labels).tolist()
-    names = sorted({seen.names[code][:_MAX_LABEL_CHARS] for code in used})
+    used, nth_used = np.unique(seen.labels, return_inverse=True)
+    shown = [shortened(seen.names[code], MAX_LABEL_CHARS) for code in used.tolist()]
+    names = sorted({*shown})
     number = {name: nth for nth, name in enumerate(names)}
-    codes = np.zeros(len(seen.names), np.int64)
-    codes[used] = [number[seen.names[code][:_MAX_LABEL_CHARS]] for code in used]
-    label = codes[seen.labels]
+    label = np.array([number[name] for name in shown], np.int64)[nth_used]
     with np.errstate(invalid="ignore"):
         near: Flags = np.all(np.abs(seen.places) < _MAX_AWAY_M, axis=1)
     x, y, z = _mm(np.where(near[:, None], seen.places, 0.0)).T
     scores = np.where(np.isfinite(seen.scores), seen.scores, np.nan)
     detections = _Detections(seen.rows, slices[seen.rows], label, x, y, z, scores, near)
-    if len(names) > _MAX_LABELS:
+    if len(names) > MAX_LABELS:
         rows, nth = distinct_rows((detections.slice, label))
         begins = np.flatnonzero(np.diff(rows[:, 0], prepend=-1))
         before = np.repeat(begins, np.diff(begins, append=len(rows)))
-        detections = rows_of(detections, (np.arange(len(rows)) - before < _MAX_LABELS)[nth])
+        detections = rows_of(detections, (np.arange(len(rows)) - before <= MAX_LABELS)[nth])
     return detections, tuple(names)
 
 

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Floats, Ints, Level, Mask
     from ros2_memory.extract import SchemaExtractor
 
-Point: TypeAlias = tuple[Leaf, Leaf, Leaf]
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 _STAMP: Final = "builtin_interfaces/msg/Time"
 
@@ -94,6 +93,16 @@ class StampedDetections(NamedTuple):
     detections: Detections
     stamps: Ints | None
     frames: Texts
+
+
+class Point(NamedTuple):
+    """Numbers that may be the place of an object: x, y and z (m).
+
+    `frames` name its frame, the outermost first: of what is in the object around the point.
+    """
+
+    axes: tuple[Leaf, ...]
+    frames: tuple[Leaf, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,6 +173,11 @@ class DetectionColumns:
             )
         except UnknownShapeError:
             return None
+
+    def has_labels(self, table: Table) -> bool:
+        """Returns whether the type of a table has fields for labels, not only texts."""
+        sources = self._sources.of(table)
+        return sources is None or not all(isinstance(source, Json) for source in sources)
 
     def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a message may hold a detection, as known without reading a column.
@@ -283,8 +297,11 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
     points: list[Point] = []
     for path in POSITIONS:
         node: Node | None = Group(fields)
+        frames: list[Leaf] = []
         for name in path:
             node = node.child(name) if node and is_object(node) else None
+            if node is not None and is_object(node):
+                frames += _frame_leaves(dict(children(node)))
         if node is None or isinstance(node, Leaf | Nothing):
             continue
         if isinstance(node, Items):
@@ -296,8 +313,7 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
             return None
         numbers = [leaf for leaf in leaves if isinstance(leaf, Leaf) and _is_number(leaf)]
         if len(leaves) == len(numbers) == 3:
-            x, y, z = numbers
-            points.append((x, y, z))
+            points.append(Point(tuple(numbers), tuple(frames)))
         elif any(not isinstance(leaf, Leaf) for leaf in leaves):
             return None
     return tuple(points)
@@ -359,12 +375,7 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     ):
         raise UnknownShapeError("some objects are detections, and some have such in them")
     detections = _detections_at(values, objects.level, name, positions, score)
-    if not places:
-        return detections
-    return detections._replace(
-        places=_places_at(values, source, objects.level, positions),
-        frames=_frames_at(values, objects.level, positions, source.frames),
-    )
+    return _placed(values, source, positions, detections) if places else detections
 
 
 def texts_of(values: Values, leaf: Leaf) -> Texts:
@@ -453,22 +464,27 @@ def _best_hypotheses(name: Texts, score: Floats, error: float, owners: Ints) -> 
     return best
 
 
-def _places_at(values: Values, source: Labels, level: Level, positions: Ints) -> Points:
-    """Returns the first valid point of each detection (N x 3); NaN where it has none."""
+def _placed(values: Values, source: Labels, positions: Ints, detections: Detections) -> Detections:
+    """Returns detections at the first valid point of each; NaN where it has none."""
     if source.points is None or source.best_points is None:
         raise UnknownShapeError("points are of another shape in each message")
-    places = _nowhere(positions.size)
-    for leaves in (*source.best_points, *source.points):
-        at = _owners_at(values, level, positions, leaves[0].level)
-        columns = [values.numbers(leaf) for leaf in leaves]
+    level, places = source.scored.level, detections.places
+    frames = _frames_at(values, level, positions, source.frames)
+    for point in (*source.best_points, *source.points):
+        at = _owners_at(values, level, positions, point.axes[0].level)
+        columns = [values.numbers(leaf) for leaf in point.axes]
         numbers = [column.values[at] for column in columns if column is not None]
-        if len(numbers) < len(leaves):
+        if len(numbers) < len(columns):
             raise UnknownShapeError("points are not held")
-        point = np.stack(numbers, axis=1).astype(np.float64)
+        place = np.stack(numbers, axis=1).astype(np.float64)
         # All zeros means that nobody filled it in.
-        is_given = np.isfinite(point).all(axis=1) & point.any(axis=1)
-        places = np.where((is_given & np.isnan(places[:, 0]))[:, None], point, places)
-    return places
+        is_given = np.isfinite(place).all(axis=1) & place.any(axis=1)
+        is_given &= np.isnan(places[:, 0])
+        places = np.where(is_given[:, None], place, places)
+        own = _frames_at(values, level, positions, point.frames)
+        codes = np.where(is_given, own.codes + 1, 0).astype(np.uint32)
+        frames = or_else(Texts(codes, ("", *own.words)), frames)
+    return detections._replace(places=places, frames=frames)
 
 
 def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[Leaf]) -> Texts:

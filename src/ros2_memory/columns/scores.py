@@ -30,11 +30,10 @@ from ros2_memory.columns.shown import (
 )
 from ros2_memory.columns.table import Texts
 from ros2_memory.columns.values import Kind, Leaf, Level
-from ros2_memory.core.text import LABELS
-from ros2_memory.messages.detections import MAX_DEPTH, NOT_LABELLED, SCORES, looks_like_json
+from ros2_memory.messages.detections import MAX_DEPTH, SCORES, looks_like_json, naming
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
+    from collections.abc import Mapping
 
     from ros2_memory.columns.values import Floats, Ints, Mask, Values
 
@@ -55,7 +54,7 @@ class Scored:
 
     Attributes:
         level: where it lies.
-        labels: texts, the first of which that is not blank names it.
+        labels: texts and then whole numbers, the first of which that is not blank names it.
         scores: numbers, of which the first that is known is its score.
     """
 
@@ -65,7 +64,7 @@ class Scored:
 
     def read(self, values: Values) -> NamedScores | None:
         """Returns the names and scores of all; None where the table does not hold them."""
-        name, *fallbacks = (values.texts(leaf) for leaf in self.labels)
+        name, *fallbacks = (_names(values, leaf) for leaf in self.labels)
         for fallback in fallbacks:
             name = None if name is None or fallback is None else or_else(name, fallback, blank=True)
         if name is None:
@@ -79,6 +78,14 @@ class Scored:
             score = np.where(np.isnan(score), column, score)
             error = max(error, numbers.error)
         return NamedScores(name, score, error)
+
+
+def _names(values: Values, leaf: Leaf) -> Texts | None:
+    """Returns the texts of a leaf, or its whole numbers as such; None where they are not held."""
+    if leaf.kind is Kind.TEXT:
+        return values.texts(leaf)
+    numbers = values.numbers(leaf)
+    return None if numbers is None else Texts.of([*map(str, numbers.values.tolist())])
 
 
 def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
@@ -230,19 +237,15 @@ def hypotheses(fields: Mapping[str, Node]) -> Scored | None:
 
 def scored(fields: Mapping[str, Node]) -> Scored | None:
     """Returns how an object is named and scored; None if none like it is a detection."""
-    if fields.keys() & NOT_LABELLED:
-        return None
-    labels = _leaves(fields, LABELS, lambda leaf: leaf.kind is Kind.TEXT)
-    numeric = {Kind.INTEGER, Kind.REAL}
-    scores = _leaves(fields, SCORES, lambda leaf: leaf.kind in numeric)
+    names = naming(fields.keys())
+    labels = _leaves(fields, names, Kind.TEXT) + _leaves(fields, names, Kind.INTEGER)
+    scores = _leaves(fields, SCORES, Kind.INTEGER, Kind.REAL)
     return Scored(labels[0].level, labels, scores) if labels else None
 
 
-def _leaves(
-    fields: Mapping[str, Node], names: tuple[str, ...], takes: Callable[[Leaf], bool]
-) -> tuple[Leaf, ...]:
+def _leaves(fields: Mapping[str, Node], names: tuple[str, ...], *kinds: Kind) -> tuple[Leaf, ...]:
     nodes = [fields[name] for name in names if name in fields]
-    return tuple(node for node in nodes if isinstance(node, Leaf) and takes(node))
+    return tuple(node for node in nodes if isinstance(node, Leaf) and node.kind in kinds)
 
 
 def _inner_detections(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:

@@ -91,6 +91,10 @@ class DetectionRows:
         """Returns in which parts some message may hold a detection, by their zones."""
         return self._columns.may_match(parts)
 
+    def have_labels(self, rows: Rows) -> bool:
+        """Returns whether the type of some rows has fields for labels, not only texts."""
+        return self._columns.has_labels(rows.table)
+
     def of(self, rows: Rows) -> Detected:
         """Returns the detections of some rows; messages that cannot be decoded are left out."""
         detected = of_columns(self._view, rows, self._by_columns)

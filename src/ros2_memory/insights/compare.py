@@ -153,10 +153,10 @@ def _compare_things(
     )
     if any(gap_around(view, window) is not None for window in windows):
         view.notes.add("things are not compared: there is nothing to compare them with")
-        return frame, ComparedThings((), (), (), (), 0)
+        return frame, ComparedThings()
     if first.start == second.start:
         view.notes.add("things are not compared: the two times begin together")
-        return frame, ComparedThings((), (), (), (), 0)
+        return frame, ComparedThings()
     if second.stop < first.stop:
         view.notes.add(
             f"things are not compared after {unix_text(second.asked()[1])}, where one of the two "

@@ -1,9 +1,9 @@
 """Reads detections from messages: what a detector saw, by name, and where if the message has that.
 
-A detection is an object with a name under one of `LABELS`: an entry of a list, or the whole
-message; a list of strings under one of `LISTS_OF_LABELS` is a list of detections. A string that is
-JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The
-position is a point in metres: `point` or `position`, vision_msgs' pose or the centre of a 3D box.
+A detection is an object with a name under one of the fields of `naming`: an entry of a list, or the
+whole message; a list of strings under one of `LISTS_OF_LABELS` is a list of detections. A string
+that is JSON is parsed. Detections of vision_msgs are named by their best hypothesis. The position
+is a point in metres, at one of `POSITIONS`, in the frame that the innermost object around it names.
 Boxes in an image are in pixels, and give no position. The score is a number under one of `SCORES`.
 """
 
@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import product
 from operator import is_
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -18,6 +19,8 @@ from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
 from ros2_memory.messages.conversions import number, triple, xyz
 
 if TYPE_CHECKING:
+    from collections.abc import Collection, Sequence
+
     from ros2_memory.core.model import JsonValue, Vector3
 
 SCORES: Final = ("score", "confidence", "probability")
@@ -29,10 +32,15 @@ POSITIONS: Final = (
     ("position",),
     ("pose", "position"),
     ("pose", "pose", "position"),
+    ("pose", "pose", "pose", "position"),
+    ("pose",),
     ("bbox", "center", "position"),
+    ("bbox3d", "center", "position"),
 )
+_SHOWN: Final = frozenset({"box"}.union(path[0] for path in POSITIONS))
+"""What has a score and one of these is something that was seen, and named as such things are."""
 _MAX_JSON_CHARS: Final = 4 << 20
-MAX_DEPTH: Final = 5
+MAX_DEPTH: Final = 7
 """Lists, objects and texts that are JSON around a detection, and it."""
 _JSON: Final = frozenset("[{")
 
@@ -61,6 +69,17 @@ def detections_of(
     return tuple(detections)
 
 
+def naming(fields: Collection[str]) -> tuple[str, ...]:
+    """Returns which fields name an object that has some fields, the first choice first.
+
+    Of these the first text that is not blank is its name, else the first whole number.
+    """
+    if not NOT_LABELLED.isdisjoint(fields):
+        return ()
+    is_seen = any(name in fields for name in SCORES) and not _SHOWN.isdisjoint(fields)
+    return (*LABELS, "name", "id") if is_seen else LABELS
+
+
 def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
     """Returns an extracted value without the detections whose score is below a limit.
 
@@ -78,6 +97,8 @@ def _walked(
     if depth == 0 or not isinstance(value, str | list | dict):
         return value
     if isinstance(value, str):
+        if not looks_like_json(value):  # most are names
+            return value
         parsed = _from_json(value)
         kept = _walked(parsed, frame, depth - 1, least, detections)
         return value if kept is parsed else json.dumps(kept, ensure_ascii=False)
@@ -102,13 +123,12 @@ def _walked_object(
     """Returns an object as `_walked` does; `frame` is the one that it is in."""
     label = _label(value)
     if label is not None:
-        detections.append(Detection(label, _position(value), frame, _score(value)))
+        detections.append(_placed((value,), frame, label, _score(value)))
         return None if _is_below(value, least) else value
     best = _best_result(value.get("results"))
     best_label = None if best is None else _label(_hypothesis(best))
     if best is not None and best_label is not None:
-        position = _position(best) or _position(value)
-        detections.append(Detection(best_label, position, frame, _score(_hypothesis(best))))
+        detections.append(_placed((best, value), frame, best_label, _score(_hypothesis(best))))
         return value if least is None else _without_hypotheses(value, best, least)
     fields: dict[str, JsonValue] = {}
     for name, inner in value.items():
@@ -116,16 +136,8 @@ def _walked_object(
             detections += [
                 Detection(element) for element in inner if isinstance(element, str) and element
             ]
-        is_worth_it = _may_hold_detections(inner)
-        fields[name] = _walked(inner, frame, depth - 1, least, detections) if is_worth_it else inner
+        fields[name] = _walked(inner, frame, depth - 1, least, detections)
     return value if all(map(is_, fields.values(), value.values())) else fields
-
-
-def _may_hold_detections(value: JsonValue) -> bool:
-    """Returns whether a field is worth a look: most are numbers and names."""
-    if isinstance(value, str):
-        return looks_like_json(value)
-    return isinstance(value, dict | list)
 
 
 def looks_like_json(text: str) -> bool:
@@ -152,13 +164,10 @@ def _is_below(value: dict[str, JsonValue], least: float | None) -> bool:
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
-    if not NOT_LABELLED.isdisjoint(value):
-        return None
-    for name in LABELS:
-        label = value.get(name)
-        if isinstance(label, str) and label.strip():
-            return label
-    return None
+    labels = [value.get(name) for name in naming(value)]
+    texts = [label for label in labels if isinstance(label, str) and label.strip()]
+    # A boolean is an int.
+    return next(iter(texts), None) or next((str(n) for n in labels if type(n) is int), None)
 
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
@@ -195,23 +204,28 @@ def _frame(value: dict[str, JsonValue]) -> str:
     return frame if isinstance(frame, str) else ""
 
 
-def _position(value: dict[str, JsonValue]) -> Vector3 | None:
-    """Returns the first valid point; all zeros means that nobody filled it in."""
-    for path in POSITIONS:
+def _placed(
+    objects: Sequence[dict[str, JsonValue]], outer: str, label: str, score: float | None
+) -> Detection:
+    """Returns a detection at the first valid point of some objects in a frame.
+
+    All zeros means that nobody filled it in.
+    """
+    for value, path in product(objects, POSITIONS):
         node: JsonValue = value
+        frame = outer
         for name in path:
             node = node.get(name) if isinstance(node, dict) else None
-        if node is None:
-            continue
+            frame = (_frame(node) if isinstance(node, dict) else "") or frame
         point = xyz(node) if isinstance(node, dict) else triple(node)
         if point is not None and any(point) and all(map(math.isfinite, point)):
-            return point
-    return None
+            return Detection(label, point, frame, score)
+    return Detection(label, None, outer, score)
 
 
 def _from_json(text: str) -> JsonValue:
-    """Parses a string that is JSON; None for any other."""
-    if len(text) > _MAX_JSON_CHARS or not looks_like_json(text):
+    """Parses a string that is JSON; None for one that is not, or is too long."""
+    if len(text) > _MAX_JSON_CHARS:
         return None
     try:
         value: JsonValue = json.loads(text)

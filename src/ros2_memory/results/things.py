@@ -57,13 +57,17 @@ _LABEL: Final = unit(lambda label: shortened(named(label), 40))
     PLAIN("times", "count"),
 )
 class ThingStay:
-    """An interval in which a thing was at a place (m): first and last seen there, and how often."""
+    """An interval in which a thing was at a place (m): first and last seen there, and how often.
+
+    `at_once` is how many there were; None where that is not compared.
+    """
 
     start: Ns
     end: Ns
     place: Vector3
     count: int
     inside: tuple[str, ...] = ()
+    at_once: int | None = None
 
 
 @result(
@@ -280,7 +284,8 @@ def _named_pairs(places: int) -> Unit:
 def _spot(name: str, time: str) -> Unit:
     """Returns the unit of a place at a time, which has this name."""
     place = (_XY.spread("place"), INSIDE("inside"))
-    return an_object(keys(*place, TIME(name, time), LOCAL_OF_DAYS("local", time)))
+    seen = (TIME(name, time), LOCAL_OF_DAYS("local", time))
+    return an_object(keys(*place, *seen, PLAIN("at_once").if_known))
 
 
 @result(
@@ -344,6 +349,7 @@ def _differences(most: int) -> Keys:
                 ("not_seen_where_expected", "missed", most),
                 ("not_looked_at", "not_looked_at", most),
                 ("not_comparable", "not_comparable", most),
+                ("more_or_fewer", "more_or_fewer", most),
                 ("movers", "movers", most),
             )
         )
@@ -355,15 +361,17 @@ class ComparedThings:
     """The things that differ between two windows; `same` counts those that do not.
 
     `not_comparable`: seen in both, in the coordinates of different runs of odometry.
+    `more_or_fewer`: of those that stand together, another number.
     """
 
-    moved: tuple[ComparedThing, ...]
-    appeared: tuple[ComparedThing, ...]
-    missed: tuple[ComparedThing, ...]
-    not_looked_at: tuple[ComparedThing, ...]
-    same: int
+    moved: tuple[ComparedThing, ...] = ()
+    appeared: tuple[ComparedThing, ...] = ()
+    missed: tuple[ComparedThing, ...] = ()
+    not_looked_at: tuple[ComparedThing, ...] = ()
+    same: int = 0
     movers: tuple[ComparedMover, ...] = ()
     not_comparable: tuple[ComparedThing, ...] = ()
+    more_or_fewer: tuple[ComparedThing, ...] = ()
 
     @property
     def is_any(self) -> bool:
@@ -374,6 +382,7 @@ class ComparedThings:
             self.missed,
             self.not_looked_at,
             self.not_comparable,
+            self.more_or_fewer,
         )
         return any((*differences, self.movers))
 

@@ -12,6 +12,7 @@ seen, how many at once, and where last.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -35,10 +36,11 @@ _SAME_MOVER_M: Final = 1.0
 
 
 class _StayInWindow(NamedTuple):
-    """A thing's last stay in a window, and that part of the stay."""
+    """A thing's last stay in a window, and that part of the stay; how many there were at once."""
 
     stay: PlacedStay
     part: ThingStay
+    at_once: int
 
     def is_elsewhere(self, other: _StayInWindow) -> bool:
         """Whether a thing was moved between this and another: to and fro is no move."""
@@ -64,9 +66,7 @@ class ThingsBetween:
 
     def compared(self) -> ComparedThings:
         """Returns what differs, each list with those seen last first."""
-        lists: dict[str, list[ComparedThing]] = {"moved": [], "appeared": [], "missed": []}
-        not_looked_at: list[tuple[Instance, ComparedThing]] = []
-        same = 0
+        kinds: dict[str, list[tuple[Instance, ComparedThing]]] = defaultdict(list)
         for instance in self.known.estimate.instances:
             before = self._stay_in(instance, self.earlier, self.later.start)
             after = self._stay_in(instance, self.later)
@@ -75,15 +75,12 @@ class ThingsBetween:
                 before = shared  # in slices of both windows, but elsewhere
             if not self._is_there(instance, before, after):
                 continue
-            if before and after and not before.is_elsewhere(after):
-                same += 1
-                continue
             kind, thing = self._difference(instance, before, after)
-            if kind == "not_looked_at":
-                not_looked_at.append((instance, thing))
-            else:
-                lists[kind].append(thing)
-        lists["not_looked_at"], lists["not_comparable"] = _paired(not_looked_at)
+            kinds[kind].append((instance, thing))
+        same = len(kinds.pop("same", ()))
+        alone, both = _paired(kinds.pop("not_looked_at", ()))
+        lists = {kind: [thing for _, thing in things] for kind, things in kinds.items()}
+        lists |= {"not_looked_at": alone, "not_comparable": both}
         ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
         movers = tuple(sorted(self._movers(), key=_newest_first))
         return ComparedThings(**ordered, same=same, movers=movers)
@@ -117,7 +114,13 @@ class ThingsBetween:
             if crossed is None or crossed >= self.later.stop:
                 return "not_looked_at", thing
             return "missed", replace(thing, missed=crossed, looks=looks)
-        return "moved", thing
+        if before is None or after is None or before.is_elsewhere(after):
+            return "moved", thing
+        if before.at_once == after.at_once:
+            return "same", thing
+        numbers = (replace(stay.part, at_once=stay.at_once) for stay in (before, after))
+        was, now = numbers
+        return "more_or_fewer", replace(thing, before=was, after=now)
 
     def _last_there(self, instance: Instance, before: _StayInWindow) -> PlacedStay:
         """Returns a thing's last stay at its place of the earlier window, before the later one."""
@@ -135,7 +138,8 @@ class ThingsBetween:
             rows = estimate.seen_in(stay.spots, window, before)
             if len(rows):
                 place = estimate.place_of(stay, rows)
-                return _StayInWindow(stay, self.known.stay(rows, place, frame, self.places))
+                part = self.known.stay(rows, place, frame, self.places)
+                return _StayInWindow(stay, part, estimate.side_by_side(rows))
         return None
 
     def _movers(self) -> Iterator[ComparedMover]:

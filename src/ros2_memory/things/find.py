@@ -31,7 +31,6 @@ from ros2_memory.things.instances import (
     spellings,
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
-from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
@@ -42,9 +41,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 LIMIT: Final = 12
-_FEWEST_BESIDE: Final = 3
-_NEWEST_BESIDE: Final = 9
-"""So many slices say how many there are now: of more, some may have been taken away since."""
 _MOST_NAMES: Final = 5
 _NEAR_M: Final = 1.0
 _JUST_NOW_NS: Final = 2 * NS_PER_S
@@ -277,7 +273,8 @@ class _Finder:
         if self.where is not None and not self.where.contains(frame, *stay.at[:2]):
             return
         rows = np.concatenate([rows for _, rows in parts])
-        at_once = self._side_by_side(newest)
+        number = estimate.side_by_side(newest)
+        at_once = number if number > 1 else None
         yield _FoundThing(
             label=instance.label,
             keys=keys,
@@ -355,31 +352,6 @@ class _Finder:
         written = spellings(estimate.sights, estimate.counts, rows)
         return named(written, self.known.labels, estimate.names)
 
-    def _side_by_side(self, rows: Ints) -> int | None:
-        """Returns how many of a label are at one place, where messages have several at once.
-
-        Places are no finer than the noise of far detections, but two of one message are never one.
-        A slice counts where each was seen at least half as often as the one seen most, three times
-        or as often as a slow detector sees them.
-        """
-        counts = self.known.estimate.counts[rows]
-        is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))
-        rows, counts = rows[is_often], counts[is_often]
-        slices, together = self.known.estimate.sights.spots[rows][:, [Spot.SLICE, Spot.TOGETHER]].T
-        order = np.argsort(slices, kind="stable")
-        begins = np.flatnonzero(np.diff(slices[order], prepend=-1))
-        numbers: list[int] = []
-        if len(begins):
-            sizes = np.diff(begins, append=len(order))
-            most = np.repeat(np.maximum.reduceat(counts[order], begins), sizes)
-            beside = np.add.reduceat((2 * counts[order] >= most).astype(np.int64), begins)
-            at_once = np.maximum.reduceat(together[order], begins)
-            numbers = np.minimum(beside, at_once).tolist()
-        # What most slices have, so that no single one with a false detection counts.
-        newest = sorted(numbers[-_NEWEST_BESIDE:], reverse=True)
-        number = newest[len(newest) // 2] if newest else 1
-        return number if number > 1 else None
-
     def _found_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields a mover: where it was last seen, inside the region if one is given."""
         estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
@@ -429,11 +401,7 @@ class _Finder:
         """
         sights = self.known.estimate.sights
         best = int(sights.spots[rows, Spot.BEST].max())
-        first, end = (
-            np.searchsorted(sights.scores[:, Score.SPOT], rows, side=side)
-            for side in ("left", "right")
-        )
-        scores = sights.scores[in_ranges(first, end - first)]
+        scores = sights.scores[np.isin(sights.scores[:, Score.SPOT], rows)]
         if not len(scores):
             return None, None
         counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)

@@ -26,7 +26,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.localisation import poorly_localised
@@ -64,6 +64,9 @@ _TINY_SHARE: Final = 0.1
 _BESIDE_SHARE: Final = 0.2
 _SEVERAL_SHARE: Final = 0.1
 """Where so many slices have several of a label at one place, it is no single thing that moves."""
+_FEWEST_BESIDE: Final = 3
+_NEWEST_BESIDE: Final = 9
+"""So many slices say how many there are now: of more, some may have been taken away since."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -216,6 +219,25 @@ class Estimate:
             for column in (self.cells.x, self.cells.y, self.cells.yaw)
         )
         return x / 1000, y / 1000, math.radians((yaw + 180) % 360 - 180)
+
+    def side_by_side(self, rows: Ints) -> int:
+        """Returns how many of a label are at one place, by its spots: what messages have at once.
+
+        Places are no finer than the noise of far detections, but two of one message are never one.
+        A slice counts where each was seen at least half as often as the one seen most, three times
+        or as often as a slow detector sees them.
+        """
+        counts = self.counts[rows]
+        is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))
+        rows, counts = rows[is_often], counts[is_often]
+        slices, together = self.sights.spots[rows][:, [Spot.SLICE, Spot.TOGETHER]].T
+        by = Groups.of(np.unique(slices, return_inverse=True)[1])
+        most = np.repeat(by.ends(counts)[1], by.sizes)
+        beside = np.add.reduceat((2 * counts[by.order] >= most).astype(np.int64), by.begins)
+        numbers = np.minimum(beside, by.ends(together)[1])
+        # What most slices have, so that no single one with a false detection counts.
+        newest = np.sort(numbers[-_NEWEST_BESIDE:])[::-1]
+        return max(1, int(newest[len(newest) // 2]))
 
     def missing(
         self, instance: Instance, stay: PlacedStay, window: tuple[Ns, Ns] | None = None

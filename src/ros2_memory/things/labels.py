@@ -11,6 +11,9 @@ import unicodedata
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.analysis.sights import MAX_LABEL_CHARS
+from ros2_memory.core.text import shortened
+
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
 
@@ -115,7 +118,7 @@ class Labels:
 
     def key(self, label: str) -> str:
         """Returns the key of a label."""
-        plain_key = singular(label)
+        plain_key = singular(shortened(label, MAX_LABEL_CHARS))
         return self._keys.get(plain_key, plain_key)
 
     def are_apart(self, one: str, other: str) -> bool:

@@ -119,8 +119,7 @@ class Placer:
         ]
         if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([messages.log_times for messages in detected.values()])
-            fixes = self._fixes(session, poses.frames.words[0], frames, times)
-            sights.append(replace(sights[0].only().with_fixes(fixes), topics=(), labels=()))
+            sights.append(self._fixes(session, poses.frames.words[0], frames, times))
         return SessionSights(target, tuple(sights), frozenset(detectors))
 
     def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
@@ -133,7 +132,10 @@ class Placer:
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
             messages = joined_detected([self.rows.of(rows) for rows in of_topic])
-            is_named = any(is_named_for_detections(rows.table.channel.type) for rows in of_topic)
+            is_named = any(
+                is_named_for_detections(rows.table.channel.type) and self.rows.have_labels(rows)
+                for rows in of_topic
+            )
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
@@ -175,7 +177,7 @@ class Placer:
             return target, frames
         return pose_frame, frames_over(self._view, lender, window, pose_frame)
 
-    def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Ints:
+    def _fixes(self, session: Session, odometry: str, frames: FrameTree, detected: Ints) -> Sights:
         """Returns where odometry was in the map around detections, where that changes."""
         first, last = int(detected.min()), int(detected.max()) + _AHEAD_NS
         step = max(1, (last - first) // (_MOST_FIXES * _FIX_NS)) * _FIX_NS

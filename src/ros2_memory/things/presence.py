@@ -1,19 +1,19 @@
 """When a label was at a place: from what was seen there, and from what was not seen.
 
 What was seen is known by slice (`analysis.sights`): 10 s of the clock.
-A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees, from which the place was
-seen at least once. How often a message from a cell has the label, while it is there, is its rate. A
-look from such a cell without a hit is evidence of absence, as strong as the rate makes it; a hit is
-evidence of presence, as strong as false detections are rare. A message that has the label somewhere
-unknown is neither. The likeliest sequence of being there and not being there (Viterbi, two states)
-gives the stays.
+A *cell* is a pose of the robot and its detector, to 25 cm and 10 degrees around where it often is,
+from which the place was seen at least once. How often a message from a cell has the label, while it
+is there, is its rate. A look from such a cell without a hit is evidence of absence, as strong as
+the rate makes it; a hit is evidence of presence, as strong as false detections are rare. A message
+that has the label somewhere unknown is neither. The likeliest sequence of being there and not being
+there (Viterbi, two states) gives the stays.
 """
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_left
-from itertools import groupby, pairwise
+from itertools import groupby, pairwise, product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -66,6 +66,8 @@ _LEAST_RATE: Final = 0.1
 _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 """A cell with so many looks is blocked if its share of hits is below this part of the others'."""
+_YAWS: Final = 3600 // CELL_DECIDEG
+_PRIME: Final = 1_000_003
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
 
@@ -89,16 +91,16 @@ class Cells:
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
         self.yaw, self.pan = looks[:, Look.YAW] / 10.0, looks[:, Look.PAN] / 10.0
-        _, self.cell = distinct_rows(
-            (
-                self.topic + poor * (len(sights.topics) + 1),
-                epoch[self.slice],
-                looks[:, Look.X] // CELL_MM,
-                looks[:, Look.Y] // CELL_MM,
-                looks[:, Look.YAW] // CELL_DECIDEG,
-                looks[:, Look.PAN],
-            )
+        columns = (
+            looks[:, Look.YAW] // CELL_DECIDEG,
+            looks[:, Look.X] // CELL_MM,
+            looks[:, Look.Y] // CELL_MM,
+            self.topic + poor * (len(sights.topics) + 1),
+            epoch[self.slice],
+            looks[:, Look.PAN],
         )
+        cells, cell = distinct_rows(columns)
+        self.cell = _joined(cells, cell, np.stack((self.x, self.y, self.yaw)), self.n)[cell]
         order = np.argsort(self.cell, kind="stable")
         self._by_cell = order
         self.looks_in = np.bincount(self.cell)
@@ -163,6 +165,46 @@ class Cells:
         ahead = self.yaw[looks] + self.pan[looks]
         bearing = (np.degrees(np.arctan2(dy, dx)) - ahead + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
+
+
+def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
+    """Returns for each cell of a grid the one that it is part of: the heaviest near it, or itself.
+
+    A robot that often stands at one pose, and so at the border of several, looks from one cell.
+
+    Args:
+        cells: yaw, x and y in the grid, and what else tells cells apart.
+        cell: of each look.
+        poses: x, y (mm) and yaw (degrees) of each look.
+        n: the messages of each look.
+    """
+    weight = np.bincount(cell, n)
+    x, y, yaw = (np.bincount(cell, n * axis) / weight for axis in poses)
+    rank = np.argsort(np.argsort(weight, kind="stable"), kind="stable")
+    keys, best = _hashed(cells), rank
+    order = np.argsort(keys, kind="stable")
+    ordered = keys[order]
+    for step in product((-1, 0, 1), repeat=3):
+        beside = cells.copy()
+        beside[:, :3] += step
+        beside[:, 0] %= _YAWS
+        wanted = _hashed(beside)
+        other = order[np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)]
+        turn = np.abs((yaw[other] - yaw + 180.0) % 360.0 - 180.0)
+        near = (keys[other] == wanted) & (turn <= CELL_DECIDEG / 10) & (cells[:, 0] >= 0)
+        near &= np.hypot(x[other] - x, y[other] - y) <= CELL_MM
+        best = np.where(near, np.maximum(best, rank[other]), best)
+    leader = np.argsort(rank, kind="stable")[best]
+    joined: Ints = np.where(leader[leader] == leader, leader, np.arange(len(cells)))
+    return joined
+
+
+def _hashed(rows: Ints) -> Ints:
+    """Returns a number for each row; of different ones, hardly ever the same."""
+    numbers = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        numbers = numbers * _PRIME + column
+    return numbers
 
 
 class FieldOfView(NamedTuple):

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
-VERSION: Final = 3
+VERSION: Final = 4
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
@@ -62,9 +62,10 @@ _NO_DETECTIONS: Final = frozenset(
         "stereo_msgs",
         "tf2_msgs",
         "trajectory_msgs",
+        "vision_msgs/msg/LabelInfo",
     }
 )
-"""Packages whose messages hold no detections, so that nothing is looked for in them."""
+"""Packages and types whose messages hold no detections, so that nothing is looked for in them."""
 _TEXT: Final = "std_msgs/msg/String"
 
 
@@ -145,7 +146,8 @@ class _Surroundings(NamedTuple):
 
 def may_have_detections(type_name: str) -> bool:
     """Returns whether messages of a type may hold detections, as far as its name tells."""
-    return type_name == _TEXT or type_name.partition("/")[0] not in _NO_DETECTIONS
+    names = {type_name, type_name.partition("/")[0]}
+    return type_name == _TEXT or _NO_DETECTIONS.isdisjoint(names)
 
 
 class Watching:

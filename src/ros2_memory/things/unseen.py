@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
+from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
+from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.errors import NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import (
+    LABELS,
     Reason,
     abbreviate,
     counted,
@@ -116,8 +118,9 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
         )
     if not sights.topics and known.since is None and not asked.undecoded:
         yield (
-            "no things are known: there is no message of a detector "
-            "(a type such as vision_msgs/msg/Detection3DArray); find_matches searches text"
+            "no things are known: no message has a detection, which is an object with one of the "
+            f"fields {', '.join(LABELS)}, as in vision_msgs/msg/Detection3DArray; find_matches "
+            "searches text"
         )
     yield from vague_notes(known, (asked.window,), asked.labels, asked.vague)
     if not asked.labels:
@@ -160,6 +163,7 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
 
     And those of which there were too many at once to tell them apart.
     """
+    yield from _labels_left_out(known)
     for window in windows:
         labels = [_detected(known, key, window) for key in sorted(known.estimate.names)]
         unplaced = [
@@ -180,6 +184,19 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
                 f"detected, but could not be placed: {listed(unplaced, at_most=_MOST_NAMED)}",
                 [label.name for label in labels],
             )
+
+
+def _labels_left_out(known: KnownThings) -> list[str]:
+    """Returns a note where some slice has more labels than are looked at; none where none has."""
+    sights = known.estimate.sights
+    if len(sights.labels) <= MAX_LABELS:
+        return []
+    # A slice, a topic and a label are the first columns of both.
+    labels, _ = distinct_rows([*np.concatenate((sights.spots[:, :3], sights.unplaced[:, :3])).T])
+    _, slice_of = distinct_rows([*labels[:, :2].T])
+    if np.bincount(slice_of).max() <= MAX_LABELS:
+        return []
+    return [f"of more than {MAX_LABELS} labels in 10 s, the others are left out"]
 
 
 def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
@@ -242,7 +259,7 @@ def _too_low(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
 def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
     """Yields notes on a label that was asked for."""
     if key not in known.estimate.names:
-        yield from _never_reported(known, key, asked.labels[key])
+        yield from _labels_left_out(known) or _never_reported(known, key, asked.labels[key])
         return
     detected = _detected(known, key, asked.window)
     if unplaced := detected.unplaced:

@@ -84,11 +84,11 @@ _THINGS = ToolDeclaration(
 )
 _COMPARE = ToolDeclaration(
     (ToolName("compare", "Differences"),),
-    "Between two windows: things that moved, appeared, or were not seen again; "
+    "Between two windows: things moved, appeared, not seen again; "
     "path, standstills, minutes in places, errors, silences. Things go from the earlier "
-    "to the later. Within a tenth counts as equal. Reply: "
+    "to the later. Within a tenth is equal. Reply: "
     "{{things: {{moved: [{{label, was, is}}], appeared, not_seen_where_expected, not_looked_at, "
-    "movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
+    "more_or_fewer, movers}}, way: {{name: {{this, with}}}}, stood_at: [{{x, y, in, this, with}}], "
     "farthest_apart, minutes, errors, silent_s}}.",
     CompareArguments,
     compare,

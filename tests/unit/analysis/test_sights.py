@@ -174,7 +174,7 @@ def test_sights_cut_between_slices_are_those_of_the_whole(
 def test_fixes_are_kept_where_no_detector_published() -> None:
     poses, sigma = np.array([[1.0, -2.0, math.pi / 2]]), np.array([0.25])
     alone = fixes_of(np.array([13 * SECOND]), poses, sigma)
-    both, _ = joined_of([sights_of([mug(1.0)]), no_sights().with_fixes(alone)])
+    both, _ = joined_of([sights_of([mug(1.0)]), alone])
     assert both.fixes.tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
     assert both.fixes[0, Fix.SIGMA] == 250
     assert both.slices == 2

@@ -76,6 +76,10 @@ UNMAPPED: Final = {
         "Nested[] nested\nAxis[] axes\nSeen seen\nstd_msgs/Empty empty\nstring class\n"
     ),
     "own_msgs/msg/Label": "string label\nfloat32 score\nfloat64 x\nfloat64 y\n",
+    "own_msgs/msg/Posed": (
+        "int32 class_id\nstring id\nfloat32 score\ngeometry_msgs/PoseStamped pose\n"
+    ),
+    "own_msgs/msg/PosedArray": "std_msgs/Header header\nPosed[] objects\n",
 }
 MAPPED: Final = (
     "nav_msgs/msg/Odometry",
@@ -106,6 +110,7 @@ OTHERS: Final = (
     "own_msgs/msg/Everything",
     "own_msgs/msg/Nested",
     "own_msgs/msg/Label",
+    "own_msgs/msg/PosedArray",
     "sensor_msgs/msg/MagneticField",
     "nav_msgs/msg/OccupancyGrid",
     "visualization_msgs/msg/MarkerArray",

@@ -29,6 +29,7 @@ SETTLED = (
     "ros2_vision_interfaces/msg/VisionDetectionArray",
     "ros2_vision_interfaces/msg/StampedString",
     "own_msgs/msg/Label",
+    "own_msgs/msg/PosedArray",
 )
 
 

@@ -62,6 +62,56 @@ def test_the_centre_of_a_box_in_an_image_is_no_place() -> None:
     assert detections_of(value) == (Detection("cup", score=0.7),)
 
 
+AT: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}
+
+
+@pytest.mark.parametrize(
+    ("value", "label", "frame"),
+    [
+        pytest.param(
+            {"results": [{"id": "cup", "score": 0.5, "pose": {"pose": AT}}]},
+            *("cup", "camera"),
+            id="vision_msgs 2",
+        ),
+        pytest.param(
+            {
+                "class_id": 41,
+                "class_name": "cup",
+                "score": 0.5,
+                "id": "3",
+                "bbox3d": {"center": AT, "frame_id": "base_link"},
+            },
+            *("cup", "base_link"),
+            id="yolo_msgs",
+        ),
+        pytest.param(
+            {"class_id": 41, "score": 0.5, "pose": AT}, "41", "camera", id="a number alone"
+        ),
+        pytest.param(
+            {"id": 7, "confidence": 0.5, "pose": {"pose": AT}}, "7", "camera", id="aruco_msgs"
+        ),
+        pytest.param(
+            {"label": "cup", "score": 0.5, "pose": {"header": {"frame_id": "map"}, "pose": AT}},
+            *("cup", "map"),
+            id="a stamped pose",
+        ),
+        pytest.param(
+            {"name": "cup", "class": 41, "confidence": 0.5, "pose": {"x": 1, "y": 2, "z": 3}},
+            *("cup", "camera"),
+            id="JSON of ultralytics",
+        ),
+    ],
+)
+def test_detections_are_named_and_placed_as_common_packages_do(
+    value: JsonValue, label: str, frame: str
+) -> None:
+    expected = Detection(label, (1.0, 2.0, 3.0), frame, 0.5)
+    assert detections_of({"detections": [value]}, "camera") == (expected,)
+    wrapped = {"payload": {"frame_id": "camera", "detections": [value]}}
+    assert detections_of({"data": json.dumps(wrapped)}) == (expected,)
+    assert detections_of(without_low_scores({"detections": [value]}, 0.6)) == ()
+
+
 def test_a_point_that_nobody_filled_in_is_no_place() -> None:
     value: JsonValue = [{"label": "cup", "point": {"x": 0.0, "y": 0.0, "z": 0.0}}]
     assert detections_of(value) == (Detection("cup"),)
@@ -183,6 +233,8 @@ def test_what_is_left_are_the_detections_that_do_not_score_less(
         {"value": "I see a cup."},
         {"value": "[not json"},
         {"status": [{"level": 0, "name": "lidar", "message": "fine"}]},
+        {"intent": {"name": "fetch", "confidence": 0.9}},
+        {"markers": [{"ns": "path", "id": 7, "pose": {"position": {"x": 1, "y": 2, "z": 3}}}]},
         {"x": 1.0, "y": 2.0},
         True,
         None,

@@ -71,6 +71,18 @@ def test_a_thing_that_moved_is_listed_with_both_places(tmp_path: Path) -> None:
     assert reply["duration_s"] == {"this": 29.0, "with": 29.0}
 
 
+def test_things_that_stand_together_are_compared_by_their_number(tmp_path: Path) -> None:
+    cups = [("cup", 3.0, nth * 0.25) for nth in range(3)]
+    reply = compared(
+        tmp_path / "two", [*looked(0, 30, HERE, *cups), *looked(60, 90, HERE, *cups[1:])]
+    )
+    [fewer] = reply["things"]["more_or_fewer"]
+    assert (fewer["was"]["at_once"], fewer["is"]["at_once"]) == (3, 2)
+    assert (labels(reply), reply["things_unchanged"]) == ({"more_or_fewer": ["cup"]}, 0)
+    same = compared(tmp_path / "same", [*looked(0, 30, HERE, *cups), *looked(60, 90, HERE, *cups)])
+    assert (same["things"], same["things_unchanged"]) == ({}, 1)
+
+
 def test_nothing_differs_between_equal_times(tmp_path: Path) -> None:
     reply = compared(tmp_path, looked(0, 90, HERE, MUG))
     assert reply["things"] == {}

@@ -28,7 +28,7 @@ from tests.support.bags import (
     write_splits,
 )
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, replied
+from tests.support.memories import asked, each_way, memory_of, replied
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -135,8 +135,24 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
     write_splits(tmp_path, [each for each in looked(0, 3, HERE) if "vision" not in each.topic])
     reply = ask(tmp_path)
     assert (reply["things"], len(reply["notes"])) == ([], 1)
-    assert "there is no message of a detector" in reply["notes"][0]
+    assert "no message has a detection" in reply["notes"][0]
     assert ask(tmp_path, label="cup")["notes"] == reply["notes"]
+
+
+@each_way
+def test_of_detections_without_a_label_it_is_said_that_none_is_known(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    kind = "apriltag_msgs/msg/AprilTagDetection"
+    tag = make(kind, family="36h11", id=7, decision_margin=40.0)
+    messages = [each for each in looked(0, 3, HERE) if "vision" not in each.topic]
+    for at in (BEGIN * S, (BEGIN + 1) * S):
+        body = make(f"{kind}Array", header=header(at, "base_link"), detections=[tag])
+        messages.append(Msg("/tags", f"{kind}Array", at, body))
+    write_splits(tmp_path, messages)
+    reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
+    [note] = reply["notes"]
+    assert "no message has a detection" in note
 
 
 def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
@@ -248,6 +264,44 @@ def test_all_chairs_of_a_hall_are_counted_or_it_is_said_that_some_are_not(
     assert sum("of more than 128 at once" in each for each in reply.get("notes", ())) == notes
 
 
+def test_of_too_many_labels_at_once_it_is_said_that_some_are_left_out(tmp_path: Path) -> None:
+    wall = [(f"tag {nth:03}", 3.0 + nth % 30 / 10, nth // 30 / 10) for nth in range(514)]
+    write_splits(tmp_path / "513", looked(0, 3, HERE, *wall[1:]))
+    left_out = "of more than 512 labels in 10 s, the others are left out"
+    assert left_out in ask(tmp_path / "513")["notes"]
+    write_splits(tmp_path / "512", looked(0, 3, HERE, *wall[2:]))
+    assert left_out not in ask(tmp_path / "512")["notes"]
+    write_splits(tmp_path / "514", looked(0, 3, HERE, *wall))
+    # Nothing is said never to have been detected.
+    assert ask(tmp_path / "514", label="tag 513")["notes"] == [left_out]
+
+
+def test_long_labels_are_told_apart_by_all_that_is_looked_at(tmp_path: Path) -> None:
+    said = "the one on the small round table in front of the kitchen's window, beside the " * 3
+    seen = [(said + "mug", 3.0, 0.5), (said + "plate", 3.0, -1.0), ("x" * 300, 4.0, 0.0)]
+    write_splits(tmp_path, looked(0, 3, HERE, *seen))
+    for label, x, y in seen:
+        [thing] = ask(tmp_path, label=label)["things"]
+        assert (thing["place"]["x"], thing["place"]["y"]) == (x, y)
+    assert thing["label"] == "x" * 255 + "…"
+
+
+@pytest.mark.parametrize("middle", [(0.0, 0.0), (500_000.0, 5_300_000.0), (-4e6, -9.9e6)])
+def test_things_are_told_alike_however_far_the_origin_of_the_map_is(
+    tmp_path: Path, middle: tuple[float, float]
+) -> None:
+    """As in UTM, whose origin is on the equator."""
+    x, y = middle
+    here, mug, moved = (x + 1.0, y, 0.0), ("mug", x + 3.0, y + 0.5), ("mug", x + 3.0, y - 0.8)
+    write_splits(
+        tmp_path,
+        [*looked(0, 60, here, mug, in_map=False), *looked(60, 120, here, moved, in_map=False)],
+    )
+    [thing] = ask(tmp_path)["things"]
+    assert thing["place"] == {"x": x + 3.0, "y": y - 0.8, "z": 0.7}
+    assert (thing["count"], thing["moved_times"], thing["spread_m"]) == (120, 1, 0.0)
+
+
 def test_chairs_side_by_side_are_counted_where_messages_have_both(tmp_path: Path) -> None:
     beside, one = ("chair", 3.0, 0.4), ("chair", 3.0, 0.0)
     write_splits(tmp_path / "two", looked(0, 30, HERE, one, beside))
@@ -340,6 +394,20 @@ def test_a_thing_is_said_to_be_missed_only_after_looks_from_where_it_was_seen(
     [thing] = ask(tmp_path / "missed", label="mug")["things"]
     # Two looks in ten seconds of the clock, which count as a whole.
     assert thing["still_there"] == {"not_seen_where_expected": BEGIN + 29, "looks": 40}
+
+
+@pytest.mark.parametrize("beside_m", [0.0, 0.02, 0.6])
+def test_a_place_is_looked_at_from_where_it_was_seen_however_poses_are_divided(
+    tmp_path: Path, beside_m: float
+) -> None:
+    """The robot stands where four cells of poses meet: what it is off by is another cell."""
+    before, after = (0.99, -0.01, -0.02), (0.99 + beside_m, -0.01 + beside_m, -0.02 + beside_m)
+    stay = [("book", 4.0, 1.5), ("vase", 4.0, -1.0)]
+    seen = looked(0, 20, before, ("mug", 3.0, 0.5), *stay)
+    write_splits(tmp_path, [*seen, *looked(20, 50, after, *stay)])
+    [mug] = ask(tmp_path, label="mug")["things"]
+    state = "not_looked_at_since" if beside_m > 0.5 else "not_seen_where_expected"
+    assert state in mug["still_there"]
 
 
 def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:
