@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 _FORMAT: Final = 1
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 31
+ROWS_VERSION: Final = 32
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")

@@ -75,10 +75,11 @@ _TOTALS: Final = """
     FROM messages NOT INDEXED GROUP BY topic, impossible
 """
 _PAUSES: Final = """
-    SELECT before, timestamp FROM (
-        SELECT timestamp, lag(timestamp) OVER (ORDER BY timestamp) AS before
+    SELECT before, timestamp, number - 1 FROM (
+        SELECT timestamp, lag(timestamp) OVER ordered AS before, row_number() OVER ordered AS number
         FROM messages NOT INDEXED
         WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
+        WINDOW ordered AS (ORDER BY timestamp)
     ) WHERE timestamp - before > ?
 """
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
@@ -183,7 +184,7 @@ class SqliteBags:
         if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
-        return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
+        return summarize_channels(totals, declared, notes=tuple(notes), pauses=pauses)
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""

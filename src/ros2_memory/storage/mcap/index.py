@@ -20,7 +20,7 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.bag_summary import MESSAGES_MISSING, OUT_OF_ORDER_NS, WRONG_STATISTICS
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, CountedPause, pauses_among
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
@@ -229,7 +229,7 @@ class McapIndex(NamedTuple):
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: Ns = 0
-    pauses: Pauses = ()
+    pauses: Sequence[CountedPause] = ()
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
@@ -268,7 +268,7 @@ class Contents:
     def __init__(self) -> None:
         self.totals: dict[int, Extent] = {}
         self.back: Ns = 0  # as `set_back` of `McapIndex`, however little
-        self._held: list[tuple[IntArray, IntArray]] = []
+        self._held: list[tuple[IntArray, IntArray, IntArray]] = []
 
     def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
         """Adds all messages of chunks, which follow those before in the file.
@@ -281,8 +281,10 @@ class Contents:
         ends = np.maximum.reduceat(pairs.times, parts)
         # Of a short chunk its bounds will do.
         is_long = ends - starts > SHORTEST_PAUSE_NS
-        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=pairs.times.size))]
-        self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
+        counts = np.diff(parts, append=pairs.times.size)
+        inside = pairs.times[np.repeat(is_long, counts)]
+        self._held.append((starts[~is_long], ends[~is_long], counts[~is_long]))
+        self._held.append((inside, inside, np.ones_like(inside)))
         order = np.argsort(pairs.channels, kind="stable")
         numbers, times = pairs.channels[order], pairs.times[order]
         parts = _begins_of_groups(numbers, pairs.chunks[order])
@@ -315,10 +317,10 @@ class Contents:
             total.last = max(total.last, extent.last)
 
     @property
-    def pauses(self) -> Pauses:
+    def pauses(self) -> Sequence[CountedPause]:
         """As `pauses` of `McapIndex`."""
-        firsts, lasts = zip(*self._held, strict=True) if self._held else ([_NONE], [_NONE])
-        return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
+        held = self._held or [(_NONE, _NONE, _NONE)]
+        return pauses_among(*map(np.concatenate, zip(*held, strict=True)))
 
 
 def _begins_of_groups(*columns: IntArray) -> IntArray:
