@@ -79,6 +79,12 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     assert status["doubts"] == "the clock was set back between recordings (see notes)"
     (note,) = [note for note in status["notes"] if "one recorder made them" in note]
     assert ", ".join(sorted(names)) in note
+    path = asked(memory, tmp_path, "trajectory_summary", start=0, end=2 * T0 / NS_PER_S)
+    assert path["distance_m"] == pytest.approx(6.0, abs=0.1)
+    assert "as after a clock was set back" in str(path["notes"])
+    visited = asked(memory, tmp_path, "visits", x=0.0, y=3.0, radius_m=1.0)
+    assert (visited["total"], visited.get("unknown_s", 0)) == (1, 0)
+    assert "as after a clock was set back" in str(visited["notes"])
     # A copy that nobody listed may be of another robot.
     for name in names:
         (tmp_path / name).rename(tmp_path / f"{name}_copy")
