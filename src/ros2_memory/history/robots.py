@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, has_own_name, is_kept_apart
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -314,7 +315,7 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
         )
         view.notes.add(
             f"{name} has the time from {start} to {stop} twice, as the clock was set back "
-            "meanwhile: the path there is that from before"
+            "meanwhile: the path there is that of files from before"
             if pair.first == pair.other
             else f"{name} and {pair.other.name} have different messages on {topic} from {start} to "
             f"{stop}, as {_BY_CLOCK}: the path there is that of {name}"
@@ -436,22 +437,28 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
-    """Yields recordings in which the clock was set back, with the bags from after that."""
+    """Yields recordings in which the clock was set back, with the bags from after that.
+
+    Of a bag in which that happened it is not known which messages are from before, and when that
+    was to the period of its fastest topic.
+    """
     for fault in view.snapshot.dating.faults:
-        after = split_of(fault.bag.file)
-        if fault.kind is not FaultyClock.SET_BACK or fault.before is None or after is None:
+        if fault.kind is not FaultyClock.SET_BACK:
             continue
-        series, number = after
-        twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        begins, bags = [twice.stop], set[str]()
+        twice = TimeWindow(fault.at, fault.at + fault.by + 1)
+        if fault.before is None:
+            twice = twice.widened(OUT_OF_ORDER_NS)
+        series, number = split_of(fault.bag.file) or (None, 0)
+        begins = [twice.start if fault.before is None else twice.stop]
+        bags = {fault.bag.file}
         for bag in view.timeline.overlapping(twice):
-            bag_series, bag_number = split_of(bag.file) or (None, 0)
+            bag_series, bag_number = split_of(bag.file) or ("", 0)
             if bag_series == series and bag_number < number:
                 begins.append(bag.start)
             elif bag_series == series:
                 bags.add(bag.file)
         span = TimeWindow(max(min(begins), twice.start), twice.stop)
-        if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
+        if span.start < span.stop and window.overlaps(span.start, span.stop - 1):
             recording = fault.bag.recording
             yield ParallelRecordings(
                 recording, recording, span, by_clock=True, bags=frozenset(bags)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.pauses import noteworthy
 from ros2_memory.core.text import counted
@@ -546,7 +546,7 @@ def summarize_channels(
     *,
     complete: bool = True,
     notes: tuple[str, ...] = (),
-    set_back: Ns = 0,
+    set_back: tuple[Ns, Ns] = (0, 0),
     pauses: Sequence[CountedPause] = (),
 ) -> BagSummary:
     """Returns the summary of a file; channels of one topic and type count as one."""
@@ -568,7 +568,7 @@ def summarize_channels(
         tuple(sorted(silent)),
         complete,
         notes,
-        set_back=set_back,
+        set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
         pauses=noteworthy(pauses, numbers[::3], length),
     )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.bag_summary import MESSAGES_MISSING, OUT_OF_ORDER_NS, WRONG_STATISTICS
+from ros2_memory.core.bag_summary import MESSAGES_MISSING, WRONG_STATISTICS
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, CountedPause, pauses_among
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.storage.cache import unshared_bytes
@@ -212,8 +212,8 @@ class McapIndex(NamedTuple):
         loose: the messages outside chunks, by channel; their places are offsets in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
-        set_back: by how much the log times of a channel go back from one chunk, or one loose
-            message, to a later one, at most; 0 up to `OUT_OF_ORDER_NS`.
+        set_back: by how much the log times of a channel go back at most, from one chunk to a later
+            one or from one message to the next, and the first one after that.
         pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
         seams: where the times of chunks do not go on from one to the next; empty after a scan.
         contradiction: how the indexes of the file contradict its messages, if that was found after
@@ -228,7 +228,7 @@ class McapIndex(NamedTuple):
     loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
-    set_back: Ns = 0
+    set_back: tuple[Ns, Ns] = (0, 0)
     pauses: Sequence[CountedPause] = ()
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
@@ -267,7 +267,7 @@ class Contents:
 
     def __init__(self) -> None:
         self.totals: dict[int, Extent] = {}
-        self.back: Ns = 0  # as `set_back` of `McapIndex`, however little
+        self.back: tuple[Ns, Ns] = (0, 0)  # as `set_back` of `McapIndex`
         self._held: list[tuple[IntArray, IntArray, IntArray]] = []
 
     def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
@@ -288,6 +288,10 @@ class Contents:
         order = np.argsort(pairs.channels, kind="stable")
         numbers, times = pairs.channels[order], pairs.times[order]
         parts = _begins_of_groups(numbers, pairs.chunks[order])
+        back = -np.diff(times, prepend=times[:1])
+        back[parts] = 0
+        most = int(back.argmax())
+        self.back = max(self.back, (int(back[most]), int(times[most])))
         rows = zip(
             numbers[parts].tolist(),
             np.diff(parts, append=numbers.size).tolist(),
@@ -298,7 +302,7 @@ class Contents:
         for number, count, first, last in rows:
             total = self.totals.get(number)
             if total is not None:
-                self.back = max(self.back, total.last - first)
+                self.back = max(self.back, (total.last - first, first))
             self._count(number, Extent(count, first, last))
         return starts, ends
 
@@ -350,11 +354,6 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
 
 
-def beyond_disorder(back: Ns) -> Ns:
-    """Returns `back`; 0 if messages are merely out of order."""
-    return back if back > OUT_OF_ORDER_NS else 0
-
-
 def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     """Returns the decompressed records of a chunk; see `decompressed_chunk`.
 
@@ -395,7 +394,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     return index._replace(
         totals=contents.totals,
         notes=disagreements(stated, contents.totals),
-        set_back=beyond_disorder(contents.back),
+        set_back=contents.back,
         pauses=contents.pauses,
         seams=_seams(index.chunks),
     )
