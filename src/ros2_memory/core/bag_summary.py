@@ -13,7 +13,7 @@ import sys
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple, Self
+from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
 
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
     IntArray = NDArray[np.int64]
 
+SetBack: TypeAlias = "tuple[Ns, Ns] | None"
+"""By how much log times go back, and the first one after that; None where they do not."""
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
 
@@ -76,13 +78,16 @@ class SummarySchema:
     silent: tuple[str, ...] = ()
     complete: bool = True
     notes: tuple[str, ...] = ()
-    set_back: Ns = 0
+    set_back: SetBack = None
     pauses: Pauses = ()
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
         """The notes, and a sentence on a clock that was set back."""
-        return (*self.notes, set_back_while_written(self.set_back)) if self.set_back else self.notes
+        if self.set_back is None:
+            return self.notes
+        by, _ = self.set_back
+        return (*self.notes, set_back_while_written(by))
 
     @cached_property
     def positions(self) -> dict[str, tuple[int, ...]]:
@@ -121,7 +126,7 @@ class SummarySchema:
             tuple(silent),
             bool(complete),
             tuple(notes),
-            set_back=int(set_back),
+            set_back=set_back and (int(set_back[0]), int(set_back[1])),
             pauses=tuple((int(start), int(end)) for start, end in pauses),
         )
 
@@ -172,7 +177,7 @@ def shared_schema(
     complete: bool,
     notes: tuple[str, ...],
     *,
-    set_back: Ns = 0,
+    set_back: SetBack = None,
     pauses: Pauses = (),
 ) -> SummarySchema:
     """Returns one schema for all bags that have it, with one copy of each name."""
@@ -195,8 +200,8 @@ class BagSummary:
         silent: the topics that are declared without a message.
         complete: False where the file ends early and only what was readable is counted.
         notes: sentences on what is wrong with the file.
-        set_back: by how much the log times of a topic go back in the order of writing, at most; 0
-            where they do so by less than a second.
+        set_back: where the log times of a topic go back most in the order of writing, if they do
+            so by a second.
         pauses: where no topic has a message for a while, though some usually have.
 
     Attributes:
@@ -215,7 +220,7 @@ class BagSummary:
         complete: bool = True,
         notes: tuple[str, ...] = (),
         *,
-        set_back: Ns = 0,
+        set_back: SetBack = None,
         pauses: Pauses = (),
     ) -> None:
         headers = (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -15,33 +15,59 @@ if TYPE_CHECKING:
 
 Pauses: TypeAlias = "tuple[tuple[Ns, Ns], ...]"
 """From the log time of the last message before each to that of the first after it, in order."""
+CountedPause: TypeAlias = "tuple[Ns, Ns, int]"
+"""A pause, and how many messages the bag has before it."""
 
 SHORTEST_PAUSE_NS: Final[Ns] = NS_PER_S // 2
 _PERIODS: Final = 1.5
 """Half of those of a gap: in a bag with long pauses the mean period is longer than the usual."""
+_CHAINED: Final = 3
+"""A pause among those of slow topics is one of them unless it is so many times as long."""
 _MOST: Final = 64
 """The longest pauses of a bag are stated."""
 
 
-def pauses_among(firsts: NDArray[np.int64], lasts: NDArray[np.int64]) -> Pauses:
-    """Returns the pauses between spans of log time (inclusive) in any order, without one inside."""
+def pauses_among(
+    firsts: NDArray[np.int64], lasts: NDArray[np.int64], counts: NDArray[np.int64]
+) -> list[CountedPause]:
+    """Returns the pauses between spans of log time (inclusive), in any order, of some messages."""
     order = np.argsort(firsts, kind="stable")
     begins, reach = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
     apart = begins - reach > SHORTEST_PAUSE_NS
-    return tuple(zip(reach[apart].tolist(), begins[apart].tolist(), strict=True))
+    columns = (reach, begins, np.cumsum(counts[order])[:-1])
+    return [*zip(*(column[apart].tolist() for column in columns), strict=True)]
 
 
-def noteworthy(pauses: Pauses, counts: Sequence[int], length: Ns) -> Pauses:
-    """Returns the pauses that may be more than what lies between messages of a slow topic.
+def noteworthy(pauses: Sequence[CountedPause], counts: Sequence[int], length: Ns) -> Pauses:
+    """Returns the pauses that may be more than what lies between messages of slow topics.
+
+    That is where frequent topics come back after each. While they are off and slow ones go on, one
+    pause follows the other, with some messages between them.
 
     Args:
-        pauses: of a bag.
+        pauses: of a bag, in order.
         counts: how many messages it has of each topic.
         length: from its first message to its last.
     """
     if not pauses:
         return ()
-    second = sorted(counts, reverse=True)[:2][-1]
-    longer = [(start, end) for start, end in pauses if end - start > _PERIODS * length / second]
+    slower = _PERIODS * length / sorted(counts, reverse=True)[:2][-1]
+    chains: list[list[CountedPause]] = []
+    since, sent_before = MIN_NS, 0
+    for start, end, sent in pauses:
+        if end - start > slower:
+            if sent - sent_before > max(len(counts), (start - since) / slower) or not chains:
+                chains.append([])
+            chains[-1].append((start, end, sent))
+            since, sent_before = end, sent
+    longer = [
+        (start, end) for chain in chains for start, end, _ in chain if end - start > _usual(chain)
+    ]
     longer.sort(key=lambda pause: pause[0] - pause[1])  # the longest first
     return tuple(sorted(longer[:_MOST]))
+
+
+def _usual(chain: Sequence[CountedPause]) -> Ns:
+    """Returns how long pauses of a chain may be; 0 for one that stands alone."""
+    lengths = sorted(end - start for start, end, _ in chain)
+    return _CHAINED * lengths[(len(chain) - 1) // 2] if len(chain) > 1 else 0

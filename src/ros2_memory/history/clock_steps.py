@@ -158,7 +158,7 @@ def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) ->
 def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
     """Returns the steps in a window, and others near it."""
     steps = [
-        ClockStep(fault.bag.start, -fault.by)
+        ClockStep(fault.at, -fault.by)
         for fault in view.snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]

@@ -8,12 +8,14 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
+from functools import partial
 from itertools import chain, combinations, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, has_own_name, is_kept_apart
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, QueryTimeoutError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -56,12 +58,15 @@ _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
+_MADE: Final[Key[frozenset[Path]]] = Key()
+"""Of a call: the recordings that this bag directory's recorder made, one after the other."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
 """Of a memory: the parent of each static frame of a recording that is closed."""
 SET_BACK: Final = "the clock was set back between recordings"
 """The begin of a sentence on recordings that one recorder made, and that overlap in time."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
+_BY_CLOCK: Final = "after a clock was set back, or from two robots"
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
 _DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
 """Of a memory: when it was last looked whether robots are mixed, and what was found."""
@@ -124,12 +129,15 @@ def are_of_one_recorder(memory: Memory, pair: Overlapping) -> bool:
 
     Then they overlap in time since the clock was set back.
     """
-    own = OwnRecordings(memory.index.bag_dir)
+    return _made_in(memory.index.bag_dir).issuperset((pair.first, pair.second))
+
+
+def _made_in(bag_dir: Path) -> frozenset[Path]:
+    """Returns the recordings that a bag directory's recorder made; none if that is not known."""
     try:
-        made = {*own.in_order()}
+        return frozenset(bag_dir / name for name in OwnRecordings(bag_dir).in_order())
     except OSError:
-        return False
-    return made.issuperset(map(own.name_of, (pair.first, pair.second)))
+        return frozenset()
 
 
 def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...]:
@@ -267,7 +275,7 @@ class ParallelRecordings(NamedTuple):
         span: when both hold the topic.
         by_clock: whether that is as where a clock was set back between two recordings: it is the
             end of the first and the begin of the other, and less than half of each; or no longer
-            than the clock was set back while one of them ran.
+            than the clock was set back while one of them ran; or one recorder made both.
     """
 
     first: Path
@@ -307,11 +315,10 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
         )
         view.notes.add(
             f"{name} has the time from {start} to {stop} twice, as the clock was set back "
-            "meanwhile: the path there is that from before"
+            "meanwhile: the path there is that of files from before"
             if pair.first == pair.other
             else f"{name} and {pair.other.name} have different messages on {topic} from {start} to "
-            f"{stop}, as after a clock was set back, or from two robots: the path there is that of "
-            f"{name}"
+            f"{stop}, as {_BY_CLOCK}: the path there is that of {name}"
         )
 
 
@@ -321,12 +328,13 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     Returns these times, without those that a clock made which was set back.
     """
     beside = parallel_recordings(view, topic, window)
-    names = _recording_names(beside)
-    if names:
-        view.notes.add(
-            f"{len(names)} recordings have different messages on {topic} at the same time, as "
-            f"from several robots, and the answer does not separate them: {listed(names)}"
-        )
+    for by_clock, why in ((False, "from several robots"), (True, _BY_CLOCK)):
+        names = _recording_names([pair for pair in beside if pair.by_clock is by_clock])
+        if names:
+            view.notes.add(
+                f"{len(names)} recordings have different messages on {topic} at the same time, as "
+                f"{why}, and the answer does not separate them: {listed(names)}"
+            )
     return united((pair.span.start, pair.span.stop) for pair in beside if not pair.by_clock)
 
 
@@ -410,6 +418,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
+    made_here = partial(view.memo.of, _MADE, partial(_made_in, view.bag_dir))
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
@@ -422,27 +431,34 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
-                yield ParallelRecordings(other, path, span, is_edge or is_step)
+                by_clock = is_edge or is_step or made_here().issuperset((other, path))
+                yield ParallelRecordings(other, path, span, by_clock)
         open_spans.append((first, last, path))
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
-    """Yields recordings in which the clock was set back, with the bags from after that."""
+    """Yields recordings in which the clock was set back, with the bags from after that.
+
+    Of a bag in which that happened it is not known which messages are from before, and when that
+    was to the period of its fastest topic.
+    """
     for fault in view.snapshot.dating.faults:
-        after = split_of(fault.bag.file)
-        if fault.kind is not FaultyClock.SET_BACK or fault.before is None or after is None:
+        if fault.kind is not FaultyClock.SET_BACK:
             continue
-        series, number = after
-        twice = TimeWindow(fault.bag.start, fault.before.end + 1)
-        begins, bags = [twice.stop], set[str]()
+        twice = TimeWindow(fault.at, fault.at + fault.by + 1)
+        if fault.before is None:
+            twice = twice.widened(OUT_OF_ORDER_NS)
+        series, number = split_of(fault.bag.file) or (None, 0)
+        begins = [twice.start if fault.before is None else twice.stop]
+        bags = {fault.bag.file}
         for bag in view.timeline.overlapping(twice):
-            bag_series, bag_number = split_of(bag.file) or (None, 0)
+            bag_series, bag_number = split_of(bag.file) or ("", 0)
             if bag_series == series and bag_number < number:
                 begins.append(bag.start)
             elif bag_series == series:
                 bags.add(bag.file)
         span = TimeWindow(max(min(begins), twice.start), twice.stop)
-        if span.start < span.stop and window.overlaps(span.start, span.stop - 1) and bags:
+        if span.start < span.stop and window.overlaps(span.start, span.stop - 1):
             recording = fault.bag.recording
             yield ParallelRecordings(
                 recording, recording, span, by_clock=True, bags=frozenset(bags)

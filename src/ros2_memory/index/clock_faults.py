@@ -61,6 +61,12 @@ class ClockFault(NamedTuple):
     misleads: bool = True
 
     @property
+    def at(self) -> Ns:
+        """The first log time after the clock was set back; of other faults that of the bag."""
+        set_back = self.bag.summary.schema.set_back if self.before is None else None
+        return self.bag.start if set_back is None else set_back[1]
+
+    @property
     def reason(self) -> str:
         """What is wrong, as a sentence, and what follows from it."""
         left_out = "; left out of earliest and latest" if self.misleads else ""

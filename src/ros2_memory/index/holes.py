@@ -8,6 +8,7 @@ recording to the next, in which the recorder ran on, twice the longer one, or 20
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.silences import Presence, usual_period
@@ -19,7 +20,6 @@ from ros2_memory.index.split_order import split_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile
 
 SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
@@ -86,7 +86,6 @@ class Rhythm:
             for topic, presence in presences.items()
             if (period := usual_period(presence)) is not None
         }
-        self._by_schema: dict[int, list[Ns]] = {}
 
     def gaps(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses that are gaps."""
@@ -94,13 +93,7 @@ class Rhythm:
 
     def suspects(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses of running recorders that may be steps of the clock."""
-        return [
-            pause
-            for pause in pauses
-            if pause.ran_on
-            and all(map(self._periods_of, pause.bags))
-            and pause.length > _GAP_PERIODS * self._slower(pause)
-        ]
+        return [pause for pause in pauses if pause.ran_on and self._is_longer(pause, topics=1)]
 
     @property
     def shortest_gap(self) -> Ns:
@@ -111,10 +104,7 @@ class Rhythm:
         if any(is_thinned(bag.file) for bag in pause.bags):
             # There each topic has a message in every slot of 7 s, or as often as it had.
             return pause.length > _LONGEST_LEAST_NS
-        # In the split after a stall one topic may still be silent.
-        enough = any if pause.ran_on else all
-        have_two_topics = enough(len(self._periods_of(bag)) > 1 for bag in pause.bags)
-        if have_two_topics and pause.length > _GAP_PERIODS * self._slower(pause):
+        if self._is_longer(pause, topics=2):
             return True
         if len(pause.bags) == 1:
             return False
@@ -122,14 +112,32 @@ class Rhythm:
         least = min(_GAP_SPLITS * longer, _LONGEST_LEAST_NS) if pause.ran_on else 0
         return pause.length > max(least, self.shortest_gap)
 
-    def _slower(self, pause: Pause) -> Ns:
-        """Returns the period of the second most frequent topic, or of the only one, in the bags."""
-        return max(periods[-1] for periods in map(self._periods_of, pause.bags) if periods)
+    def _is_longer(self, pause: Pause, topics: int) -> bool:
+        """Returns whether a pause is longer than its bags explain, by so many topics at least.
 
-    def _periods_of(self, bag: BagFile) -> list[Ns]:
-        """Returns the shortest two usual periods of topics in a bag, as far as it has them."""
-        schema: SummarySchema = bag.summary.schema
-        if id(schema) not in self._by_schema:
-            topics = self._periods.keys() & schema.positions
-            self._by_schema[id(schema)] = sorted(self._periods[topic] for topic in topics)[:2]
-        return self._by_schema[id(schema)]
+        What explains it is how often the second most frequent of the topics has a message that are
+        heard up to it or from it on; and the most frequent on either side alone, as others may have
+        fallen silent, or have been so, for longer.
+        """
+        summaries = [bag.summary for bag in pause.bags]
+        usual = self._periods.keys() & chain.from_iterable(
+            summary.schema.positions for summary in summaries
+        )
+        sides, heard, explained = {pause.start, pause.end}, 0, 0
+        for topic in sorted(usual, key=self._periods.__getitem__):
+            limit = _GAP_PERIODS * self._periods[topic]
+            spans = [
+                summary.span_of((topic,))
+                for summary in summaries
+                if topic in summary.schema.positions
+            ]
+            beside = {
+                at
+                for at in (pause.start, pause.end)
+                if any(first - limit <= at <= last + limit for first, last in spans)
+            }
+            if beside:
+                sides, heard, explained = sides - beside, heard + 1, limit
+            if heard > 1 and not sides:
+                break
+        return heard >= topics and not sides and pause.length > explained

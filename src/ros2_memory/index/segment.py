@@ -21,7 +21,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.copied_files import Alike, alike_among
 from ros2_memory.index.holes import Pause, pauses_between, pauses_within
-from ros2_memory.index.split_order import Series, SplitRange, split_ranges_of
+from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -227,9 +227,13 @@ class Segment:
         )
 
     @cached_property
-    def set_back(self) -> tuple[BagFile, ...]:
-        """The bags in which log times go back."""
-        return tuple(bag for bag in self.bags if bag.summary.schema.set_back)
+    def set_back(self) -> tuple[StepBack, ...]:
+        """Where the clock was set back within a bag."""
+        return tuple(
+            StepBack(bag, bag, back[0])
+            for bag in self.bags
+            if (back := bag.summary.schema.set_back) is not None
+        )
 
     @cached_property
     def _schemas(self) -> tuple[SummarySchema, ...]:

@@ -27,7 +27,6 @@ from ros2_memory.index.holes import Pause, Rhythm, pauses_between
 from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.index.split_order import (
     Neighbours,
-    StepBack,
     is_recording,
     neighbours,
     split_of,
@@ -109,9 +108,8 @@ class Snapshot:
         """What the dates and the order of all bags show about the clocks that dated them."""
         recorded = self.timeline.recorded_segments
         within = chain.from_iterable(segment.set_back for segment in recorded)
-        steps = [StepBack(bag, bag, bag.summary.schema.set_back) for bag in within]
         between = steps_of(self.timeline.segments)
-        return check_dates(self.timeline, [*between, *steps], self.scanned_at)
+        return check_dates(self.timeline, [*between, *within], self.scanned_at)
 
     @cached_property
     def _dated_segments(self) -> Sequence[Segment]:

@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.pauses import Pauses, noteworthy
+from ros2_memory.core.pauses import noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.pauses import CountedPause
 
 T = TypeVar("T")
 IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
@@ -545,8 +546,8 @@ def summarize_channels(
     *,
     complete: bool = True,
     notes: tuple[str, ...] = (),
-    set_back: Ns = 0,
-    pauses: Pauses = (),
+    set_back: tuple[Ns, Ns] = (0, 0),
+    pauses: Sequence[CountedPause] = (),
 ) -> BagSummary:
     """Returns the summary of a file; channels of one topic and type count as one."""
     by_topic: dict[tuple[str, str], ChannelTotal] = {}
@@ -561,16 +562,14 @@ def summarize_channels(
     for (topic, type_name), (channel, *stated) in sorted(by_topic.items(), key=itemgetter(0)):
         headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
         numbers += stated
-    if pauses:
-        firsts, lasts = numbers[1::3], numbers[2::3]
-        pauses = noteworthy(pauses, numbers[::3], max(lasts, default=0) - min(firsts, default=0))
+    length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
     schema = shared_schema(
         tuple(headers),
         tuple(sorted(silent)),
         complete,
         notes,
-        set_back=set_back,
-        pauses=pauses,
+        set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
+        pauses=noteworthy(pauses, numbers[::3], length),
     )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 

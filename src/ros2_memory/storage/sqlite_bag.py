@@ -76,11 +76,19 @@ _TOTALS: Final = """
     FROM messages NOT INDEXED GROUP BY topic, impossible
 """
 _PAUSES: Final = """
-    SELECT before, timestamp FROM (
-        SELECT timestamp, lag(timestamp) OVER (ORDER BY timestamp) AS before
+    SELECT before, timestamp, number - 1 FROM (
+        SELECT timestamp, lag(timestamp) OVER ordered AS before, row_number() OVER ordered AS number
         FROM messages NOT INDEXED
         WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
+        WINDOW ordered AS (ORDER BY timestamp)
     ) WHERE timestamp - before > ?
+"""
+_SET_BACK: Final = """
+    SELECT max(before - timestamp, 0), timestamp FROM (
+        SELECT timestamp, lag(timestamp) OVER (PARTITION BY topic_id ORDER BY rowid) AS before
+        FROM messages NOT INDEXED
+        WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
+    ) WHERE before IS NOT NULL ORDER BY before - timestamp DESC LIMIT 1
 """
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
 _ASCENDING: Final = """
@@ -166,6 +174,7 @@ class SqliteBags:
             is_right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
+            set_back = base.execute(_SET_BACK, asked[:2]).fetchone() or (0, 0)
         if any(undecodable for *_, undecodable, _ in stored):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
@@ -184,7 +193,9 @@ class SqliteBags:
         if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         declared = topics.channels.values()
-        return summarize_channels(totals, declared, notes=tuple(notes), pauses=tuple(pauses))
+        return summarize_channels(
+            totals, declared, notes=tuple(notes), set_back=set_back, pauses=pauses
+        )
 
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the topics declared in the file."""

@@ -15,7 +15,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
-from tests.support.bags import Msg, odom, text, tf, transform, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -79,6 +79,12 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     assert status["doubts"] == "the clock was set back between recordings (see notes)"
     (note,) = [note for note in status["notes"] if "one recorder made them" in note]
     assert ", ".join(sorted(names)) in note
+    path = asked(memory, tmp_path, "trajectory_summary", start=0, end=2 * T0 / NS_PER_S)
+    assert path["distance_m"] == pytest.approx(6.0, abs=0.1)
+    assert "as after a clock was set back" in str(path["notes"])
+    visited = asked(memory, tmp_path, "visits", x=0.0, y=3.0, radius_m=1.0)
+    assert (visited["total"], visited.get("unknown_s", 0)) == (1, 0)
+    assert "as after a clock was set back" in str(visited["notes"])
     # A copy that nobody listed may be of another robot.
     for name in names:
         (tmp_path / name).rename(tmp_path / f"{name}_copy")
@@ -274,3 +280,30 @@ def test_a_frame_that_was_moved_within_one_deployment_is_not(tmp_path: Path) -> 
         at = T0 + number * 3600 * NS_PER_S
         write_mcap(tmp_path / name / f"{name}_0.mcap", [mounted(parent, at)])
     assert contradicting_frames(memory_of(tmp_path), Call()) == ()
+
+
+@pytest.mark.parametrize("kind", ["mcap", "small chunks", "db3"])
+def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path(
+    tmp_path: Path, kind: str
+) -> None:
+    """100 s at 0.5 m/s; after 50 s the clock is set back by 30 s."""
+    begin = T0 / NS_PER_S
+    poses = [odom(T0 + n * NS_PER_S // 10, n / 20, 0.0) for n in range(1000)]
+    logged = [
+        replace(pose, log_time=pose.log_time - 30 * NS_PER_S * (n >= 500))
+        for n, pose in enumerate(poses)
+    ]
+    if kind == "db3":
+        write_db3(tmp_path / "run" / "run_0.db3", logged)
+    else:
+        layout = McapLayout(chunk_size=1 << 14 if kind == "small chunks" else 1 << 20)
+        write_mcap(tmp_path / "run" / "run_0.mcap", logged, layout)
+    plain = memory_of(tmp_path, storage="sqlite3" if kind == "db3" else "mcap")
+    for memory in (plain, with_store(plain, tmp_path)):
+        (step,) = asked(memory, tmp_path, "data_time_range")["clock_steps"]
+        assert step["at"] == pytest.approx(begin + 20, abs=1)
+        assert step["step_s"] == pytest.approx(-29.9, abs=2)
+        path = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 70)
+        assert path["distance_m"] == pytest.approx(20.0, abs=1.2)
+        assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
+        assert any("run has the time from" in note for note in path["notes"])

@@ -56,7 +56,7 @@ def split_up(topics: Sequence[Times], split: float, length: float) -> list[BagFi
         every = np.concatenate([*held.values()])
         first, last = int(every.min()), int(every.max())
         counts = [times.size for times in held.values()]
-        found = noteworthy(pauses_among(every, every), counts, last - first)
+        found = noteworthy(pauses_among(every, every, np.ones_like(every)), counts, last - first)
         rows = [
             TopicSummary(f"/{nth}", "T", "cdr", times.size, int(times[0]), int(times[-1]))
             for nth, times in held.items()

@@ -36,7 +36,8 @@ def message(seconds: float) -> Msg:
 
 def set_back(path: Path, messages: list[Msg], layout: McapLayout) -> int:
     write_mcap(path, messages, layout)
-    return McapReader().summarize(path).schema.set_back
+    by, _ = McapReader().summarize(path).schema.set_back or (0, 0)
+    return by
 
 
 @pytest.fixture(params=list(LAYOUTS))
@@ -73,7 +74,7 @@ def test_it_is_listed_and_told_where_it_matters_and_changes_no_span(tmp_path: Pa
     write_mcap(tmp_path / "a.mcap", messages, LAYOUTS["indexed"])
     memory = memory_of(tmp_path)
     [fault] = data_time_range(memory, Call()).clock_faults
-    assert "set back by 28 s or more while it was being written" in fault.reason
+    assert "set back by 29 s or more while it was being written" in fault.reason
     assert data_time_range(memory, Call()).earliest == T0 - 10 * S
     result = topic_range(
         memory, Call(), messages[0].topic, TimeRange(start_s=T0 / S, end_s=T0 / S + 10)

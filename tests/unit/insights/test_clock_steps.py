@@ -243,7 +243,7 @@ def test_a_clock_that_was_set_back_is_listed_with_a_negative_step(tmp_path: Path
     assert reply["duration_s"] == 160.0
     [note, of_path] = [each for each in reply["notes"] if "set back" in each]
     assert note.startswith("the clock was set back by 29.9 s or more at ")
-    assert of_path.endswith("the path there is that from before")
+    assert of_path.endswith("the path there is that of files from before")
 
 
 WHEN = 54.95

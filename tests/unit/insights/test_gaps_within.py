@@ -93,6 +93,22 @@ def test_gaps_within_bags_are_listed_wherever_gaps_are(stalled: Memory) -> None:
     assert status["doubts"] == "while the recorder ran, nothing was recorded 2 times (3.71 s)"
 
 
+@pytest.mark.parametrize(("splits", "kind"), [(1, "mcap"), (4, "mcap"), (1, "db3")])
+def test_frequent_topics_that_fall_silent_while_slow_ones_go_on_leave_no_gap(
+    tmp_path: Path, splits: int, kind: str
+) -> None:
+    messages = [each for each in at_rates(40, ((8.005, 30.0),)) if each.topic != "/chatter"]
+    for topic, period, begin in (("/a", 1.0, 0.3), ("/b", 2.0, 0.7), ("/c", 1.0, 0.35)):
+        messages += [
+            text(round((BEGIN + begin + n * period) * S), "here", topic)
+            for n in range(int(40 / period))
+        ]
+    messages.sort(key=lambda message: message.log_time)
+    assert gaps(memory_with(tmp_path / "slow", messages, splits, kind)) == []
+    stalled = [each for each in messages if not 15 <= each.log_time / S - BEGIN < 22]
+    assert gaps(memory_with(tmp_path / "stalled", stalled, splits, kind)) == [(14.7, 22.3)]
+
+
 def test_a_moment_in_a_gap_within_a_bag_has_no_data(stalled: Memory) -> None:
     for at, reason in ((9.5, "gap"), (16.35, "gap")):
         reply = ask(stalled, "get_position_at", timestamp=BEGIN + at, tolerance_s=0.1)

@@ -488,10 +488,10 @@ def shown_by(known: Thinned, snapshot: Snapshot, bags: Sequence[BagFile]) -> Thi
         if is_in(silence.start)
     }
     steps = [
-        (fault.bag.start, fault.by)
+        (fault.at, fault.by)
         for fault in snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK
-        if fault.by >= SHORTEST_STEP_NS and is_in(fault.bag.start)
+        if fault.by >= SHORTEST_STEP_NS and is_in(fault.at)
     ]
     pauses = [(pause.start, pause.end) for pause in snapshot.suspects if is_in(pause.start)]
     left_open = [bag.end for bag in bags if bag.state is BagState.INCOMPLETE]

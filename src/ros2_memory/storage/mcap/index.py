@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 from mcap.opcode import Opcode
 
-from ros2_memory.core.bag_summary import MESSAGES_MISSING, OUT_OF_ORDER_NS, WRONG_STATISTICS
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, Pauses, pauses_among
+from ros2_memory.core.bag_summary import MESSAGES_MISSING, WRONG_STATISTICS
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, CountedPause, pauses_among
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
@@ -212,8 +212,8 @@ class McapIndex(NamedTuple):
         loose: the messages outside chunks, by channel; their places are offsets in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
-        set_back: by how much the log times of a channel go back from one chunk, or one loose
-            message, to a later one, at most; 0 up to `OUT_OF_ORDER_NS`.
+        set_back: by how much the log times of a channel go back at most, from one chunk to a later
+            one or from one message to the next, and the first one after that.
         pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
         seams: where the times of chunks do not go on from one to the next; empty after a scan.
         contradiction: how the indexes of the file contradict its messages, if that was found after
@@ -228,8 +228,8 @@ class McapIndex(NamedTuple):
     loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
-    set_back: Ns = 0
-    pauses: Pauses = ()
+    set_back: tuple[Ns, Ns] = (0, 0)
+    pauses: Sequence[CountedPause] = ()
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
@@ -267,8 +267,8 @@ class Contents:
 
     def __init__(self) -> None:
         self.totals: dict[int, Extent] = {}
-        self.back: Ns = 0  # as `set_back` of `McapIndex`, however little
-        self._held: list[tuple[IntArray, IntArray]] = []
+        self.back: tuple[Ns, Ns] = (0, 0)  # as `set_back` of `McapIndex`
+        self._held: list[tuple[IntArray, IntArray, IntArray]] = []
 
     def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
         """Adds all messages of chunks, which follow those before in the file.
@@ -281,11 +281,17 @@ class Contents:
         ends = np.maximum.reduceat(pairs.times, parts)
         # Of a short chunk its bounds will do.
         is_long = ends - starts > SHORTEST_PAUSE_NS
-        inside = pairs.times[np.repeat(is_long, np.diff(parts, append=pairs.times.size))]
-        self._held += [(starts[~is_long], ends[~is_long]), (inside, inside)]
+        counts = np.diff(parts, append=pairs.times.size)
+        inside = pairs.times[np.repeat(is_long, counts)]
+        self._held.append((starts[~is_long], ends[~is_long], counts[~is_long]))
+        self._held.append((inside, inside, np.ones_like(inside)))
         order = np.argsort(pairs.channels, kind="stable")
         numbers, times = pairs.channels[order], pairs.times[order]
         parts = _begins_of_groups(numbers, pairs.chunks[order])
+        back = -np.diff(times, prepend=times[:1])
+        back[parts] = 0
+        most = int(back.argmax())
+        self.back = max(self.back, (int(back[most]), int(times[most])))
         rows = zip(
             numbers[parts].tolist(),
             np.diff(parts, append=numbers.size).tolist(),
@@ -296,7 +302,7 @@ class Contents:
         for number, count, first, last in rows:
             total = self.totals.get(number)
             if total is not None:
-                self.back = max(self.back, total.last - first)
+                self.back = max(self.back, (total.last - first, first))
             self._count(number, Extent(count, first, last))
         return starts, ends
 
@@ -315,10 +321,10 @@ class Contents:
             total.last = max(total.last, extent.last)
 
     @property
-    def pauses(self) -> Pauses:
+    def pauses(self) -> Sequence[CountedPause]:
         """As `pauses` of `McapIndex`."""
-        firsts, lasts = zip(*self._held, strict=True) if self._held else ([_NONE], [_NONE])
-        return pauses_among(np.concatenate(firsts), np.concatenate(lasts))
+        held = self._held or [(_NONE, _NONE, _NONE)]
+        return pauses_among(*map(np.concatenate, zip(*held, strict=True)))
 
 
 def _begins_of_groups(*columns: IntArray) -> IntArray:
@@ -346,11 +352,6 @@ def _seams(chunks: Sequence[Chunk]) -> tuple[Seam, ...]:
             first, last = min([chunk.start for chunk in near]), max([chunk.end for chunk in near])
             seams.append(Seam(nth, first, last))
     return tuple(seams) if len(seams) <= _MOST_SEAMS else ()
-
-
-def beyond_disorder(back: Ns) -> Ns:
-    """Returns `back`; 0 if messages are merely out of order."""
-    return back if back > OUT_OF_ORDER_NS else 0
 
 
 def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
@@ -393,7 +394,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
     return index._replace(
         totals=contents.totals,
         notes=disagreements(stated, contents.totals),
-        set_back=beyond_disorder(contents.back),
+        set_back=contents.back,
         pauses=contents.pauses,
         seams=_seams(index.chunks),
     )

@@ -22,7 +22,6 @@ from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     Contents,
     McapIndex,
-    beyond_disorder,
     disagreements,
 )
 from ros2_memory.storage.mcap.records import (
@@ -186,7 +185,7 @@ class _Scan:
             loose.columns({*loose.channels.tolist()}),
             complete=complete,
             notes=tuple(notes),
-            set_back=beyond_disorder(self.contents.back),
+            set_back=self.contents.back,
             pauses=self.contents.pauses,
         )
 
