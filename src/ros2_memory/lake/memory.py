@@ -1,4 +1,4 @@
-"""The memory of one robot over its bags in a lake: their index, and what reads their messages."""
+"""The index of one robot's bags in a lake, and what reads their messages."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
 
 from ros2_memory.columns.pack import is_large
-from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
 from ros2_memory.core.model import COMPRESSED, BagFile, BagState, TimeWindow
-from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
@@ -33,10 +31,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.lake.files import Days, Lake
 
 MOST_BAGS: Final = 45_000
@@ -441,38 +437,3 @@ class LakeReader(BagReader):
         files = [file for file in of_day if file.first <= last and first <= file.last]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)
-
-
-def lake_memory(
-    index: LakeIndex,
-    limits: QuerySettings,
-    *,
-    extractor: SchemaExtractor,
-    decoder: BagReader,
-    large: LargeReads,
-    store: ColumnStore | None = None,
-    reading: str = "",
-    caches: Caches | None = None,
-) -> Memory:
-    """Returns the memory of one robot whose bags and messages are read from a lake.
-
-    Args:
-        index: the robot's bags in the lake.
-        limits: the settings of queries.
-        extractor: knows the types of messages.
-        decoder: decodes messages.
-        large: the turn to hold much of a bag.
-        store: of the columns of its bags, which are made again from the lake; None for none.
-        reading: the hash of the settings that decide what is read from bags.
-        caches: those of the columns of all robots.
-    """
-    return Memory(
-        index,
-        LakeReader(index, decoder, large),
-        extractor,
-        index.clock,
-        # Nothing is recorded here, and nothing deleted.
-        replace(limits, kept=None, recording="", screened=False),
-        Scanner(store, index.bag_dir, reading, large, caches),
-        large=large,
-    )

@@ -175,20 +175,16 @@ class LakeLocation:
         Raises:
             LakeError: it is another one's, which the sentence names, or cannot be reached.
         """
-        own = {
-            "id": _id_in(self.state_dir),
-            "host": socket.gethostname(),
-            "state_dir": os.fspath(self.state_dir.absolute()),
-        }
-        path = f"{self.warehouse}/{NAMESPACE}/{_OWNER_FILE}"
+        path, own_id = f"{self.warehouse}/{NAMESPACE}/{_OWNER_FILE}", _id_in(self.state_dir)
+        folder, host = os.fspath(self.state_dir.absolute()), socket.gethostname()
+        own: dict[str, object] = {"id": own_id, "host": host, "state_dir": folder}
         with self.translated("looking whose the lake is"):
-            file = load_file_io({**self.properties, **self.secrets}, path)
-            owner = _owner_in(file, path)
-            if owner is None:
-                with closing(file.new_output(path).create(overwrite=True)) as stream:
+            store = load_file_io({**self.properties, **self.secrets}, path)
+            if not _owner_in(store, path):
+                with closing(store.new_output(path).create(overwrite=True)) as stream:
                     stream.write(json.dumps(own).encode())
-                owner = _owner_in(file, path) or own
-        if owner["id"] != own["id"]:
+            owner = _owner_in(store, path) or own
+        if owner["id"] != own_id:
             whose = f"lake.state_dir={owner.get('state_dir')} on {owner.get('host')}"
             do = "share that folder, which alone knows what was forgotten"
             lost = f"if it is lost for good, delete {path}"
@@ -328,14 +324,14 @@ def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str |
         yield descriptor, holder
 
 
-def _owner_in(store: FileIO, path: str) -> dict[str, object] | None:
-    """Returns what the file of a lake's owner has; None where there is none, or it is damaged."""
-    file = store.new_input(path)
+def _owner_in(store: FileIO, path: str) -> dict[str, object]:
+    """Returns what the file of a lake's owner has; nothing where it is damaged, or not there."""
     owner: object = None
+    file = store.new_input(path)
     if file.exists():
         with file.open() as stream, suppress(ValueError):
             owner = json.loads(stream.read(_MAX_TEXT))
-    return owner if isinstance(owner, dict) and isinstance(owner.get("id"), str) else None
+    return owner if isinstance(owner, dict) and isinstance(owner.get("id"), str) else {}
 
 
 def _id_in(state_dir: Path) -> str:

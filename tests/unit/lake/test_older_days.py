@@ -46,7 +46,7 @@ def memory(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Memo
 
 @pytest.fixture
 def robot(memory: Memory) -> Robot:
-    return Robot("hall", Path("/hall"), lambda: memory, lake=memory)
+    return Robot("hall", Path("/hall"), memory, lake=memory)
 
 
 def asked(of: Robot, tool: str, label: str, topic: str = SEEN, **more: object) -> Any:

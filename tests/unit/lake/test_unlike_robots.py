@@ -46,7 +46,7 @@ class World(NamedTuple):
         robots = [
             Robot(name, Path("/") / name, robot.memory, lake=of_lake)
             for name, robot in self.mounted.robots.items()
-            for of_lake in [self.lake.robots[name].memory()]
+            for of_lake in [self.lake.robots[name].memory]
         ]
         return Fleet(robots, self.mounted.clock, shared_map=True)
 
@@ -118,7 +118,7 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     unmounted = [replace(robot, is_mounted=lambda: False) for robot in world.both().robots.values()]
     *_, note = reply(Fleet(unmounted, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
-        name: robot.memory().index.snapshot().latest for name, robot in world.lake.robots.items()
+        name: robot.memory.index.snapshot().latest for name, robot in world.lake.robots.items()
     }
     times = [f"{name} up to {iso_local(latest[name] or 0)}" for name in sorted(latest, key=str)]
     assert note.startswith("from the lake, which has what was shipped: behind up to ")
