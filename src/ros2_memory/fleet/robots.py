@@ -85,7 +85,7 @@ class FromLake(NamedTuple):
         return [f"the lake has days before {since}, which were not looked at: {do}"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Robot:
     """One robot of a fleet.
 

@@ -130,15 +130,11 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 def _drop_versions(table: IcebergTable, until: Ns) -> None:
     """Drops the versions of up to a time, but those that a branch or a tag names."""
-    named = {ref.snapshot_id for ref in table.metadata.refs.values()}
-    old = [
-        version.snapshot_id
-        for version in table.metadata.snapshots
-        if version.snapshot_id not in named and version.timestamp_ms * NS_PER_MS <= until
-    ]
+    versions = table.metadata.snapshots
+    old = {each.snapshot_id for each in versions if each.timestamp_ms * NS_PER_MS <= until}
+    old -= {ref.snapshot_id for ref in table.metadata.refs.values()}
     if old:
-        table.maintenance.expire_snapshots().by_ids(old).commit()
-        table.refresh()
+        table.maintenance.expire_snapshots().by_ids([*old]).commit()
 
 
 def _unreferenced(table: IcebergTable, files: Sequence[str]) -> Sequence[str]:
