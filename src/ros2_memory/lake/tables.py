@@ -204,9 +204,9 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
-    """Returns the condition on rows of one day of some robots."""
-    return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
+def of_days(days: Iterable[tuple[str, date]]) -> ex.BooleanExpression:
+    """Returns the condition on rows of some days, each of a robot."""
+    return _any_of(map(_of_day, days))
 
 
 def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
@@ -227,10 +227,16 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    condition: ex.BooleanExpression = ex.AlwaysFalse()
-    for (robot, day), bag_ids in ids.items():
-        condition = ex.Or(condition, ex.And(of_robots([robot], day), of_ids(robot, bag_ids)))
-    return condition
+    return _any_of(ex.And(_of_day(day), of_ids(day[0], bag_ids)) for day, bag_ids in ids.items())
+
+
+def _of_day(day: tuple[str, date]) -> ex.BooleanExpression:
+    return ex.And(_is(ex.EqualTo, "robot", day[0]), _is(ex.EqualTo, "day", day[1].isoformat()))
+
+
+def _any_of(conditions: Iterable[ex.BooleanExpression]) -> ex.BooleanExpression:
+    # At once: one after the other they are nested, and years of days deeper than Python allows.
+    return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *conditions)
 
 
 def overlapping(
@@ -241,11 +247,12 @@ def overlapping(
     `columns` have its first and last time (inclusive). Where there are `topics`, only their rows.
     """
     first, last = columns
-    span = ex.And(
-        _is(ex.LessThan, first, window.stop), _is(ex.GreaterThanOrEqual, last, window.start)
+    return ex.And(
+        _is(ex.EqualTo, "robot", robot),
+        _is(ex.LessThan, first, window.stop),
+        _is(ex.GreaterThanOrEqual, last, window.start),
+        _is(ex.In, "topic", topics) if topics else ex.AlwaysTrue(),
     )
-    of_robot = ex.And(_is(ex.EqualTo, "robot", robot), span)
-    return ex.And(of_robot, _is(ex.In, "topic", topics)) if topics else of_robot
 
 
 def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
