@@ -10,7 +10,7 @@ from collections import Counter
 from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
-from operator import attrgetter
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
@@ -285,8 +285,8 @@ class _Head(NamedTuple):
 class LakeReader(BagReader):
     """An adapter of `BagReader`: the bags of one robot in a lake.
 
-    Messages of one time are in the order of their topics. Of images, clouds, scans and the like a
-    lake has the times alone: to read their payloads is refused.
+    Of images, clouds, scans and the like a lake has the times alone: to read their payloads is
+    refused.
 
     Attributes:
         index: its bags.
@@ -324,9 +324,12 @@ class LakeReader(BagReader):
             NotInLakeError: the lake has the times of a topic alone.
         """
         step = -1 if newest_first else 1
-        batches = [*self.batches(path, topics, window)][::step]
-        records = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
-        yield from heapq.merge(*records, key=attrgetter("log_time"), reverse=newest_first)
+        merged = heapq.merge(
+            *(_in_order(batch, step) for batch in self.batches(path, topics, window)),
+            key=itemgetter(0, 1),
+            reverse=newest_first,
+        )
+        yield from (record for *_, record in merged)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
@@ -437,3 +440,9 @@ class LakeReader(BagReader):
         files = [file for file in of_day if file.first <= last and first <= file.last]
         asked = {"bags": bags, "first": first, "last": last, **more}
         return lake.select(sql, "channels", files, asked)
+
+
+def _in_order(batch: Batch, step: int) -> Iterator[tuple[Ns, int, Record]]:
+    """Yields time, place and record of each message, with a `step` of -1 from the last one on."""
+    times, places = batch.log_times[::step].tolist(), batch.places[::step].tolist()
+    return zip(times, places, map(batch.record, range(len(times))[::step]), strict=True)

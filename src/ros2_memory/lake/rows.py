@@ -11,9 +11,9 @@ import hashlib
 import json
 import math
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import Batch, Channel
+    from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
 """Packed bytes of each message on average; of a channel with more the lake has the times alone."""
@@ -65,6 +65,7 @@ _LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
 _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
+_Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
 
 
 def bag_id_of(robot: str, recording: str, file: str, first: Ns) -> str:
@@ -272,8 +273,12 @@ class _BagRows:
             by_channel.values(),
             key=lambda messages: (messages.channel.topic, messages.channel.type),
         )
+        times = [np.unique(np.concatenate(messages.parts, 1)[0]) for messages in order]
+        none = np.empty(0, np.int64)
+        moments, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
+        tied = moments[channels > 1]
         for number, messages in enumerate(order):
-            yield messages.row(number)
+            yield messages.row(number, tied)
 
     def _add_messages(self, seen: Collection[str], frame: str | None, track: RobotTrack) -> None:
         """Adds whole messages, and the detections of the topics `seen`."""
@@ -362,35 +367,37 @@ class _Messages:
     """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
 
     `is_whole`: they are shipped whatever they take; of other images, clouds, scans and the like,
-    the times alone are.
+    the times alone are. `parts`: their log times, places and publish times.
     """
 
     channel: Channel
     is_whole: bool
     payloads: list[bytes] | None
-    parts: list[Batch] = field(default_factory=list)
+    parts: list[_Rows] = field(default_factory=list)
     size: int = 0
 
     def add(self, batch: Batch) -> None:
         """Takes more messages."""
-        # Without the buffer, in which are those of other channels.
-        self.parts.append(replace(batch, buffer=b""))
+        self.parts.append(np.stack((batch.log_times, batch.places, batch.publish_times)))
         if self.payloads is not None:
             self.payloads += map(batch.payload, range(batch.sizes.size))
             self.size += int(batch.sizes.sum())
 
-    def row(self, number: int) -> Row:
-        """Returns its row, the n-th of the bag; without payloads where these take too much."""
-        logged = np.concatenate([part.log_times for part in self.parts])
-        published = np.concatenate([part.publish_times for part in self.parts])
-        order = np.lexsort((np.concatenate([part.places for part in self.parts]), logged))
-        logged, published, channel = logged[order], published[order], self.channel
+    def row(self, number: int, tied: IntArray) -> Row:
+        """Returns its row, the n-th of the bag; without payloads where these take too much.
+
+        `tied`: log times of which several channels have messages.
+        """
+        times, channel = np.concatenate(self.parts, 1), self.channel
+        order = np.lexsort((times[1], times[0]))
+        logged, places, published = times[:, order]
         payloads = self.payloads and [self.payloads[nth] for nth in order.tolist()]
-        packed = packed_messages(logged, published, payloads)
+        order_counts = places if np.isin(logged, tied).any() else None
+        packed = packed_messages(logged, published, payloads, order_counts)
         most = max(_MOST_OF_MESSAGE * len(logged), _LEAST_OF_CHANNEL)
         if payloads is not None and not self.is_whole and len(packed) > most:
             payloads = None
-            packed = packed_messages(logged, published, None)
+            packed = packed_messages(logged, published, None, order_counts)
         schema = {"schema_encoding": channel.schema.encoding, "schema": channel.schema.text}
         return {
             **{name: getattr(channel, name) for name in ("topic", "type", "encoding", "latched")},

@@ -1,14 +1,17 @@
 """The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which.
 
 In the column `packed` are the messages of one channel of a bag: both times and the payload of each.
+Where another channel of the bag has a message of the same log time, their places in the file are
+there, too, which say the order.
 What the bytes are, once decompressed (numbers are little-endian and lie in planes, the lowest byte
 of each first, as they then compress best)::
 
-    1       format
+    1       format: 1, or 2 with places
     1       0: times alone; 1: payloads, too
     4       n, the number of messages
     8 n     log times, each since the one before
     8 n     publish times, each since the log time
+    8 n     places, each since the one before; only in format 2
     4 n     the bytes of each payload
     ...     the payloads, in planes where all have one size, else one after the other
 
@@ -48,10 +51,11 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
 
-_FORMAT: Final = 1
+_PLAIN: Final = 1
+_PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 31
+ROWS_VERSION: Final = 32
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")
@@ -273,17 +277,23 @@ def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, Iceb
 
 
 def packed_messages(
-    log_times: IntArray, publish_times: IntArray, payloads: Sequence[bytes] | None
+    log_times: IntArray,
+    publish_times: IntArray,
+    payloads: Sequence[bytes] | None,
+    places: IntArray | None = None,
 ) -> bytes:
     """Returns messages in order of their log times as bytes; without payloads where there are none.
 
-    `payloads` are of messages in the same order.
+    `payloads` are of messages in the same order, and so are `places`, if they are needed.
     """
+    form = _PLAIN if places is None else _PLACED
     parts = [
-        _HEAD.pack(_FORMAT, payloads is not None, len(log_times)),
+        _HEAD.pack(form, payloads is not None, len(log_times)),
         byte_planes(np.diff(log_times, prepend=np.int64(0)), 8),
         byte_planes(publish_times - log_times, 8),
     ]
+    if places is not None:
+        parts.append(byte_planes(np.diff(places, prepend=np.int64(0)), 8))
     if payloads is not None:
         sizes = np.array([len(payload) for payload in payloads], np.int64)
         joined = b"".join(payloads)
@@ -305,12 +315,16 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
         form, is_whole, count = _HEAD.unpack_from(content)
     except struct.error as error:
         raise ValueError("packed messages are cut short") from error
-    if form != _FORMAT:
-        raise ValueError(f"messages are packed in format {form}, this program reads {_FORMAT}")
+    if form not in (_PLAIN, _PLACED):
+        raise ValueError(f"messages are packed in format {form}, this program reads {_PLACED}")
     at = _HEAD.size
     logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
     published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
     at += 16 * count
+    places = np.arange(count)
+    if form == _PLACED:
+        places = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
+        at += 8 * count
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
         sizes = from_planes(content, at, count, 4).astype(np.int64)
@@ -321,4 +335,4 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
             planes = np.frombuffer(payloads, np.uint8).reshape(-1, count)
             payloads = planes.T.tobytes()
     starts = np.cumsum(sizes) - sizes
-    return Batch(channel, logged, published, np.arange(count), payloads, starts, sizes)
+    return Batch(channel, logged, published, places, payloads, starts, sizes)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.columns.pack import decompressed
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
@@ -24,6 +25,7 @@ from tests.support.fleets import SEEN, START_S, reply
 from tests.support.lakes import (
     fleet_of,
     lake_robot,
+    lake_rows,
     location,
     robot_bags,
     ship,
@@ -166,6 +168,34 @@ def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
     for _ in range(2):
         with pytest.raises(BagVanishedError):
             [*robot.reader.records(bag.path, ["/chatter"], EVERYTHING)]
+
+
+def test_messages_of_one_log_time_keep_the_order_of_the_file(
+    engine: DuckdbEngine, tmp_path: Path
+) -> None:
+    """Those of a topic with two channels, and of several topics."""
+    draw, stamped = Random(5), "ros2_vision_interfaces/msg/StampedString"
+    messages: list[Msg] = []
+    for beat in range(40):
+        at = AT + beat // 4 * NS_PER_S
+        kinds = [("/said", "std_msgs/msg/String"), ("/said", stamped), ("/heard", stamped)]
+        for topic, kind in draw.sample(kinds, 2):
+            messages.append(Msg(topic, kind, at, draw.randbytes(9), at - 5))
+        messages.append(text(AT + beat * NS_PER_S + 7, "alone", topic="/alone"))
+    write_mcap(tmp_path / "bags" / "r0" / "one_0.mcap", messages)
+    on_robot = robot_bags("hall", tmp_path / "bags")
+    assert ship(tmp_path / "lake", [on_robot]).bags == 1
+    bags, robot = on_robot.memory, lake_robot(tmp_path / "lake", engine)
+    [bag], [other] = bags.index.snapshot().bags, robot.index.snapshot().bags
+    for topics in (["/said"], ["/said", "/heard", "/alone"]):
+        for newest_first in (False, True):
+            how = {"newest_first": newest_first}
+            found = [*robot.reader.records(other.path, topics, EVERYTHING, **how)]
+            assert found == [*bags.reader.records(bag.path, topics, EVERYTHING, **how)]
+    # Where no channel shares a log time with another, no place is stored.
+    rows = {row["topic"]: row["packed"] for row in lake_rows(tmp_path / "lake", "channels")}
+    assert decompressed(rows["/alone"])[0] == 1
+    assert decompressed(rows["/said"])[0] == 2
 
 
 def test_damaged_and_later_bytes_are_refused() -> None:
