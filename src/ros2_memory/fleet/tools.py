@@ -369,9 +369,8 @@ def _shared_error(failed: Mapping[str, EpisodicError]) -> EpisodicError:
         return InvalidArgumentsError(text if len(reasons) > 1 else next(iter(reasons)))
     if kinds == {errors.NotInLakeError}:
         return errors.NotInLakeError(text)
-    if any(issubclass(kind, errors.QueryTimeoutError) for kind in kinds):
-        return errors.QueryTimeoutError(text)
-    return errors.RefusedError(text)
+    is_late = errors.QueryTimeoutError in kinds
+    return errors.QueryTimeoutError(text) if is_late else errors.RefusedError(text)
 
 
 def merged(

@@ -102,20 +102,14 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     force, the pose topic, the spellings of labels, the settings (`config`) and the topics whose
     `messages` are shipped.
     """
-    counted = [
-        (topic.topic, topic.type, topic.count, topic.first, topic.last)
-        for topic in bag.summary.topics
-    ]
+    counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
     view = View(memory, Call())
     recordings = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, recordings), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
-    return _digest(
-        [
-            *(ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted),
-            *memory.index.joined_with(bag.recording),
-        ]
-    )
+    joined = memory.index.joined_with(bag.recording)
+    made = ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted
+    return _digest([*made, *joined])
 
 
 def rows_of(
@@ -153,29 +147,22 @@ class _BagRows:
         tracks = self._tracks()
         for frame, track in tracks:
             same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-            columns = (track.times, track.x, track.y, track.heading, track.begins)
-            for vertex in zip(*(column.tolist() for column in columns), strict=True):
-                row = dict(zip(("time_ns", "x", "y", "heading", "begins"), vertex, strict=True))
-                if math.isnan(row["heading"]):
-                    row["heading"] = None
-                self._rows["poses"].append({**same, **row})
+            columns = (track.times, track.x, track.y, track.begins, track.heading)
+            for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
+                row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
+                known = None if math.isnan(heading) else heading
+                self._rows["poses"].append({**same, **row, "heading": known})
         self._rows["things"] += self._things()
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        # Of each topic that can have some.
-        events = {
-            topic: bag_events.limited(MAX_PER_BAG, MAX_PER_BAG)
-            for topic, bag_events in events_of_bag(self._view, self._bag, topics).items()
-        }
-        for topic, found in events.items():
-            self._rows["events"] += self._events_of(topic, found)
+        seen = set[str]()
+        for topic, of_topic in events_of_bag(self._view, self._bag, topics).items():
+            events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
+            self._rows["events"] += self._events_of(topic, events)
+            # What the events of a topic rule out is not decoded.
+            may_have_some = any(map(may_have_detections, self._types[topic]))
+            if may_have_some and (events.visible.size or events.left_out):
+                seen.add(topic)
         driven = self._driven()
-        # What the events of a topic rule out is not decoded.
-        seen = {
-            topic
-            for topic, found in events.items()
-            if (found.visible.size or found.left_out)
-            and any(map(may_have_detections, self._types[topic]))
-        }
         first = tracks[0] if tracks else (None, empty_track())
         self._add_messages(seen, *first)
         self._rows["channels"] += self._channels()
@@ -269,10 +256,7 @@ class _BagRows:
                 by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             by_channel[id(channel)].add(batch)
             _drop_payloads(by_channel.values())
-        order = sorted(
-            by_channel.values(),
-            key=lambda messages: (messages.channel.topic, messages.channel.type),
-        )
+        order = sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
         times = [np.unique(np.concatenate(messages.parts, 1)[0]) for messages in order]
         none = np.empty(0, np.int64)
         moments, channels = np.unique(np.concatenate([none, *times]), return_counts=True)

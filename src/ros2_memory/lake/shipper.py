@@ -12,6 +12,7 @@ import os
 import threading
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -165,16 +166,11 @@ class Shipper:
             LakeError: the lake cannot be written; what is left is done when it is opened again.
         """
         if not robot.answers(self.patience_s):
-            why = f"{robot.bag_dir} does not answer: is its disk reachable?"
-            done.problems.append(
-                f"{robot.name}: {why} Until it does, nothing of this robot is shipped"
-            )
+            why = "does not answer: is its disk reachable? Until it does, nothing of it is shipped"
+            done.problems.append(f"{robot.name}: {robot.bag_dir} {why}")
             return False
         try:
-            wanted = [
-                Tombstone.of(robot.name, forgetting)
-                for forgetting in read_forgettings(robot.bag_dir)
-            ]
+            wanted = [*map(partial(Tombstone.of, robot.name), read_forgettings(robot.bag_dir))]
         except (OSError, ValueError) as error:
             why = "until it is repaired, since what was forgotten could come back"
             file = f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}"

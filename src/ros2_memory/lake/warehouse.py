@@ -276,11 +276,10 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
     Raises:
         LakeError: another process holds it, which the sentence names; or nothing can be locked.
     """
-    with _locked(state_dir, os.O_RDWR | os.O_CREAT, fcntl.LOCK_EX) as (descriptor, holder):
+    with _locked(state_dir, fcntl.LOCK_EX) as holder:
         if holder is not None:
             do = "a lake has one writer: stop that process first"
             raise LakeError(f"{holder} writes into this lake; {do}")
-        write_holder(descriptor)
         yield
 
 
@@ -290,38 +289,37 @@ def holder_of(state_dir: Path) -> str | None:
     Raises:
         LakeError: that cannot be found out.
     """
-    try:
-        with _locked(state_dir, os.O_RDONLY, fcntl.LOCK_SH) as (_, holder):
-            return holder
-    except FileNotFoundError:
+    if not (state_dir / _LOCK_FILE).exists():
         return None
+    with _locked(state_dir, fcntl.LOCK_SH) as holder:
+        return holder
 
 
 @contextmanager
-def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str | None]]:
-    """Locks the file, if nobody else has; yields its descriptor, and who has.
+def _locked(state_dir: Path, lock: int) -> Iterator[str | None]:
+    """Locks the file, if nobody else has; yields who has. Who writes is named in it.
 
     Raises:
-        FileNotFoundError: there is none, and it is not to be made.
         LakeError: it cannot be opened or locked.
     """
-    path, holder = state_dir / _LOCK_FILE, None
+    path, holder, writes = state_dir / _LOCK_FILE, None, lock == fcntl.LOCK_EX
+    flags = os.O_RDWR | os.O_CREAT if writes else os.O_RDONLY
     with ExitStack() as opened:
         try:
-            if flags & os.O_CREAT:
+            if writes:
                 state_dir.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
             opened.callback(os.close, descriptor)
             fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+            if writes:
+                write_holder(descriptor)
         except BlockingIOError:
             pid, host = read_holder(descriptor)
             holder = "another process" if pid is None else f"process {pid} on {host}"
-        except FileNotFoundError:
-            raise
         except OSError as error:
             do = "lake.state_dir must be on a file system that supports locks"
             raise LakeError(f"{path} cannot be opened or locked: {error.strerror}; {do}") from error
-        yield descriptor, holder
+        yield holder
 
 
 def _owner_in(store: FileIO, path: str) -> dict[str, object]:
