@@ -203,7 +203,7 @@ def _dispatcher(settings: Settings) -> Dispatcher:
         memory.index.refresh()
     else:
         for robot in fleet.robots.values():
-            robot.memory().index.refresh()
+            robot.memory.index.refresh()
     return build_dispatcher(settings, memory, fleet=fleet)
 
 

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
     from ros2_memory.fleet.robots import Fleet, Robot
-    from ros2_memory.history.context import Memory
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.lake.engine import DuckdbEngine
     from ros2_memory.lake.files import Lake
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import LakeLocation
@@ -112,7 +112,7 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     return Lake(catalog, engine, location.translated)
 
 
-def engine_of(node: DuckdbNode) -> LakeEngine:
+def engine_of(node: DuckdbNode) -> DuckdbEngine:
     """Returns the engine of the settings.
 
     Raises:
@@ -123,9 +123,9 @@ def engine_of(node: DuckdbNode) -> LakeEngine:
             "lake: duckdb needs the optional part of this package (no duckdb): "
             "pip install '.[lake]'"
         )
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.engine import DuckdbEngine
 
-    return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
+    return instantiated("lake.engine", node, DuckdbEngine)
 
 
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this
@@ -142,8 +142,7 @@ _JOINED_AGAIN_S: Final = 5.0
 def build_fleet(settings: Settings) -> Fleet | None:
     """Returns the robots of `fleet.robots`, whose bags are only read; None if there are none.
 
-    With a lake also those that it alone has. A robot's memory is built when it is first asked; what
-    reads and decodes bags is shared.
+    With a lake also those that it alone has. What reads and decodes bags is shared.
 
     Raises:
         ConfigError: other settings are not those of a fleet, or a robot's places are refused.
@@ -194,28 +193,35 @@ def _build_robot(settings: Settings, name: str, shared: SharedParts, lake: Lake 
     if not settings.fleet.shared_map and own.data.places_file == settings.data.places_file:
         # `data.places_file` is about some other map.
         limits = replace(limits, places=(), places_file="")
-
-    def mounted() -> Memory:
-        return replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
-
     bag_dir = settings.fleet.robots.get(name)
-    if lake is None:
-        return Robot(name, own.recording.bag_dir, mounted)
-    from ros2_memory.lake.memory import LakeIndex, lake_memory
+    shipped = None if lake is None else _build_shipped(own, name, shared, lake, limits)
+    if bag_dir is None and shipped is not None:
+        return Robot(name, Path(name), shipped, shipped, lambda: False)
+    bag_dir = own.recording.bag_dir
+    mounted = replace(build_memory(own, shared, setting=ROBOTS_SETTING), limits=limits)
+    return Robot(name, bag_dir, mounted, shipped, bag_dir.is_dir)
 
-    shipped = lake_memory(
-        LakeIndex(lake, name, WallClock()),
-        limits,
-        extractor=shared.extractor,
-        decoder=shared.reader,
+
+def _build_shipped(
+    own: Settings, name: str, shared: SharedParts, lake: Lake, limits: QuerySettings
+) -> Memory:
+    """Returns the memory of a robot's bags in a lake; its columns are made again from these."""
+    from ros2_memory.columns.scanner import Scanner
+    from ros2_memory.history.context import Memory
+    from ros2_memory.lake.memory import LakeIndex, LakeReader
+
+    index = LakeIndex(lake, name, WallClock())
+    store, reading = build_columns(own, shared.reader, name), reading_of(own, shared.schemas)
+    return Memory(
+        index,
+        LakeReader(index, shared.reader, shared.large),
+        shared.extractor,
+        index.clock,
+        # Nothing is recorded there, and nothing deleted.
+        replace(limits, kept=None, recording="", screened=False),
+        Scanner(store, index.bag_dir, reading, shared.large, shared.caches),
         large=shared.large,
-        store=build_columns(own, shared.reader, of_lake=name),
-        reading=reading_of(own, shared.schemas),
-        caches=shared.caches,
     )
-    if bag_dir is None:
-        return Robot(name, Path(name), lambda: shipped, lake=shipped, is_mounted=lambda: False)
-    return Robot(name, bag_dir, mounted, lake=shipped, is_mounted=bag_dir.is_dir)
 
 
 def robot_settings(settings: Settings, name: str) -> Settings:

@@ -228,7 +228,7 @@ def _parts_of_fleet(
     fillers: dict[str, tuple[Memory, Filler]] = {}
     for name in settings.fleet.robots:  # of others there is no bag here
         robot = fleet.robots[name]
-        robot_memory = robot.memory()
+        robot_memory = robot.memory
         backfill = build_backfill(robot_settings(settings, name), robot_memory)
         reports[name] = Health(robot_memory, package_version(), backfill)
         helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
@@ -315,8 +315,8 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
             limiter.total_tokens += 2 * len(robots)
             for robot in robots:
                 shipped = robot.lake
-                if robot.memory() is not shipped:
-                    tasks.start_soon(keep_fresh, robot.memory(), every_s, limiter)
+                if robot.memory is not shipped:
+                    tasks.start_soon(keep_fresh, robot.memory, every_s, limiter)
                 if shipped is not None:
                     tasks.start_soon(keep_fresh, shipped, lake_s, limiter)
             if fleet.join is None:

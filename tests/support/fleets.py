@@ -6,7 +6,6 @@ import json
 import math
 import os
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from random import Random
 from typing import Any, Final
@@ -134,7 +133,7 @@ def fleet_memory(bag_dir: Path, limits: QuerySettings | None = None) -> Memory:
 
 def fleet_over(folder: Path, names: tuple[str, ...], *, shared_map: bool = False) -> Fleet:
     """The fleet of `folder/<name>`, asked at `NOW`."""
-    robots = [Robot(name, folder / name, partial(fleet_memory, folder / name)) for name in names]
+    robots = [Robot(name, folder / name, fleet_memory(folder / name)) for name in names]
     return Fleet(robots, FixedClock(NOW), shared_map=shared_map)
 
 

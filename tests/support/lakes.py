@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -15,15 +14,15 @@ from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.columns.fill import Filling, StoreLimits
+from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import FILE, ColumnStore
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
-from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.files import Lake
-from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, lake_memory
+from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, LakeReader
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.upkeep import Tombstone
 from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation, location_of
@@ -141,7 +140,7 @@ def lake_in(folder: Path) -> SqlCatalog:
 
 def lake_robots(
     catalog: Catalog,
-    engine: LakeEngine,
+    engine: DuckdbEngine,
     names: Sequence[str],
     stores: Path | None = None,
     *,
@@ -150,23 +149,20 @@ def lake_robots(
     now: int = NOW,
 ) -> dict[str, Memory]:
     """The robots of a lake; with a folder for `stores` each has one."""
-    lake, clock, decoder = Lake(catalog, engine), FixedClock(now), McapReader()
-    return {
-        name: lake_memory(
-            LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags),
-            QuerySettings(),
-            extractor=extractor(),
-            decoder=decoder,
-            store=None
-            if stores is None
-            else ColumnStore([stores / name / FILE], decoder.definition),
-            large=LargeReads(),
-        )
-        for name in names
-    }
+    lake, clock, decoder, large = Lake(catalog, engine), FixedClock(now), McapReader(), LargeReads()
+
+    def memory(name: str) -> Memory:
+        index = LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags)
+        path = [] if stores is None else [stores / name / FILE]
+        store = ColumnStore(path, decoder.definition) if path else None
+        scanner = Scanner(store, index.bag_dir, "", large)
+        reader = LakeReader(index, decoder, large)
+        return Memory(index, reader, extractor(), clock, QuerySettings(), scanner, large=large)
+
+    return {name: memory(name) for name in names}
 
 
-def lake_robot(folder: Path, engine: LakeEngine, **how: Any) -> Memory:
+def lake_robot(folder: Path, engine: DuckdbEngine, **how: Any) -> Memory:
     """The robot `hall` of the lake in a folder; see `lake_robots`."""
     return lake_robots(lake_in(folder), engine, ["hall"], **how)["hall"]
 
@@ -186,11 +182,5 @@ def store_columns(memory: Memory) -> Filling:
 
 def fleet_of(memories: Mapping[str, Memory], *, shared_map: bool = False, now: int = NOW) -> Fleet:
     """The fleet of some memories."""
-
-    def same(memory: Memory) -> Memory:
-        return memory
-
-    robots = [
-        Robot(name, Path("/") / name, partial(same, memory)) for name, memory in memories.items()
-    ]
+    robots = [Robot(name, Path("/") / name, memory) for name, memory in memories.items()]
     return Fleet(robots, FixedClock(now), shared_map=shared_map)

@@ -5,9 +5,8 @@ from __future__ import annotations
 import contextvars
 import threading
 import time
-from collections import deque
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from dataclasses import KW_ONLY, InitVar, dataclass, field, replace
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -71,13 +70,6 @@ class FromLake(NamedTuple):
     latest: Ns | None
     older: Ns | None = None
 
-    @classmethod
-    def of(cls, lake: Memory, call: Call) -> FromLake:
-        """Returns what is to be reported of a call that a lake has answered."""
-        published = lake.index.published
-        latest = None if published is None else published.latest
-        return cls(latest, None if call.older == MAX_NS else call.older)
-
     def since(self, begin: Ns) -> FromLake:
         """Returns the report for an answer that needs nothing before a log time."""
         is_whole = self.older is None or begin > self.older
@@ -93,33 +85,23 @@ class FromLake(NamedTuple):
         return [f"the lake has days before {since}, which were not looked at: {do}"]
 
 
-@dataclass(eq=False, repr=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class Robot:
-    """One robot of a fleet. Its memory is built when it is first needed; no bag is read for that.
+    """One robot of a fleet.
 
     Attributes:
         name: as replies and arguments have it; never a path.
         bag_dir: the bag directory, which need not exist.
-        build: what builds its memory.
+        memory: over its own bags; that of the lake where only the lake has some.
         lake: its memory over what was shipped to a lake.
         is_mounted: returns whether there are bags besides those of the lake; it may hang.
     """
 
     name: str
     bag_dir: Path
-    build: Callable[[], Memory]
-    _: KW_ONLY
+    memory: Memory
     lake: Memory | None = None
     is_mounted: Callable[[], bool] = lambda: True
-    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
-    _memory: Memory | None = field(default=None, init=False)
-
-    def memory(self) -> Memory:
-        """Returns the robot's memory, always the same one."""
-        with self._lock:
-            if self._memory is None:
-                self._memory = self.build()
-            return self._memory
 
     def asked(
         self,
@@ -139,17 +121,17 @@ class Robot:
         """
         lake = self.lake
         if lake is None:
-            return ask(self.memory(), call), None
+            return ask(self.memory, call), None
 
         def answer(*, of_lake: bool) -> tuple[T, FromLake | None]:
-            return _ask_lake(lake, ask, call) if of_lake else (ask(self.memory(), call), None)
+            return _ask_lake(lake, ask, call) if of_lake else (ask(self.memory, call), None)
 
         is_mounted = self.is_mounted()
-        own = self.memory().index.snapshot() if is_mounted else None
+        own = self.memory.index.snapshot() if is_mounted else None
         if own is None or not (own.bags or own.problem is not None):
             # A folder that is there says best why nothing is, where nothing was shipped either.
             return answer(of_lake=not is_mounted or lake.index.snapshot().latest is not None)
-        is_lakes = _lacks(self.memory(), lake, since)
+        is_lakes = _lacks(self.memory, lake, since)
         try:
             return answer(of_lake=is_lakes)
         except (NoDataError, NotInLakeError) as error:
@@ -170,10 +152,9 @@ class Robot:
 
         Nothing is scanned for it.
         """
-        memory = self._memory or self.lake
-        published = None if memory is None else memory.index.published
-        latest = None if published is None else published.latest
-        return MIN_NS if latest is None else latest
+        published = [memory.index.published for memory in (self.memory, self.lake) if memory]
+        known = [snapshot.latest for snapshot in published if snapshot is not None]
+        return next(filter(None, known), MIN_NS)
 
 
 def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
@@ -205,37 +186,44 @@ def _lacks(own: Memory, lake: Memory, since: Callable[[Ns], Ns | None]) -> bool:
 def _ask_lake(lake: Memory, ask: Callable[[Memory, Call], T], call: Call) -> tuple[T, FromLake]:
     """Returns what `ask` finds in a lake, with what to report; raises what it raises."""
     call.older = MAX_NS
+
+    def report() -> FromLake:
+        published = lake.index.published
+        latest = None if published is None else published.latest
+        return FromLake(latest, None if call.older == MAX_NS else call.older)
+
     try:
-        answer = ask(lake, call)
+        return ask(lake, call), report()
     except NoDataError as error:
-        detail = "; ".join((error.detail, *FromLake.of(lake, call).notes))
+        detail = "; ".join((error.detail, *report().notes))
         raise NoDataError(error.reason, detail, error.notes) from error
-    return answer, FromLake.of(lake, call)
 
 
-@dataclass(eq=False, repr=False)
 class Fleet:
     """The robots that one server answers for.
 
-    Attributes:
-        robots: all of them, by their names.
+    Args:
+        robots: no two have one name.
         clock: the wall clock, read once for a question to several.
         shared_map: whether coordinates mean the same place for all of them.
         join: returns the robots that a lake has besides those of some names, where there is one.
             It looks there, unless it did so a moment ago.
+
+    Attributes:
+        robots: all of them, by their names.
     """
 
-    given: InitVar[Iterable[Robot]]
-    clock: Clock
-    _: KW_ONLY
-    shared_map: bool = False
-    join: Callable[[Collection[str]], Iterable[Robot]] | None = None
-    robots: Mapping[str, Robot] = field(init=False)
-    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
-
-    def __post_init__(self, given: Iterable[Robot]) -> None:
-        """Has the robots by name; no two have one."""
-        self.robots = {robot.name: robot for robot in given}
+    def __init__(
+        self,
+        robots: Iterable[Robot],
+        clock: Clock,
+        *,
+        shared_map: bool = False,
+        join: Callable[[Collection[str]], Iterable[Robot]] | None = None,
+    ) -> None:
+        self.robots: Mapping[str, Robot] = {robot.name: robot for robot in robots}
+        self.clock, self.shared_map, self.join = clock, shared_map, join
+        self._lock = threading.Lock()
 
     def joined(self) -> Sequence[Robot]:
         """Returns the robots that were shipped to the lake for the first time since; adds them.
@@ -302,42 +290,30 @@ class FanOut:
         """
         left_s, begun_s = call.deadline.left_s(), time.monotonic()
         limit_s = left_s * (_OF_ONE if len(robots) > 1 else _OF_ALL)
-        waiting = deque(robots)
-        running: dict[str, tuple[Future[T | EpisodicError], Call, float, float]] = {}
-        done: dict[str, T | EpisodicError] = {}
-        while waiting or running:
-            now_s = time.monotonic()
-            while waiting and len(running) < self._at_once:
-                robot = waiting.popleft()
-                own_s = min(limit_s, begun_s + left_s * _OF_ALL - now_s)
-                refused = self._refused(robot, call, own_s)
-                if refused is not None:
-                    done[robot.name] = refused
-                    continue
-                own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
-                own.used_active = own.used_thinned = False
-                until_s = now_s + own_s + left_s * _GRACE
-                running[robot.name] = _start_asking(robot, work, own), own, own_s, until_s
-            # Without a deadline there is nothing to wake up for but an answer.
-            first_s = min((until_s for *_, until_s in running.values()), default=now_s)
-            futures = [future for future, *_ in running.values()]
-            wait(futures, min(max(first_s - now_s, 0), threading.TIMEOUT_MAX), FIRST_COMPLETED)
-            for name, (future, own, own_s, until_s) in [*running.items()]:
-                if future.done():
-                    done[name] = future.result()
-                elif time.monotonic() >= until_s:
-                    self._is_done[name] = future.done
-                    do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
-                    text = f"no answer in {own_s:.3g} s; {do} a shorter window"
-                    done[name] = QueryTimeoutError(text)
-                else:
-                    continue
-                del running[name]
-                for stage, spent in [*own.stages.spent.items()]:
-                    call.stages.add(stage, spent)
-                call.used_active |= own.used_active
-                call.used_thinned |= own.used_thinned
-        return {robot.name: done[robot.name] for robot in robots}
+        context = contextvars.copy_context()
+
+        def ask_one(robot: Robot) -> tuple[T | EpisodicError, Call]:
+            own_s = min(limit_s, begun_s + left_s * _OF_ALL - time.monotonic())
+            own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
+            own.used_active = own.used_thinned = False
+            if refused := self._refused(robot, call, own_s):
+                return refused, own
+            answer = _start_asking(robot, work, own, context.copy())
+            try:
+                return answer.result(min(own_s + left_s * _GRACE, threading.TIMEOUT_MAX)), own
+            except TimeoutError:
+                self._is_done[robot.name] = answer.done
+                do = "ask about it alone, or about" if len(robots) > 1 else "ask about"
+                return QueryTimeoutError(f"no answer in {own_s:.3g} s; {do} a shorter window"), own
+
+        with ThreadPoolExecutor(self._at_once) as threads:
+            answers = [*threads.map(ask_one, robots)]
+        for _, own in answers:
+            for stage, spent in [*own.stages.spent.items()]:
+                call.stages.add(stage, spent)
+            call.used_active |= own.used_active
+            call.used_thinned |= own.used_thinned
+        return {robot.name: answer for robot, (answer, _) in zip(robots, answers, strict=True)}
 
     def _refused(self, robot: Robot, call: Call, own_s: float) -> EpisodicError | None:
         """Returns why a robot is not asked: it is stuck, or no time is left."""
@@ -352,7 +328,7 @@ class FanOut:
 
 
 def _start_asking(
-    robot: Robot, work: Callable[[Robot, Call], T], call: Call
+    robot: Robot, work: Callable[[Robot, Call], T], call: Call, context: contextvars.Context
 ) -> Future[T | EpisodicError]:
     """Returns what a robot will answer, in a thread of its own."""
     answer: Future[T | EpisodicError] = Future()
@@ -369,6 +345,6 @@ def _start_asking(
 
     # A daemon: one that hangs must not keep the program from ending.
     threading.Thread(
-        target=contextvars.copy_context().run, args=(run,), name=f"robot-{robot.name}", daemon=True
+        target=context.run, args=(run,), name=f"robot-{robot.name}", daemon=True
     ).start()
     return answer

@@ -12,10 +12,9 @@ row itself (`SHORT_KEYS`).
 from __future__ import annotations
 
 import math
-import threading
 from collections import Counter
 from contextlib import suppress
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, cast
@@ -138,13 +137,19 @@ def fleet_tools(
     `at_once`: how many robots are asked at once.
     """
     fan_out = FanOut(at_once)
+
+    def asking(tool: Tool, given: Mapping[str, object]) -> Question:
+        own = {name: value for name, value in given.items() if name != ROBOT}
+        asked = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
+        return lambda _, call: asked.ask(given.get(ROBOT), call)
+
     return tuple(
         replace(
             tool,
             describe=partial(_described, tool),
             # One robot that is slow must not keep a quick tool's thread.
             blocking=tool.blocking or tool.name in ANSWER_FOR_ALL | TABLE_FOR_ALL,
-            question=partial(_asking, tool, fleet, fan_out, max_chars),
+            question=partial(asking, tool),
         )
         for tool in tools
         if not tool.writes
@@ -169,15 +174,6 @@ def _described(tool: Tool) -> tuple[str, JsonObject]:
     return text, {**tool.schema, "properties": {ROBOT: argument, **tool.arguments}}
 
 
-def _asking(
-    tool: Tool, fleet: Fleet, fan_out: FanOut, max_chars: int, given: Mapping[str, object]
-) -> Question:
-    """Checks the arguments of a call, and returns what asks one robot or several."""
-    own = {name: value for name, value in given.items() if name != ROBOT}
-    asked = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
-    return lambda _, call: asked.ask(given.get(ROBOT), call)
-
-
 @dataclass(frozen=True, slots=True)
 class _FleetQuestion:
     """A question to robots of a fleet: what asks one of them, and its arguments."""
@@ -195,17 +191,20 @@ class _FleetQuestion:
         Raises:
             EpisodicError: there is none.
         """
-        if isinstance(named, str) and "," in named:
-            names = dict.fromkeys(map(str.strip, named.split(",")))
-            robots = [self.fleet.named(name, call) for name in names]
-        elif named is not None:
-            return self._of_one(self.fleet.named(named, call), call)
-        else:
+        if named is None:
             robots = self.fleet.allowed(call)
-        is_table = self.tool.name in TABLE_FOR_ALL and self.given.get("by") is not None
-        if (self.tool.name in ANSWER_FOR_ALL or is_table) and self.given.get("between") is None:
-            return self._of_all(robots, call)
-        return self._of_one(_only_one(self.tool.name, robots), call)
+        else:
+            names = [*map(str.strip, named.split(","))] if isinstance(named, str) else [named]
+            robots = [self.fleet.named(name, call) for name in names]
+        tool, given = self.tool.name, self.given
+        is_table = tool in TABLE_FOR_ALL and given.get("by") is not None
+        if (
+            (named is None or len(robots) > 1)
+            and (tool in ANSWER_FOR_ALL or is_table)
+            and given.get("between") is None
+        ):
+            return self._of_all([*dict.fromkeys(robots)], call)
+        return self._of_one(_only_one(tool, robots), call)
 
     def _of_one(self, robot: Robot, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
@@ -301,32 +300,29 @@ class _FleetQuestion:
         return lake.since(MIN_NS if begin is None else begin)
 
 
-@dataclass(eq=False)
 class Page:
-    """The `limit` rows that come first, of the rows of robots that answered so far. Thread-safe.
+    """The `limit` rows that come first, of the rows of robots that answered so far.
 
-    The newest rows come first, or the oldest.
+    The newest rows come first, or the oldest. Rows that one of two threads does not see leave the
+    page longer than it needs to be, not shorter.
     """
 
-    limit: int | None
-    _: KW_ONLY
-    oldest_first: bool
-    _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
-    _times: list[Ns] = field(default_factory=list, init=False)
+    def __init__(self, limit: int | None, *, oldest_first: bool) -> None:
+        self.limit, self.oldest_first = limit, oldest_first
+        self._times: list[Ns] = []
 
     def add(self, times: Iterable[Ns]) -> None:
         """Adds the times of a robot's rows."""
-        with self._lock:
-            self._times = sorted((*self._times, *times), reverse=not self.oldest_first)
-            del self._times[self.limit :]
+        times = sorted((*self._times, *times), reverse=not self.oldest_first)
+        self._times = times[: self.limit]
 
     def window(self) -> TimeWindow | None:
         """Returns where a row's time must lie for a place on the page; None while there is room."""
-        with self._lock:
-            if self.limit is None or len(self._times) < max(self.limit, 1):
-                return None
-            # Rows are put in order by times as replies show them, in milliseconds.
-            early, late = self._times[-1] - NS_PER_MS, self._times[-1] + NS_PER_MS
+        times = self._times
+        if self.limit is None or len(times) < max(self.limit, 1):
+            return None
+        # Rows are put in order by times as replies show them, in milliseconds.
+        early, late = times[-1] - NS_PER_MS, times[-1] + NS_PER_MS
         return TimeWindow(MIN_NS, late) if self.oldest_first else TimeWindow(early, MAX_NS)
 
 
@@ -373,9 +369,8 @@ def _shared_error(failed: Mapping[str, EpisodicError]) -> EpisodicError:
         return InvalidArgumentsError(text if len(reasons) > 1 else next(iter(reasons)))
     if kinds == {errors.NotInLakeError}:
         return errors.NotInLakeError(text)
-    if any(issubclass(kind, errors.QueryTimeoutError) for kind in kinds):
-        return errors.QueryTimeoutError(text)
-    return errors.RefusedError(text)
+    is_late = errors.QueryTimeoutError in kinds
+    return errors.QueryTimeoutError(text) if is_late else errors.RefusedError(text)
 
 
 def merged(

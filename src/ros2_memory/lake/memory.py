@@ -1,4 +1,4 @@
-"""The memory of one robot over its bags in a lake: their index, and what reads their messages."""
+"""The index of one robot's bags in a lake, and what reads their messages."""
 
 from __future__ import annotations
 
@@ -10,17 +10,15 @@ from collections import Counter
 from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
-from operator import attrgetter
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 from zlib import crc32
 
 from ros2_memory.columns.pack import is_large
-from ros2_memory.columns.scanner import Caches, Scanner
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.errors import BagError, BagVanishedError, NotInLakeError
 from ros2_memory.core.model import COMPRESSED, BagFile, BagState, TimeWindow
-from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
@@ -33,10 +31,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.columns.store import ColumnStore
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.extract import SchemaExtractor
     from ros2_memory.lake.files import Days, Lake
 
 MOST_BAGS: Final = 45_000
@@ -289,8 +285,8 @@ class _Head(NamedTuple):
 class LakeReader(BagReader):
     """An adapter of `BagReader`: the bags of one robot in a lake.
 
-    Messages of one time are in the order of their topics. Of images, clouds, scans and the like a
-    lake has the times alone: to read their payloads is refused.
+    Of images, clouds, scans and the like a lake has the times alone: to read their payloads is
+    refused.
 
     Attributes:
         index: its bags.
@@ -328,9 +324,12 @@ class LakeReader(BagReader):
             NotInLakeError: the lake has the times of a topic alone.
         """
         step = -1 if newest_first else 1
-        batches = [*self.batches(path, topics, window)][::step]
-        records = (map(batch.record, range(batch.log_times.size)[::step]) for batch in batches)
-        yield from heapq.merge(*records, key=attrgetter("log_time"), reverse=newest_first)
+        merged = heapq.merge(
+            *(_in_order(batch, step) for batch in self.batches(path, topics, window)),
+            key=itemgetter(0, 1),
+            reverse=newest_first,
+        )
+        yield from (record for *_, record in merged)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, bare: Collection[str] = ()
@@ -443,36 +442,7 @@ class LakeReader(BagReader):
         return lake.select(sql, "channels", files, asked)
 
 
-def lake_memory(
-    index: LakeIndex,
-    limits: QuerySettings,
-    *,
-    extractor: SchemaExtractor,
-    decoder: BagReader,
-    large: LargeReads,
-    store: ColumnStore | None = None,
-    reading: str = "",
-    caches: Caches | None = None,
-) -> Memory:
-    """Returns the memory of one robot whose bags and messages are read from a lake.
-
-    Args:
-        index: the robot's bags in the lake.
-        limits: the settings of queries.
-        extractor: knows the types of messages.
-        decoder: decodes messages.
-        large: the turn to hold much of a bag.
-        store: of the columns of its bags, which are made again from the lake; None for none.
-        reading: the hash of the settings that decide what is read from bags.
-        caches: those of the columns of all robots.
-    """
-    return Memory(
-        index,
-        LakeReader(index, decoder, large),
-        extractor,
-        index.clock,
-        # Nothing is recorded here, and nothing deleted.
-        replace(limits, kept=None, recording="", screened=False),
-        Scanner(store, index.bag_dir, reading, large, caches),
-        large=large,
-    )
+def _in_order(batch: Batch, step: int) -> Iterator[tuple[Ns, int, Record]]:
+    """Yields time, place and record of each message, with a `step` of -1 from the last one on."""
+    times, places = batch.log_times[::step].tolist(), batch.places[::step].tolist()
+    return zip(times, places, map(batch.record, range(len(times))[::step]), strict=True)

@@ -11,9 +11,9 @@ import hashlib
 import json
 import math
 from collections import Counter, defaultdict
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import numpy as np
 
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.storage.base import Batch, Channel
+    from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
 """Packed bytes of each message on average; of a channel with more the lake has the times alone."""
@@ -65,6 +65,7 @@ _LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
 _MM: Final = 1000.0
 _SCORE_UNIT: Final = 1000.0
+_Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
 
 
 def bag_id_of(robot: str, recording: str, file: str, first: Ns) -> str:
@@ -101,20 +102,14 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     force, the pose topic, the spellings of labels, the settings (`config`) and the topics whose
     `messages` are shipped.
     """
-    counted = [
-        (topic.topic, topic.type, topic.count, topic.first, topic.last)
-        for topic in bag.summary.topics
-    ]
+    counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
     view = View(memory, Call())
     recordings = sessions_of(view).lending_to(bag.recording, bag.end)
     statics = repr(static_at(static_transforms(view, recordings), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
-    return _digest(
-        [
-            *(ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted),
-            *memory.index.joined_with(bag.recording),
-        ]
-    )
+    joined = memory.index.joined_with(bag.recording)
+    made = ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted
+    return _digest([*made, *joined])
 
 
 def rows_of(
@@ -152,29 +147,22 @@ class _BagRows:
         tracks = self._tracks()
         for frame, track in tracks:
             same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-            columns = (track.times, track.x, track.y, track.heading, track.begins)
-            for vertex in zip(*(column.tolist() for column in columns), strict=True):
-                row = dict(zip(("time_ns", "x", "y", "heading", "begins"), vertex, strict=True))
-                if math.isnan(row["heading"]):
-                    row["heading"] = None
-                self._rows["poses"].append({**same, **row})
+            columns = (track.times, track.x, track.y, track.begins, track.heading)
+            for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
+                row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
+                known = None if math.isnan(heading) else heading
+                self._rows["poses"].append({**same, **row, "heading": known})
         self._rows["things"] += self._things()
         topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        # Of each topic that can have some.
-        events = {
-            topic: bag_events.limited(MAX_PER_BAG, MAX_PER_BAG)
-            for topic, bag_events in events_of_bag(self._view, self._bag, topics).items()
-        }
-        for topic, found in events.items():
-            self._rows["events"] += self._events_of(topic, found)
+        seen = set[str]()
+        for topic, of_topic in events_of_bag(self._view, self._bag, topics).items():
+            events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
+            self._rows["events"] += self._events_of(topic, events)
+            # What the events of a topic rule out is not decoded.
+            may_have_some = any(map(may_have_detections, self._types[topic]))
+            if may_have_some and (events.visible.size or events.left_out):
+                seen.add(topic)
         driven = self._driven()
-        # What the events of a topic rule out is not decoded.
-        seen = {
-            topic
-            for topic, found in events.items()
-            if (found.visible.size or found.left_out)
-            and any(map(may_have_detections, self._types[topic]))
-        }
         first = tracks[0] if tracks else (None, empty_track())
         self._add_messages(seen, *first)
         self._rows["channels"] += self._channels()
@@ -268,12 +256,13 @@ class _BagRows:
                 by_channel[id(channel)] = _Messages(channel, is_whole, [] if has_payloads else None)
             by_channel[id(channel)].add(batch)
             _drop_payloads(by_channel.values())
-        order = sorted(
-            by_channel.values(),
-            key=lambda messages: (messages.channel.topic, messages.channel.type),
-        )
+        order = sorted(by_channel.values(), key=attrgetter("channel.topic", "channel.type"))
+        times = [np.unique(np.concatenate(messages.parts, 1)[0]) for messages in order]
+        none = np.empty(0, np.int64)
+        moments, channels = np.unique(np.concatenate([none, *times]), return_counts=True)
+        tied = moments[channels > 1]
         for number, messages in enumerate(order):
-            yield messages.row(number)
+            yield messages.row(number, tied)
 
     def _add_messages(self, seen: Collection[str], frame: str | None, track: RobotTrack) -> None:
         """Adds whole messages, and the detections of the topics `seen`."""
@@ -362,35 +351,37 @@ class _Messages:
     """The messages of a channel. `payloads`: None where they are not shipped; `size`: of these.
 
     `is_whole`: they are shipped whatever they take; of other images, clouds, scans and the like,
-    the times alone are.
+    the times alone are. `parts`: their log times, places and publish times.
     """
 
     channel: Channel
     is_whole: bool
     payloads: list[bytes] | None
-    parts: list[Batch] = field(default_factory=list)
+    parts: list[_Rows] = field(default_factory=list)
     size: int = 0
 
     def add(self, batch: Batch) -> None:
         """Takes more messages."""
-        # Without the buffer, in which are those of other channels.
-        self.parts.append(replace(batch, buffer=b""))
+        self.parts.append(np.stack((batch.log_times, batch.places, batch.publish_times)))
         if self.payloads is not None:
             self.payloads += map(batch.payload, range(batch.sizes.size))
             self.size += int(batch.sizes.sum())
 
-    def row(self, number: int) -> Row:
-        """Returns its row, the n-th of the bag; without payloads where these take too much."""
-        logged = np.concatenate([part.log_times for part in self.parts])
-        published = np.concatenate([part.publish_times for part in self.parts])
-        order = np.lexsort((np.concatenate([part.places for part in self.parts]), logged))
-        logged, published, channel = logged[order], published[order], self.channel
+    def row(self, number: int, tied: IntArray) -> Row:
+        """Returns its row, the n-th of the bag; without payloads where these take too much.
+
+        `tied`: log times of which several channels have messages.
+        """
+        times, channel = np.concatenate(self.parts, 1), self.channel
+        order = np.lexsort((times[1], times[0]))
+        logged, places, published = times[:, order]
         payloads = self.payloads and [self.payloads[nth] for nth in order.tolist()]
-        packed = packed_messages(logged, published, payloads)
+        order_counts = places if np.isin(logged, tied).any() else None
+        packed = packed_messages(logged, published, payloads, order_counts)
         most = max(_MOST_OF_MESSAGE * len(logged), _LEAST_OF_CHANNEL)
         if payloads is not None and not self.is_whole and len(packed) > most:
             payloads = None
-            packed = packed_messages(logged, published, None)
+            packed = packed_messages(logged, published, None, order_counts)
         schema = {"schema_encoding": channel.schema.encoding, "schema": channel.schema.text}
         return {
             **{name: getattr(channel, name) for name in ("topic", "type", "encoding", "latched")},

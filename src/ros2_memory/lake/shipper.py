@@ -12,6 +12,7 @@ import os
 import threading
 from contextlib import suppress
 from dataclasses import KW_ONLY, dataclass, field
+from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -165,16 +166,11 @@ class Shipper:
             LakeError: the lake cannot be written; what is left is done when it is opened again.
         """
         if not robot.answers(self.patience_s):
-            why = f"{robot.bag_dir} does not answer: is its disk reachable?"
-            done.problems.append(
-                f"{robot.name}: {why} Until it does, nothing of this robot is shipped"
-            )
+            why = "does not answer: is its disk reachable? Until it does, nothing of it is shipped"
+            done.problems.append(f"{robot.name}: {robot.bag_dir} {why}")
             return False
         try:
-            wanted = [
-                Tombstone.of(robot.name, forgetting)
-                for forgetting in read_forgettings(robot.bag_dir)
-            ]
+            wanted = [*map(partial(Tombstone.of, robot.name), read_forgettings(robot.bag_dir))]
         except (OSError, ValueError) as error:
             why = "until it is repaired, since what was forgotten could come back"
             file = f"{robot.name}: {robot.bag_dir / FORGOTTEN_FILE}: {error}"
@@ -228,7 +224,7 @@ class RobotBags:
     """One robot whose bags are shipped, and what is known of those that it has.
 
     `_states` has the newest state of each by its file, `known` what the lake has of them by their
-    ids; neither those that it had: a hub runs for years.
+    ids, `_confirmed` those with a receipt; none has those that are gone: a hub runs for years.
 
     Attributes:
         name: the robot.
@@ -268,7 +264,7 @@ class RobotBags:
         """Has everything looked at again."""
         self._states: dict[str, _KnownState] = {}
         self.known: dict[str, ShippedBag] = {}
-        self._receipts: dict[str, Receipt] | None = None
+        self._confirmed: set[ShippedBag] = set()
 
     def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBag]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
@@ -351,16 +347,11 @@ class RobotBags:
     def _drop_gone(self, bags: Sequence[BagFile]) -> None:
         """Drops what is known of bags that the robot has no longer."""
         names = {bag.file: self.name_of(bag) for bag in bags}
-        self._states = {file: known for file, known in self._states.items() if file in names}
-        ids, present = {known.bag_id for known in self._states.values()}, {*names.values()}
-        self.known = {
-            bag_id: shipped
-            for bag_id, shipped in self.known.items()
-            if bag_id in ids or shipped.file in present
-        }
-        if self._receipts is not None:
-            receipts = self._receipts.items()
-            self._receipts = {name: receipt for name, receipt in receipts if name in present}
+        self._states = {file: state for file, state in self._states.items() if file in names}
+        ids, present = {state.bag_id for state in self._states.values()}, {*names.values()}
+        shipped = [bag for bag in self.known.values() if bag.bag_id in ids or bag.file in present]
+        self.known = {bag.bag_id: bag for bag in shipped}
+        self._confirmed.intersection_update(shipped)
 
     def _identified(self, bag: BagFile, tombstones: Collection[Tombstone]) -> tuple[str, bool]:
         """Returns a bag's id, and whether it has forgotten messages; reads each state once."""
@@ -402,23 +393,19 @@ class RobotBags:
     def confirm(self, bags: Sequence[ShippedBag], shipper: Shipper, done: Shipped) -> None:
         """Notes that bags are in the lake; writes receipts for the robot's recorder, if any."""
         self.known |= {bag.bag_id: bag for bag in bags}
-        lake = shipper.lake.lake_id
-        if not has_recorded(self.bag_dir):
+        new = [bag for bag in bags if bag not in self._confirmed]
+        if not (new and has_recorded(self.bag_dir)):
             return
         try:
-            if self._receipts is None:
-                self._receipts = read_receipts(self.bag_dir)
-            receipts = self._receipts
+            receipts, lake = read_receipts(self.bag_dir), shipper.lake.lake_id
             missing = [
                 Receipt(bag.file, bag.bag_id, bag.size, bag.sha256, lake, shipper.clock.now())
-                for bag in bags
-                if not (
-                    is_shipped(receipts, bag.file, bag.size) and receipts[bag.file].lake == lake
-                )
+                for bag in new
+                if not is_shipped(receipts, bag.file, bag.size) or receipts[bag.file].lake != lake
             ]
             if missing:
                 append_receipts(self.bag_dir, missing)
-                receipts.update((receipt.bag, receipt) for receipt in missing)
+            self._confirmed.update(new)
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
             done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")

@@ -1,14 +1,17 @@
 """The Iceberg tables of a lake, as tables.yaml declares them: rows as Arrow tables, and which.
 
 In the column `packed` are the messages of one channel of a bag: both times and the payload of each.
+Where another channel of the bag has a message of the same log time, their places in the file are
+there, too, which say the order.
 What the bytes are, once decompressed (numbers are little-endian and lie in planes, the lowest byte
 of each first, as they then compress best)::
 
-    1       format
+    1       format: 1, or 2 with places
     1       0: times alone; 1: payloads, too
     4       n, the number of messages
     8 n     log times, each since the one before
     8 n     publish times, each since the log time
+    8 n     places, each since the one before; only in format 2
     4 n     the bytes of each payload
     ...     the payloads, in planes where all have one size, else one after the other
 
@@ -48,7 +51,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
 
-_FORMAT: Final = 1
+_PLAIN: Final = 1
+_PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
 ROWS_VERSION: Final = 32
@@ -204,9 +208,9 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
-    """Returns the condition on rows of one day of some robots."""
-    return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
+def of_days(days: Iterable[tuple[str, date]]) -> ex.BooleanExpression:
+    """Returns the condition on rows of some days, each of a robot."""
+    return _any_of(map(_of_day, days))
 
 
 def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
@@ -227,10 +231,16 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    condition: ex.BooleanExpression = ex.AlwaysFalse()
-    for (robot, day), bag_ids in ids.items():
-        condition = ex.Or(condition, ex.And(of_robots([robot], day), of_ids(robot, bag_ids)))
-    return condition
+    return _any_of(ex.And(_of_day(day), of_ids(day[0], bag_ids)) for day, bag_ids in ids.items())
+
+
+def _of_day(day: tuple[str, date]) -> ex.BooleanExpression:
+    return ex.And(_is(ex.EqualTo, "robot", day[0]), _is(ex.EqualTo, "day", day[1].isoformat()))
+
+
+def _any_of(conditions: Iterable[ex.BooleanExpression]) -> ex.BooleanExpression:
+    # At once: one after the other they are nested, and years of days deeper than Python allows.
+    return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *conditions)
 
 
 def overlapping(
@@ -241,11 +251,12 @@ def overlapping(
     `columns` have its first and last time (inclusive). Where there are `topics`, only their rows.
     """
     first, last = columns
-    span = ex.And(
-        _is(ex.LessThan, first, window.stop), _is(ex.GreaterThanOrEqual, last, window.start)
+    return ex.And(
+        _is(ex.EqualTo, "robot", robot),
+        _is(ex.LessThan, first, window.stop),
+        _is(ex.GreaterThanOrEqual, last, window.start),
+        _is(ex.In, "topic", topics) if topics else ex.AlwaysTrue(),
     )
-    of_robot = ex.And(_is(ex.EqualTo, "robot", robot), span)
-    return ex.And(of_robot, _is(ex.In, "topic", topics)) if topics else of_robot
 
 
 def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, IcebergTable]:
@@ -266,17 +277,23 @@ def open_tables(catalog: IcebergCatalog, names: Iterable[str]) -> dict[str, Iceb
 
 
 def packed_messages(
-    log_times: IntArray, publish_times: IntArray, payloads: Sequence[bytes] | None
+    log_times: IntArray,
+    publish_times: IntArray,
+    payloads: Sequence[bytes] | None,
+    places: IntArray | None = None,
 ) -> bytes:
     """Returns messages in order of their log times as bytes; without payloads where there are none.
 
-    `payloads` are of messages in the same order.
+    `payloads` are of messages in the same order, and so are `places`, if they are needed.
     """
+    form = _PLAIN if places is None else _PLACED
     parts = [
-        _HEAD.pack(_FORMAT, payloads is not None, len(log_times)),
+        _HEAD.pack(form, payloads is not None, len(log_times)),
         byte_planes(np.diff(log_times, prepend=np.int64(0)), 8),
         byte_planes(publish_times - log_times, 8),
     ]
+    if places is not None:
+        parts.append(byte_planes(np.diff(places, prepend=np.int64(0)), 8))
     if payloads is not None:
         sizes = np.array([len(payload) for payload in payloads], np.int64)
         joined = b"".join(payloads)
@@ -298,12 +315,16 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
         form, is_whole, count = _HEAD.unpack_from(content)
     except struct.error as error:
         raise ValueError("packed messages are cut short") from error
-    if form != _FORMAT:
-        raise ValueError(f"messages are packed in format {form}, this program reads {_FORMAT}")
+    if form not in (_PLAIN, _PLACED):
+        raise ValueError(f"messages are packed in format {form}, this program reads {_PLACED}")
     at = _HEAD.size
     logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
     published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
     at += 16 * count
+    places = np.arange(count)
+    if form == _PLACED:
+        places = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
+        at += 8 * count
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
         sizes = from_planes(content, at, count, 4).astype(np.int64)
@@ -314,4 +335,4 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
             planes = np.frombuffer(payloads, np.uint8).reshape(-1, count)
             payloads = planes.T.tobytes()
     starts = np.cumsum(sizes) - sizes
-    return Batch(channel, logged, published, np.arange(count), payloads, starts, sizes)
+    return Batch(channel, logged, published, places, payloads, starts, sizes)

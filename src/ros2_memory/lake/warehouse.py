@@ -6,14 +6,11 @@ becomes a `LakeError`, in whose sentence no secret is.
 Each file is recorded in the state directory before it is written: pyiceberg deletes none, and a
 process that is killed leaves files that no version ever had (`upkeep`).
 
-There is one writer: a lock that the system releases when its holder dies, and a lease.
-
-A commit of pyiceberg compares and swaps, so two writers would not lose a bag, nor have it twice.
-But only one knows what was forgotten, and with the SQLite catalogue of another state directory
-there would be a second lake in the same files. So there is one: by a lock in the lake's state
-directory, on a file system that supports locks, and for those with another state directory by a
-lease in the warehouse, whose holder renews its term. A state directory that has it goes on at once,
-another one when the term is over.
+There is one writer. A commit of pyiceberg compares and swaps, so two writers would not lose a bag,
+nor have it twice. But only one knows what was forgotten, and with the SQLite catalogue of another
+state directory there would be a second lake in the same files. So a lake belongs to one state
+directory, which a file in the warehouse names (`claim`), and that has a lock, which the system
+releases when its holder dies.
 """
 
 from __future__ import annotations
@@ -33,14 +30,14 @@ from typing import TYPE_CHECKING, Final, Literal
 
 from pyiceberg.catalog.rest import RestCatalog
 from pyiceberg.catalog.sql import SqlCatalog
-from pyiceberg.io import load_file_io
+from pyiceberg.io import FileIO, load_file_io
 from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Clock, Ns, WallClock, iso_local
+from ros2_memory.core.timebase import NS_PER_MS, Ns, WallClock
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 if TYPE_CHECKING:
@@ -52,10 +49,8 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
 
-LEASE_FILE: Final = "writer.lock"
-TERM_NS: Final[Ns] = 600 * NS_PER_S
-"""How long the lease in the warehouse holds: longer than any commit takes."""
-_RENEWED_NS: Final = TERM_NS // 4
+_LOCK_FILE: Final = "writer.lock"
+_OWNER_FILE: Final = "writer.json"
 _ID_FILE: Final = "writer.id"
 _MAX_TEXT: Final = 1000
 CATALOGUE_FILE: Final = "catalogue.sqlite"
@@ -171,6 +166,30 @@ class LakeLocation:
                 tables = open_tables(catalog, TABLES)
             yield LakeTables(self, tables)
 
+    def claim(self) -> None:
+        """Makes the lake that of this state directory, unless it is another one's.
+
+        A store has no locks, so two that claim it at the same moment may both have it, until each
+        claims it again before its next commit; of two commits at once a table takes only one.
+
+        Raises:
+            LakeError: it is another one's, which the sentence names, or cannot be reached.
+        """
+        path, own_id = f"{self.warehouse}/{NAMESPACE}/{_OWNER_FILE}", _id_in(self.state_dir)
+        folder, host = os.fspath(self.state_dir.absolute()), socket.gethostname()
+        own: dict[str, object] = {"id": own_id, "host": host, "state_dir": folder}
+        with self.translated("looking whose the lake is"):
+            store = load_file_io({**self.properties, **self.secrets}, path)
+            if not _owner_in(store, path):
+                with closing(store.new_output(path).create(overwrite=True)) as stream:
+                    stream.write(json.dumps(own).encode())
+            owner = _owner_in(store, path) or own
+        if owner["id"] != own_id:
+            whose = f"lake.state_dir={owner.get('state_dir')} on {owner.get('host')}"
+            do = "share that folder, which alone knows what was forgotten"
+            lost = f"if it is lost for good, delete {path}"
+            raise LakeError(f"this lake has another writer, with {whose}: {do}; {lost}")
+
     def last_commit(self) -> Ns | None:
         """Returns when a bag was last committed; None where none was. Makes nothing.
 
@@ -257,11 +276,10 @@ def writing_alone(state_dir: Path) -> Iterator[None]:
     Raises:
         LakeError: another process holds it, which the sentence names; or nothing can be locked.
     """
-    with _locked(state_dir, os.O_RDWR | os.O_CREAT, fcntl.LOCK_EX) as (descriptor, holder):
+    with _locked(state_dir, fcntl.LOCK_EX) as holder:
         if holder is not None:
             do = "a lake has one writer: stop that process first"
             raise LakeError(f"{holder} writes into this lake; {do}")
-        write_holder(descriptor)
         yield
 
 
@@ -271,107 +289,47 @@ def holder_of(state_dir: Path) -> str | None:
     Raises:
         LakeError: that cannot be found out.
     """
-    try:
-        with _locked(state_dir, os.O_RDONLY, fcntl.LOCK_SH) as (_, holder):
-            return holder
-    except FileNotFoundError:
+    if not (state_dir / _LOCK_FILE).exists():
         return None
+    with _locked(state_dir, fcntl.LOCK_SH) as holder:
+        return holder
 
 
 @contextmanager
-def _locked(state_dir: Path, flags: int, lock: int) -> Iterator[tuple[int, str | None]]:
-    """Locks the file, if nobody else has; yields its descriptor, and who has.
+def _locked(state_dir: Path, lock: int) -> Iterator[str | None]:
+    """Locks the file, if nobody else has; yields who has. Who writes is named in it.
 
     Raises:
-        FileNotFoundError: there is none, and it is not to be made.
         LakeError: it cannot be opened or locked.
     """
-    path, holder = state_dir / LEASE_FILE, None
+    path, holder, writes = state_dir / _LOCK_FILE, None, lock == fcntl.LOCK_EX
+    flags = os.O_RDWR | os.O_CREAT if writes else os.O_RDONLY
     with ExitStack() as opened:
         try:
-            if flags & os.O_CREAT:
+            if writes:
                 state_dir.mkdir(parents=True, exist_ok=True)
             descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
             opened.callback(os.close, descriptor)
             fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
+            if writes:
+                write_holder(descriptor)
         except BlockingIOError:
             pid, host = read_holder(descriptor)
             holder = "another process" if pid is None else f"process {pid} on {host}"
-        except FileNotFoundError:
-            raise
         except OSError as error:
             do = "lake.state_dir must be on a file system that supports locks"
             raise LakeError(f"{path} cannot be opened or locked: {error.strerror}; {do}") from error
-        yield descriptor, holder
+        yield holder
 
 
-class WarehouseLease:
-    """A lease in the warehouse of a lake, for those who do not share its state directory.
-
-    A store has no locks, so two that take it at the same moment may both have it, until either
-    looks at it before its next commit; of two commits at once a table takes only one.
-
-    Args:
-        location: the lake.
-        clock: the wall clock, which must not differ between machines by as much as the term.
-    """
-
-    def __init__(self, location: LakeLocation, clock: Clock) -> None:
-        self._location = location
-        self._clock = clock
-        self._file = f"{location.warehouse}/{NAMESPACE}/writer.json"
-        self._store = load_file_io({**location.properties, **location.secrets}, self._file)
-        self._id = _id_in(location.state_dir)
-        self._until: Ns = 0
-
-    def renew(self) -> None:
-        """Takes the lease, or prolongs it where a quarter of its term is over.
-
-        Raises:
-            LakeError: another state directory has it, or the warehouse cannot be reached.
-        """
-        now = self._clock.now()
-        if self._until - now <= TERM_NS - _RENEWED_NS:
-            self._until = 0
-            with self._location.translated("taking the lease of the lake"):
-                self._write(now, now + TERM_NS)
-                self._require_mine(now)
-            self._until = now + TERM_NS
-
-    def confirm(self) -> None:
-        """Looks whether the lease is still held, and renews it: before each commit.
-
-        Raises:
-            LakeError: as `renew`.
-        """
-        self._until = 0
-        self.renew()
-
-    def close(self) -> None:
-        """Ends the lease, if it is held; one that cannot be ended is over with its term."""
-        if self._until:
-            with suppress(LakeError), self._location.translated("ending the lease of the lake"):
-                self._write(self._clock.now(), 0)
-
-    def _require_mine(self, now: Ns) -> None:
-        lease: object = None
-        file = self._store.new_input(self._file)
-        if file.exists():
-            with file.open() as stream, suppress(ValueError):
-                lease = json.loads(stream.read(_MAX_TEXT))
-        if not isinstance(lease, dict) or lease.get("id") == self._id:
-            return
-        until = lease.get("until")
-        if isinstance(until, int) and until > now:
-            who = f"process {lease.get('pid')} on {lease.get('host')} writes into this lake"
-            why = f"another lake.state_dir, until {iso_local(until)}"
-            raise LakeError(f"{who}, with {why}: a lake has one writer, and one state_dir")
-
-    def _write(self, now: Ns, until: Ns) -> None:
-        self._require_mine(now)
-        lease = {"id": self._id, "pid": os.getpid(), "host": socket.gethostname(), "until": until}
-        with closing(self._store.new_output(self._file).create(overwrite=True)) as stream:
-            stream.write(json.dumps(lease).encode())
+def _owner_in(store: FileIO, path: str) -> dict[str, object]:
+    """Returns what the file of a lake's owner has; nothing where it is damaged, or not there."""
+    owner: object = None
+    file = store.new_input(path)
+    if file.exists():
+        with file.open() as stream, suppress(ValueError):
+            owner = json.loads(stream.read(_MAX_TEXT))
+    return owner if isinstance(owner, dict) and isinstance(owner.get("id"), str) else {}
 
 
 def _id_in(state_dir: Path) -> str:

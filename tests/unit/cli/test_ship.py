@@ -18,7 +18,7 @@ from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.upkeep import TOMBSTONES_FILE
-from ros2_memory.lake.warehouse import WarehouseLease, writing_alone
+from ros2_memory.lake.warehouse import LakeLocation, writing_alone
 from tests.support.fleets import START_S, seeded, write_robot
 from tests.support.lakes import lake_column, write_bag
 
@@ -117,13 +117,13 @@ def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
 ) -> None:
     monkeypatch.setenv("MEMORY_DEPLOYMENT", "lake")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    taken = WarehouseLease.renew
+    claimed = LakeLocation.claim
     waited: list[float] = []
 
-    def renew(lease: WarehouseLease) -> None:
+    def claim(location: LakeLocation) -> None:
         if not waited:
             raise LakeError("the store cannot be reached")
-        taken(lease)
+        claimed(location)
 
     def wait(seconds: float) -> None:
         if seconds > 0:  # not before a commit
@@ -131,7 +131,7 @@ def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
         if len(waited) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(WarehouseLease, "renew", renew)
+    monkeypatch.setattr(LakeLocation, "claim", claim)
     monkeypatch.setattr(ship_module, "_wait", wait)
     settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake"]
     assert cli.main(["ship", *settings]) == 130

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -16,16 +16,14 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.timebase import Deadline
 from ros2_memory.fleet.robots import FanOut, Robot
-from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.context import Call
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
 
 def robots(count: int) -> list[Robot]:
-    def none() -> Memory:
-        raise AssertionError("no memory is needed")
-
+    none: Any = None  # no memory is needed
     return [Robot(f"r{number}", Path("bags"), none) for number in range(count)]
 
 

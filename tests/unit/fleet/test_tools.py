@@ -6,7 +6,6 @@ The oracle is a server of each robot alone.
 from __future__ import annotations
 
 from collections import Counter
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,9 +74,7 @@ def test_each_robots_now_stands_beside_its_ages_where_it_is_the_newest_message(
     folder: Path,
 ) -> None:
     limits = QuerySettings(now="latest")
-    robots = [
-        Robot(name, folder / name, partial(fleet_memory, folder / name, limits)) for name in NAMES
-    ]
+    robots = [Robot(name, folder / name, fleet_memory(folder / name, limits)) for name in NAMES]
     fleet = Fleet(robots, FixedClock(NOW))
     nows = {name: float(seeded(name).end_s) for name in NAMES}
     assert len({*nows.values()}) > 1
@@ -286,9 +283,8 @@ def test_coordinates_are_asked_of_one_robot_unless_all_share_a_map(
 def test_a_place_is_that_of_each_robots_own_map(folder: Path) -> None:
     def robot(name: str, x: float | None) -> Robot:
         places = () if x is None else (Place("kitchen", "map", Circle(x, 2.0, 9.0)),)
-        return Robot(
-            name, folder / name, partial(fleet_memory, folder / name, QuerySettings(places=places))
-        )
+        limits = QuerySettings(places=places)
+        return Robot(name, folder / name, fleet_memory(folder / name, limits))
 
     robots = map(robot, NAMES, (1.0, 500.0, None))
     found = reply(Fleet(robots, FixedClock(NOW)), "visits", {"where": "kitchen"})

@@ -10,7 +10,6 @@ import os
 import shutil
 import threading
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,8 +75,7 @@ def six(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Six]:
 
     def robot_of(name: str) -> Robot:
         reader = Hanging(released) if name == "slow" else McapReader()
-        build = partial(memory_of, folder / name, clock=clock, reader=reader)
-        return Robot(name, folder / name, build)
+        return Robot(name, folder / name, memory_of(folder / name, clock=clock, reader=reader))
 
     tools = tools_of(Fleet(map(robot_of, (*ROBOTS, "offline")), clock, shared_map=True))
     hung = reply_of(tools["list_frames"], {"robot": "slow"}, Call(Deadline.after(0.2)))

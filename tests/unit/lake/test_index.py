@@ -13,7 +13,8 @@ from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.files import DataFiles, Parameters
 from ros2_memory.lake.tables import day_of
 from tests.support.bags import detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S
@@ -22,10 +23,10 @@ from tests.support.lakes import lake_robot, robot_bags, ship
 DAY_S = 86_400
 
 
-class WatchedEngine(LakeEngine):
+class WatchedEngine(DuckdbEngine):
     """Keeps which files were read."""
 
-    def __init__(self, engine: LakeEngine) -> None:
+    def __init__(self, engine: DuckdbEngine) -> None:
         self._engine = engine
         self.read: set[str] = set()
 
@@ -44,7 +45,7 @@ class WatchedEngine(LakeEngine):
 class Shipping:
     """A robot whose bags are shipped a few at a time."""
 
-    def __init__(self, folder: Path, engine: LakeEngine) -> None:
+    def __init__(self, folder: Path, engine: DuckdbEngine) -> None:
         self._folder = folder
         self.engine = WatchedEngine(engine)
         self._passes = 0
@@ -64,7 +65,7 @@ class Shipping:
 
 
 @pytest.fixture
-def shipping(tmp_path: Path, engine: LakeEngine) -> Shipping:
+def shipping(tmp_path: Path, engine: DuckdbEngine) -> Shipping:
     return Shipping(tmp_path, engine)
 
 
@@ -144,7 +145,7 @@ def test_days_that_are_looked_at_late_show_nothing_about_the_robots_clock(
 
 
 def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_robot(
-    tmp_path: Path, engine: LakeEngine
+    tmp_path: Path, engine: DuckdbEngine
 ) -> None:
     bags = tmp_path / "bags"
     for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):

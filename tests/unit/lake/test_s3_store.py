@@ -7,11 +7,13 @@ moto is in no lock, since its server brings forty packages for this one test:
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
 
+from ros2_memory.core.errors import LakeError
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
 from ros2_memory.lake.warehouse import LakeLocation
 from tests.support.lakes import LATER, ship_and_ask
@@ -37,6 +39,11 @@ def test_bags_are_shipped_once_into_a_bucket_and_asked(tmp_path: Path) -> None:
         where.state_dir.mkdir()
         endpoint = where.properties["s3.endpoint"]
         urlopen(Request(f"{endpoint}/robots", method="PUT")).close()  # noqa: S310 - of this host
+        for _ in range(2):
+            where.claim()
+        (tmp_path / "other").mkdir()
+        with pytest.raises(LakeError, match="another writer"):
+            replace(where, state_dir=tmp_path / "other").claim()
         ship_and_ask(where, tmp_path / "hall")
         with where.writable() as tables:
             assert forget_in_lake(tables, Tombstone("hall", 0, LATER)).bags == 2

@@ -172,7 +172,7 @@ def test_what_ships_for_years_forgets_bags_that_are_gone(tmp_path: Path) -> None
             bag = write_bag(tmp_path / "hall", day, at_s=START_S + day * DAY_S)
             assert shipper.run().bags == 1
             [robot] = shipper.robots
-            assert max(map(len, (robot.known, robot._states, robot._receipts or ()))) <= 2
+            assert max(len(robot.known), len(robot._states), len(robot._confirmed)) <= 2
             bag.unlink()
 
 

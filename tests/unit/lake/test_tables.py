@@ -1,6 +1,6 @@
 """The tables of a lake, in a catalogue of SQLite and files."""
 
-from datetime import date
+from datetime import date, timedelta
 from pathlib import Path
 
 import pyarrow as pa
@@ -10,9 +10,10 @@ from pyiceberg.partitioning import PartitionSpec
 from pyiceberg.schema import Schema
 from pyiceberg.types import DateType, NestedField, StringType
 
-from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
+from ros2_memory.lake.tables import NAMESPACE, TABLES, of_bags, open_tables
 
-KEYS = {"robot": "hall", "bag_id": "a", "day": date(2026, 11, 20)}
+DAY = date(2026, 11, 20)
+KEYS = {"robot": "hall", "bag_id": "a", "day": DAY}
 
 
 @pytest.fixture
@@ -47,6 +48,16 @@ def test_an_older_lake_gets_the_columns_that_are_new(catalog: SqlCatalog) -> Non
     catalog.create_table(f"{NAMESPACE}.things", Schema(*fields), partition_spec=PartitionSpec())
     table = open_tables(catalog, ["things"])["things"]
     assert table.schema().column_names == [*TABLES["things"].columns]
+
+
+def test_bags_of_years_are_deleted_at_once(catalog: SqlCatalog) -> None:
+    """Python's limit of nested calls was reached with 500 days."""
+    table = open_tables(catalog, ["events"])["events"]
+    days = [DAY + timedelta(days=nth) for nth in (0, 1, 1199, 1200)]
+    rows = [{**KEYS, "day": day, "topic": "/odom", "first_ns": 0} for day in days]
+    table.append(TABLES["events"].filled(rows))
+    table.delete(of_bags(("hall", days[0] + timedelta(days=nth), "a") for nth in range(1200)))
+    assert table.scan().to_arrow()["day"].to_pylist() == [days[-1]]
 
 
 def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:

@@ -15,7 +15,7 @@ from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.shipper import Shipped
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
@@ -46,13 +46,13 @@ class World(NamedTuple):
         robots = [
             Robot(name, Path("/") / name, robot.memory, lake=of_lake)
             for name, robot in self.mounted.robots.items()
-            for of_lake in [self.lake.robots[name].memory()]
+            for of_lake in [self.lake.robots[name].memory]
         ]
         return Fleet(robots, self.mounted.clock, shared_map=True)
 
 
 @pytest.fixture(scope="module")
-def world(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def world(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
     of_robots = [robot_bags(name, write(folder / name)) for name, write in ROBOTS.items()]
     shipped = ship(lake, of_robots, messages=MESSAGES, most_bags=100)
@@ -118,7 +118,7 @@ def test_answers_say_up_to_when_each_robot_was_shipped(world: World) -> None:
     unmounted = [replace(robot, is_mounted=lambda: False) for robot in world.both().robots.values()]
     *_, note = reply(Fleet(unmounted, world.lake.clock), "find_last_match", asked)["notes"]
     latest = {
-        name: robot.memory().index.snapshot().latest for name, robot in world.lake.robots.items()
+        name: robot.memory.index.snapshot().latest for name, robot in world.lake.robots.items()
     }
     times = [f"{name} up to {iso_local(latest[name] or 0)}" for name in sorted(latest, key=str)]
     assert note.startswith("from the lake, which has what was shipped: behind up to ")

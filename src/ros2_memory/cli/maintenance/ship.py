@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Final, NoReturn
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.lake.shipper import RobotBags, Shipper
-    from ros2_memory.lake.warehouse import LakeLocation, WarehouseLease
+    from ros2_memory.lake.warehouse import LakeLocation
 
 _STEP_S: Final = 5.0
 """How long it waits at a time: the service manager hears from it in between."""
@@ -69,16 +69,15 @@ def ship(
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
-    from ros2_memory.lake.warehouse import WarehouseLease, writing_alone  # noqa: PLC0415
+    from ros2_memory.lake.warehouse import writing_alone  # noqa: PLC0415
 
     shown = settings.logging.level if verbose or not (once or forget) else "warning"
     configure_logging(shown, settings.logging.format)
-    alone = writing_alone(location.state_dir)
-    with alone, closing(WarehouseLease(location, WallClock())) as lease:
-        shipping = _Shipping(settings, location, lease, robots)
+    with writing_alone(location.state_dir):
+        shipping = _Shipping(settings, location, robots)
         if forget is None and not once:
             shipping.go_on(partial(_new_robots, overrides, shared))
-        lease.renew()
+        location.claim()
         if forget is not None and window is not None:
             return _forget(location, forget, window, robots, as_json=as_json)
         with shipping.shipper() as shipper:
@@ -176,14 +175,13 @@ def _wait(seconds: float) -> None:
 
 @dataclass
 class _Shipping:
-    """What ships the bags of robots while it has the lease.
+    """What ships the bags of robots.
 
     `committed_s` is when it last began a commit, by the monotonic clock.
     """
 
     settings: Settings
     location: "LakeLocation"
-    lease: "WarehouseLease"
     robots: "Sequence[RobotBags]"
     committed_s: float = -math.inf
 
@@ -210,12 +208,8 @@ class _Shipping:
                 messages=self.settings.lake.messages,
                 tombstones={*tombstones},
                 before_commit=self._before_commit,
-                alive=self._alive,
+                alive=partial(notify, WATCHDOG),
             )
-
-    def _alive(self) -> None:
-        notify(WATCHDOG)
-        self.lease.renew()
 
     def _before_commit(self, is_full: bool) -> None:
         """Waits until enough time has passed since the last commit, but with no full batch.
@@ -225,7 +219,7 @@ class _Shipping:
         if not is_full:
             _wait(self.committed_s + self.settings.lake.commit_interval_s - time.monotonic())
         self.committed_s = time.monotonic()
-        self.lease.confirm()
+        self.location.claim()
 
     def go_on(self, new_robots: "Callable[[Sequence[RobotBags]], Sequence[RobotBags]]") -> NoReturn:
         """Ships until the process is stopped; a lake that fails is tried again.
@@ -238,14 +232,14 @@ class _Shipping:
         kept_up_s = -math.inf
         while True:
             try:
-                self.lease.renew()
+                self.location.claim()
                 with self.shipper() as shipper:
                     new: Sequence[RobotBags] = ()
                     while not new:
-                        self.lease.renew()
                         problems = shipper.run().problems
                         is_due = time.monotonic() - kept_up_s >= _UPKEEP_S
                         if is_due:
+                            self.location.claim()
                             shipper.keep_up(self.grace)
                             kept_up_s = time.monotonic()
                         for problem in problems:
