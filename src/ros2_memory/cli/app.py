@@ -5,8 +5,10 @@ wait for the libraries of all of them.
 """
 
 import signal
+import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, cast
 
@@ -178,6 +180,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     # Signals end it as Ctrl-C does, so that files are closed.
     before = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
+    if isinstance(sys.stdout, TextIOWrapper):  # names and texts that its encoding has not
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         # An application with a callback is a group.
         group = cast("TyperGroup", get_command(app))

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Final
 
@@ -131,8 +130,6 @@ def ask(
         print_reply(
             stdout_console(), _without_waypoints(answer), unix_from_ns(present_time(memory))
         )
-    if name not in tools:
-        print(f"tools: {', '.join(tools)}", file=sys.stderr)
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
@@ -271,7 +268,7 @@ def _print_help(name: str) -> None:
     """
     tools = {tool.name: tool for tool in build_tools(QuerySettings(), writing=True)}
     if name not in tools:
-        raise InvalidArgumentsError(f"there is no tool {name}; the tools are {', '.join(tools)}")
+        raise InvalidArgumentsError(f"there is no tool {name}; the tools are: {', '.join(tools)}")
     tool = tools[name]
     print_line(f"ros2-memory ask {name} key=value ... [PATH]\n\n{tool.description}\n")
     for argument, schema in _arguments(tool):

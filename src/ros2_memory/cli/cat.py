@@ -12,7 +12,7 @@ from typing import Annotated, TypeAlias
 import typer
 
 from ros2_memory.cli.options import Bags, Times
-from ros2_memory.cli.output import format_time, format_value, leaves, print_notes
+from ros2_memory.cli.output import escape, format_time, format_value, leaves, print_notes
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.text import counted, listed, match_topics
@@ -71,10 +71,10 @@ def cat(
     exact = as_csv or as_json
     rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
     lines = _csv(rows) if as_csv else (_line(*row, as_json=as_json) for row in rows)
-    count = 0
+    count, is_screen = 0, sys.stdout.isatty()
     for line in lines:
         count += 1
-        print(line)
+        print(escape(line) if is_screen else line)
     sys.stdout.flush()
     note_unread(view, window)
     print_notes(view.notes.sentences())

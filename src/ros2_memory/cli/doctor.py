@@ -35,7 +35,7 @@ from ros2_memory.cli.findings import (
     warning,
 )
 from ros2_memory.cli.info import assumed_active
-from ros2_memory.cli.options import AsJson, Bags, open_memory
+from ros2_memory.cli.options import AsJson, Bags, open_memory, reason_of
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
@@ -58,9 +58,10 @@ from ros2_memory.insights.status import (
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.installation import advice_on_rmw, rmw_of, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.results import Undecodable
 from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
-from ros2_memory.storage.base import BagReader, Closing
+from ros2_memory.storage.base import Closing
 
 T = TypeVar("T")
 
@@ -73,7 +74,8 @@ _COMMANDS_OF_EXTRAS: Final = (
     ("plot", "matplotlib", "plot"),
 )
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
-_NOT_REPAIRED: Final = "copy them again from their source, or delete them"
+_NOT_REPAIRED: Final = "copy them again from their source; what is so there, too, cannot be read"
+_READ: Final = "give this user the right to read it, or run as the user of the services"
 _UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 _LIST_TAKEN: Final = "a changed list is taken within seconds"
@@ -138,8 +140,11 @@ def _findings_of(
 ) -> Iterator[Finding]:
     """Yields the findings of checks by their concerns."""
     for about, check in checks.items():
-        for finding in check(what):
-            yield finding._replace(about=finding.about or about)
+        try:
+            for finding in check(what):
+                yield finding._replace(about=finding.about or about)
+        except OSError as problem:
+            yield error(reason_of(problem), _READ, about=about)
 
 
 def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
@@ -175,8 +180,8 @@ def check_bag_dir(robot: Examined) -> Iterator[Finding]:
         do = "the recorder makes it when it starts; is its disk mounted?"
         yield warning(f"{bag_dir} is not there", do)
     elif not os.access(bag_dir, os.R_OK | os.X_OK):
-        do = "give this user the right to read it, or run as the user of the services"
-        yield error(f"{user} may not read {bag_dir}", do)
+        yield error(f"{user} may not read {bag_dir}", _READ)
+        return
     elif not robot.records:
         yield ok(f"{bag_dir}, readable by {user}")
     elif os.access(bag_dir, os.W_OK):
@@ -251,7 +256,7 @@ def check_clock(robot: Examined) -> Iterator[Finding]:
 
 def check_bags(robot: Examined) -> Iterator[Finding]:
     """Checks that all bags can be read, and all messages in them decoded; and what they hold."""
-    settings, memory, snapshot, _ = robot
+    memory, snapshot = robot.memory, robot.snapshot
     covered = data_time_range(memory, Call())
     if snapshot.problem:
         yield error(snapshot.problem, "see bag_dir above; is the disk mounted?")
@@ -262,17 +267,23 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield warning(nothing_here(snapshot), do)
-    if broken := (*covered.damaged, *covered.incomplete):
-        names = listed([f"{bag.path.name} ({bag.reason})" for bag in broken])
-        seen = f"{len(covered.damaged)} damaged and {len(covered.incomplete)} unfinished: {names}"
-        others = sum(not _is_repairable(bag, memory.reader) for bag in broken)
-        rest = f"; {others} of them it cannot repair: {_NOT_REPAIRED}" if others else ""
-        repaired = f"ros2-memory recover {settings.recording.bag_dir}{rest}"
-        yield warning(seen, _NOT_REPAIRED if others == len(broken) else repaired)
-    for reason in dict.fromkeys(bag.reason for bag in covered.unread):
-        unread = [bag.path.name for bag in covered.unread if bag.reason == reason]
-        files = counted(len(unread), "file is", "files are")
-        yield warning(f"{files} not read: {listed(unread)}", reason)
+    aside: dict[tuple[str, str], list[str]] = {}
+    for bag in covered.unread:
+        aside.setdefault(("not read", bag.reason), []).append(bag.path.name)
+    for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
+        for bag in files:
+            named = f"{bag.path.name} ({bag.reason})"
+            aside.setdefault((state, _remedy(bag, memory)), []).append(named)
+    for (state, do), names in aside.items():
+        yield warning(f"{counted(len(names), 'file is', 'files are')} {state}: {listed(names)}", do)
+    yield from _check_content(memory, snapshot, covered.undecodable)
+    yield from _check_recordings(memory, snapshot)
+
+
+def _check_content(
+    memory: Memory, snapshot: Snapshot, undecodable: Iterable[Undecodable]
+) -> Iterator[Finding]:
+    """Checks that bags are whole, as they state, and that their messages can be decoded."""
     odd = bags_with_remarks(snapshot)
     for forms, bags, do in (
         (
@@ -296,21 +307,20 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         (False, "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"),
     ):
         # The reason names the key where a configured folder would help.
-        topics = [
-            topic for topic in covered.undecodable if (_MSG_FOLDERS in topic.reason) is is_mended
-        ]
+        topics = [topic for topic in undecodable if (_MSG_FOLDERS in topic.reason) is is_mended]
         if topics:
             names = listed([f"{topic.topic} ({topic.reason})" for topic in topics])
             yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
-    yield from _check_recordings(memory, snapshot)
 
 
-def _is_repairable(bag: SetAside, reader: BagReader) -> bool:
-    """Returns whether `ros2-memory recover` repairs a file: MCAP that its writer did not finish."""
-    try:
-        return bag.path.suffix == ".mcap" and reader.closing(bag.path) is Closing.OPEN
-    except BagError:
-        return False
+def _remedy(bag: SetAside, memory: Memory) -> str:
+    """Returns what to do about a file; `ros2-memory recover` repairs MCAP without an end."""
+    if not os.access(bag.path, os.R_OK):
+        return _READ
+    with suppress(BagError):
+        if bag.path.suffix == ".mcap" and memory.reader.closing(bag.path) is Closing.OPEN:
+            return f"ros2-memory recover {memory.index.bag_dir}"
+    return _NOT_REPAIRED
 
 
 def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:

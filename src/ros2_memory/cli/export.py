@@ -9,7 +9,13 @@ from pathlib import Path
 from typing import Annotated, Final
 
 from ros2_memory.cli.options import AsJson, Bags, Times
-from ros2_memory.cli.output import print_json, print_line, print_notes, progress_bar
+from ros2_memory.cli.output import (
+    made_whole,
+    print_json,
+    print_line,
+    print_notes,
+    progress_bar,
+)
 from ros2_memory.core.errors import (
     BagError,
     ConfigError,
@@ -24,6 +30,7 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -108,13 +115,14 @@ def _topics(view: View, globs: Sequence[str]) -> list[str]:
     """Returns the recorded topics that match one of the globs; all without any.
 
     Raises:
-        NoDataError: no topic matches.
+        NoDataError: nothing is recorded, or no topic matches.
     """
+    require_bags(view)
     names = view.timeline.topics()
     chosen = {name for glob in globs or ("*",) for name in match_topics(names, glob)}
     if not chosen:
-        asked = f"no recorded topic matches {', '.join(globs)}" if globs else "nothing is recorded"
-        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, f"{asked}; see ros2-memory topics")
+        asked = f"no recorded topic matches {', '.join(globs)}; list_recorded_topics has them"
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, asked)
     return sorted(chosen)
 
 
@@ -223,13 +231,8 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS
             written += 1
             yield stored.record
 
-    temporary = path.with_name(f".{path.name}.tmp")
-    try:
-        temporary.unlink(missing_ok=True)
+    with made_whole(path) as temporary:
         McapWriter().write(temporary, records(), profile=profile)
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return written
 
 

@@ -318,7 +318,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     else:
         read = [row for row in rows if "start" in row]
         left_out = {"end"}  # there is the length
-        if all(row["whose"] == _OTHERS for row in read):
+        if read and all(row["whose"] == _OTHERS for row in read):
             left_out.add("whose")
             print_line(f"whose: {_OTHERS} made all of them")
         lists: JsonObject = {

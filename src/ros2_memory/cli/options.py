@@ -497,6 +497,13 @@ def _declared(option: Parameter) -> object:
     return Annotated[kind, typer.Option(*names, metavar=metavar, help=line)]
 
 
+def reason_of(error: Exception) -> str:
+    """Returns an error as a sentence; one of the system as its file and its reason."""
+    if not isinstance(error, OSError) or error.strerror is None:
+        return str(error)
+    return ": ".join(str(part) for part in (error.filename, error.strerror) if part)
+
+
 @contextmanager
 def reported_errors(command: str) -> Iterator[None]:
     """Prints an error of the block as one line on stderr, and exits with code 2.
@@ -510,7 +517,7 @@ def reported_errors(command: str) -> Iterator[None]:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(EXIT_NEGATIVE) from None
     except (EpisodicError, OSError) as error:
-        lines = "\n".join(map(with_local_times, str(error).split("\n")))
+        lines = "\n".join(map(with_local_times, reason_of(error).split("\n")))
         print(f"ros2-memory {command}: {lines}", file=sys.stderr)
         raise typer.Exit(EXIT_CANNOT_RUN) from None
     finally:

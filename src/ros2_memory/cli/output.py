@@ -1,6 +1,7 @@
 """Prints replies for people: tables for lists, lines for the rest; and a bar for what takes long.
 
-Recorded text comes from elsewhere: control characters in it never reach the terminal.
+And makes the files that a command writes. Recorded text comes from elsewhere: control characters in
+it never reach the terminal.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 import os
 import re
 import sys
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -20,11 +21,13 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
+from ros2_memory.core.errors import BagError
 from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from pathlib import Path
 
     from rich.progress import Progress
 
@@ -71,6 +74,29 @@ def print_line(line: str) -> None:
 def print_json(value: object) -> None:
     """Prints a value for programs, as a line on stdout."""
     print_line(json.dumps(value))
+
+
+@contextmanager
+def made_whole(path: Path) -> Iterator[Path]:
+    """Yields where to write a file, which takes its place at the end, or is gone where that fails.
+
+    Raises:
+        BagError: it cannot be written, under its own name.
+        OSError: likewise.
+    """
+    temporary = path.with_name(f".{path.name}.tmp")
+    try:
+        temporary.unlink(missing_ok=True)
+        yield temporary
+        temporary.replace(path)
+    except BagError as error:
+        own = error.path == str(temporary)
+        raise BagError(str(path) if own else error.path, error.reason) from error
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -29,6 +29,7 @@ from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
 from ros2_memory.cli.output import (
     format_duration,
     leaves,
+    made_whole,
     print_json,
     print_line,
     print_notes,
@@ -292,7 +293,8 @@ def _picture(out: Path, title: str, subtitle: str, size: Seconds) -> Iterator["F
         figure.suptitle(f"{title}\n{subtitle}".rstrip(), x=0.01, ha="left")
         yield figure
         metadata = {"Date": None} if out.suffix.lower() == ".svg" else None
-        figure.savefig(out, dpi=130, metadata=metadata)
+        with made_whole(out) as temporary:
+            figure.savefig(temporary, format=out.suffix[1:].lower(), dpi=130, metadata=metadata)
 
 
 def _font_folder() -> str:

@@ -21,7 +21,7 @@ from ros2_memory.cli.options import LOOKING, AsJson, Bags, is_folder, load_to_lo
 from ros2_memory.cli.output import print_line, print_notes, spinner
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject
 from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, without
@@ -29,6 +29,7 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
 
@@ -73,9 +74,8 @@ def prove(
     with spinner("asking"):
         expected = _answer(loaded, replace(memory, reader=cast("BagReader", reads)), words)
     view = View(memory, Call())
+    require_bags(view)
     parts = _parts(view)
-    if not parts:
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, "nothing is recorded: see ros2-memory info")
     read, tried = reads.spans(), list[_Proof]()
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
         for nth, spans in enumerate(_more_and_more(view, read, parts)):
@@ -250,15 +250,19 @@ def _words(question: str) -> list[str]:
 
 
 def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonValue:
-    """Returns the reply to a question, from the bags themselves."""
+    """Returns the reply to a question, from the bags themselves.
+
+    Raises:
+        InvalidArgumentsError: the tool refuses the question, or cannot answer it in time.
+    """
     memory = replace(memory, columns=Scanner(None, memory.index.bag_dir))
     dispatcher = build_dispatcher(settings, memory)
     tool, *given = words
     tools = {tool.name: tool for tool in dispatcher.tools}
-    if tool not in tools:
-        raise InvalidArgumentsError(f"there is no tool {tool}; the tools are {', '.join(tools)}")
-    (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools[tool], given)})
+    (reply,) = call_tools(dispatcher, {tool: question_for(memory, tool, tools.get(tool), given)})
     answer: JsonValue = json.loads(reply.text)
+    if reply.is_error and isinstance(answer, dict):
+        raise InvalidArgumentsError(str(answer["detail"]))
     return answer
 
 

@@ -91,7 +91,9 @@ class TestAsk:
         assert "\\x1b[31mred" in shown
 
     def test_a_name_that_no_tool_has_lists_those_that_are(self, exits: Program) -> None:
-        assert "get_position_seconds_ago" in exits(1, "ask", "where_am_i").err
+        listed = "the tools are: list_recorded_topics, data_time_range"
+        assert listed in exits(1, "ask", "where_am_i").out
+        assert listed in exits(2, "ask", "where_am_i", "--help").err
 
     @pytest.mark.parametrize("words", [("nowhere", "visits", "x=1"), ("visits", "x=1", "nowhere")])
     def test_a_folder_that_is_not_there_is_named(

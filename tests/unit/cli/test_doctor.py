@@ -17,6 +17,7 @@ from mcap.writer import Writer
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts
+from ros2_memory.cli import doctor
 from ros2_memory.core.timebase import NS_PER_S, iso_local
 from tests.support import stub_ros2
 from tests.support.bags import McapLayout, Msg, odom, write_mcap
@@ -304,10 +305,27 @@ def test_recover_is_not_advised_for_files_that_it_refuses(robot: Path, examined:
     assert "letter_0.mcap (not an MCAP file" in wrong["bags"][0]["seen"]
     whole = (robot / "rec" / "rec_0.mcap").read_bytes()
     lay(robot, "cut", whole[: len(whole) // 2])
-    wrong = examined(1)
-    assert wrong["bags"][0]["do"].startswith(
-        f"ros2-memory recover {robot}; 1 of them it cannot repair: "
+    advice = [finding["do"] for finding in examined(1)["bags"]]
+    assert {f"ros2-memory recover {robot}", wrong["bags"][0]["do"]} <= {*advice}
+
+
+def test_what_this_user_may_not_read_is_not_advised_to_be_copied_and_ends_no_report(
+    robot: Path, monkeypatch: pytest.MonkeyPatch, examined: Examined
+) -> None:
+    lay(robot, "letter", b"a letter")
+    access = os.access
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: "letter" not in str(path) and access(path, mode)
     )
+    assert examined(1)["bags"][0]["do"].startswith("give this user the right to read it")
+
+    def refuses(_: object) -> str:
+        raise PermissionError(13, "Permission denied", "leaving.json")
+
+    monkeypatch.setattr(doctor, "describe_leaving", refuses)
+    found = examined(2)
+    assert found["disk"][-1]["seen"] == "leaving.json: Permission denied"
+    assert "bags" in found
 
 
 def test_msg_folders_are_advised_for_what_they_would_mend_alone(
@@ -414,7 +432,7 @@ def test_a_copy_of_older_data_is_not_being_written_where_nobody_writes(
     code = 1 if recorder == "none" else 2
     seen = " ".join(each["seen"] for each in examined(code, f"recorder={recorder}")["bags"])
     assert ("counts as still being written" in seen) is is_active
-    assert ("0 damaged and 1 unfinished" in seen) is not is_active
+    assert ("1 file is unfinished: copy_0.mcap" in seen) is not is_active
 
 
 class TestExtras:

@@ -10,12 +10,14 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from io import BytesIO, TextIOWrapper
 from typing import TYPE_CHECKING
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory import cli
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import parse_end, parse_time
 from ros2_memory.cli.output import format_time
@@ -273,7 +275,32 @@ class TestRecordings:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
 
 
+def test_of_a_folder_without_a_recording_nobody_is_said_to_have_made_all(
+    tmp_path: Path, exits: Program
+) -> None:
+    (tmp_path / "letter.mcap").write_bytes(b"a letter")
+    assert "whose" not in exits(0, "recordings", tmp_path).out
+
+
 class TestCat:
+    @pytest.mark.parametrize("option", ["--csv", "--json"])
+    def test_no_text_commands_a_terminal(
+        self, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, option: str
+    ) -> None:
+        write_mcap(tmp_path / "rec_0.mcap", [text(T0, "\x1b[2J\x9b31m", "/speech")])
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+        shown = exits(0, "cat", "/speech", option, tmp_path).out
+        assert not {"\x1b", "\x9b"} & {*shown}
+
+    def test_letters_that_the_encoding_has_not_are_spelled_out(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        write_mcap(tmp_path / "rec_0.mcap", [text(T0, "k\u00fcche", "/speech")])
+        written = BytesIO()
+        monkeypatch.setattr(sys, "stdout", TextIOWrapper(written, encoding="ascii"))
+        assert cli.main(["cat", "/speech", str(tmp_path)]) == 0
+        assert written.getvalue().endswith(b"  k\\xfcche\n")
+
     def test_json_lines_are_whole_and_strict(self, tmp_path: Path, exits: Program) -> None:
         messages = [odom(T0 + 1, math.nan, 0.123456789), odom(T0 + 2, 1.0, 2.0)]
         write_mcap(tmp_path / "r" / "r_0.mcap", messages)

@@ -22,6 +22,8 @@ from tests.unit.test_positions import fix
 
 pytest.importorskip("matplotlib", reason="needs the extra plot")
 
+from matplotlib.figure import Figure
+
 from ros2_memory.cli import plot
 from ros2_memory.cli.options import day_of
 from ros2_memory.places.local_map import east_north
@@ -223,6 +225,22 @@ def test_where_there_can_be_no_picture_it_says_why(
     words = [str(tmp_path / each) if re.search(r"\.(svg|jpeg)$", each) else each for each in words]
     assert reason in exits(2, "plot", *words, f"recording.bag_dir={bags}").err
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_picture_that_cannot_be_written_leaves_the_one_before(
+    bags: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "path.svg"
+    out.write_bytes(b"before")
+
+    def fill_the_disk(_: Figure, path: Path, **_options: object) -> None:
+        path.write_bytes(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", fill_the_disk)
+    refused = exits(2, "plot", "path", "--out", out, bags)
+    assert refused.err == f"ros2-memory plot path: {out}: No space left on device\n"
+    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"before"]
 
 
 def test_without_the_extra_it_names_the_command_that_installs_it(

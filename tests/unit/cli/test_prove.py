@@ -132,14 +132,15 @@ def test_a_key_on_files_is_named_and_is_no_other_answer(
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "bags").mkdir()
     refused = exits(2, "prove", "visits x=1 y=1", "-o", tmp_path / "proof", tmp_path / "bags")
-    assert "nothing is recorded" in refused.err
+    assert "contains no bag with messages; `ros2-memory info`" in refused.err
 
 
 @pytest.mark.parametrize(
     ("question", "name", "said"),
     [
-        ("find_thing", "p.mcap", "there is no tool find_thing; the tools are"),
-        ("remember_moment label=x", "p.mcap", "there is no tool remember_moment"),
+        ("find_thing", "p.mcap", 'unknown tool "find_thing"; do you mean find_things'),
+        ("remember_moment label=x", "p.mcap", "remember_moment is not offered here"),
+        ("recap foo=1", "p.mcap", 'unknown argument "foo"'),
         ("visits 5", "p.mcap", "is not an argument"),
         ("visits", "none/p.mcap", "must be new, in a folder that is there"),
         ("visits", "bags", "must be new, in a folder that is there"),
