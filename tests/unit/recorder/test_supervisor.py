@@ -163,6 +163,17 @@ class TestMessagesOfOneRecordingAlone:
         world.supervisor.stop()
         assert_each_counts_once(world)
 
+    @pytest.mark.parametrize("deaf_s", [2, 8, 15])
+    def test_what_one_missed_since_long_before_a_rotation_counts_in_the_other(
+        self, tmp_path: Path, deaf_s: float
+    ) -> None:
+        """Some recorders live and write nothing, which is why they are rotated."""
+        world = World(tmp_path, session_duration_s=20).started(20 - deaf_s)
+        world.recorders[0].deaf = True
+        world.run(deaf_s + 15)
+        world.supervisor.stop()
+        assert_what_stands_counts_once(world)
+
 
 class TestClock:
     def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
