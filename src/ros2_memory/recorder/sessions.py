@@ -20,7 +20,11 @@ from ros2_memory.recorder.handover.transfer import (
     HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.union import settle_handover, unsettled_handovers
+from ros2_memory.recorder.handover.union import (
+    give_up,
+    settle_handover,
+    unsettled_handovers,
+)
 from ros2_memory.recorder.policies import ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.output import LineKind
@@ -167,7 +171,8 @@ class RecordingSessions:
         try:
             new = self._launch(name, now)
         except RecorderError:
-            HandoverTransfer.announce(old, None)
+            self._unsettled.append((old.splits.directory, self._bag_dir / name))
+            self.settle_handovers()
             raise
         self.handover = HandoverTransfer(
             old,
@@ -376,9 +381,9 @@ class RecordingSessions:
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session; the old one continues."""
         self.handover = None
-        with self._reporting_failures(handover.old):
-            handover.abandon()
         self._unsettled.append(handover.directories)
+        with self._reporting_failures(handover.old):
+            give_up(*handover.directories)
         handover.new.end()
 
     def _go_on_without(self, session: RecordingSession) -> None:

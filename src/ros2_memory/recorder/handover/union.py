@@ -107,16 +107,39 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
             return True
         begun = read_handover(old).handover
         if begun.next == new.name and begun.counts_until is None:
-            if old.name in running and is_folder(new):
+            if old.name not in running:
+                _write_cut(old, new, reader)
+                _log.info("handover_settled", recording=old.name, next=new.name)
+            elif new.name in running:
                 return False
-            _write_cut(old, new, reader)
-            _log.info("handover_settled", recording=old.name, next=new.name)
+            else:
+                give_up(old, new)
         return not is_folder(new) or _compare(old, new, reader, running)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
         # What the disk cannot show at present must not be taken for missing.
         raise RecorderError(str(error)) from error
+
+
+def give_up(old: Path, new: Path) -> None:
+    """Marks a new recording as not counting: it did not take over, and the old one goes on.
+
+    Raises:
+        RecorderError: a sidecar cannot be written, or it is not known whether there is a recording.
+    """
+    try:
+        if is_folder(new):
+            write_handover(new, void(old.name))
+        if is_folder(old):
+            write_handover(old, intended(handover_to_change(old), None))
+    except OSError as error:
+        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
+
+
+def void(old_name: str) -> Handover:
+    """Returns the sidecar of a new recording that did not take over: the old one went on."""
+    return Handover(state=Counting.VOID, previous=old_name, compared=False)
 
 
 def intended(old: Handover, new_name: str | None) -> Handover:
