@@ -87,7 +87,7 @@ class TestRotation:
     def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20, subscribe_timeout_s=6).started(19)
         world.defaults = {"topics": ("/bumper",)}
-        [said] = world.logged(12, "rotated_without")
+        [said] = world.logged(12.25, "rotated_without")
         assert world.recorders[0].status == 0
         assert "does not subscribe to /door yet" in str(said["reason"])
         assert world.heartbeat()["last_error"] is None
@@ -155,7 +155,7 @@ class TestMessagesOfOneRecordingAlone:
         world.run(0.75)
         world.recorders[which].deaf = False
         # Compared as soon as the first split of the new one is closed, long before it ends.
-        world.run(12)
+        world.run(15)
         assert len(world.running) == 1
         stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
         counts = world.published(counting=True)
