@@ -137,7 +137,12 @@ class Supervisor:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
         self._check_space(now)
         if not self._paused:
-            self._begin_recording(now)
+            try:
+                self._begin_recording(now)
+            except RecorderError as error:
+                self._events.fail("recorder_not_started", str(error))
+                self._write_heartbeat(RecorderState.STOPPED)
+                raise
         self.stopped = False
         self._write_heartbeat()
 

@@ -8,6 +8,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.simulated_recorders import (
     World,
@@ -35,6 +36,20 @@ class TestStart:
         world = World(tmp_path, defaults={"ready_s": 10**9}).started(130)
         assert world.supervisor.is_recording
         assert len(world.recorders) == 1
+
+    def test_one_that_cannot_begin_leaves_the_reason_and_nothing_that_looks_begun(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.refuse = "no more processes"
+        with pytest.raises(RecorderError, match="no more processes"):
+            world.supervisor.start()
+        beat = world.heartbeat()
+        assert (beat["state"], beat["recordings"], beat["last_error"]) == (
+            "stopped",
+            [],
+            "no more processes",
+        )
 
 
 class TestRotation:
