@@ -334,14 +334,19 @@ class RecordingSessions:
     def _report_output(self, session: RecordingSession) -> None:
         lines = session.new_lines()
         self._events.report_output(session.name, lines)
+        reception = self._orders.reception
         for line in lines:
-            if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
+            if line.topic is None:
+                continue
+            if line.kind is LineKind.QOS_REFUSED:
                 # Of two policies that do not fit only one is named: a volatile publisher may be
                 # best effort, but then another line says that.
                 best_effort = "DURABILITY" not in line.text
-                self._orders.reception.refused(session.name, line.topic, best_effort=best_effort)
-            elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                self._orders.reception.lost(session.name, line.topic, line.count or 0)
+                reception.refused(session.name, line.topic, best_effort=best_effort)
+            elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
+                reception.refused(session.name, line.topic, best_effort=None)
+            elif line.kind is LineKind.TOPIC_LOST:
+                reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: tuple[str, ...]
