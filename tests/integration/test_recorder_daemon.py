@@ -141,7 +141,7 @@ class Site:
         return daemon.process.wait(PATIENCE_S), daemon.log.read_text()
 
     def refusal_here(self, *overrides: str) -> tuple[object, str]:
-        """The same in this process, of one that is refused before it takes the lock."""
+        """The same in this process."""
         said = io.StringIO()
         with patch.dict(os.environ, self.env, clear=True), redirect_stderr(said):
             try:
@@ -455,7 +455,9 @@ class TestRefusals:
         assert "recording.bag_dir" in message
 
     def test_a_refused_start_leaves_nothing_running_and_no_lock(self, site: Site) -> None:
-        site.refusal(f"recorder.setup_files=[{site.folder}/none.bash]")
+        code, message = site.refusal_here(f"recorder.setup_files=[{site.folder}/none.bash]")
+        assert (code, "recorder.setup_files" in message) == (1, True)
+        # While the process that was refused lives on.
         assert site.run().stop() == 0
 
 

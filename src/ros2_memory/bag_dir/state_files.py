@@ -108,7 +108,7 @@ class Loss:
     `by` is what shows it: a counter in the messages, the cadence of their header stamps (then they
     may never have been published either), or rosbag2's own count; or they were deleted by request,
     or since they had `expired` (`retention.topics`). Of a publisher that was `refused`, as its QoS
-    did not fit the subscription, it is not known how many there were, and `lost` 0.
+    or type did not fit the subscription, it is not known how many there were, and `lost` 0.
     The unexpected end of a recording is of `EVERY_TOPIC`, from when it last grew to when that was
     noticed, or while it was `paused`, with a key of `INTERRUPTIONS`. How many messages it cost is
     not known, and `lost` 0.

@@ -148,8 +148,8 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
         spans = [_span_text(*span) for span in united(refused[topic], _EDGE_NS)]
         yield (
             f"messages of a publisher of {topic} were not recorded from "
-            f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS did not fit the subscription: "
-            "how many is not known"
+            f"{listed(spans[-MAX_NAMED:], len(spans))}, as its QoS or type did not fit the "
+            "subscription: how many is not known"
         )
 
 

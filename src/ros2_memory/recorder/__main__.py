@@ -116,27 +116,32 @@ def _record(settings: Settings) -> None:
     if clear:
         refuse_homes(bag_dir)
     make_bag_dir(bag_dir)
-    # Until this process ends: what is still under way in its threads must meet no other recorder.
     lock = BagDirLock.acquire(bag_dir)
-    recorder = build_recorder(
-        settings,
-        reader=reader,
-        housekeeper=housekeeper,
-        own=own,
-        keep_open=(lock.descriptor,),
-        excluding={
-            rule.topic: f"the rule {rule.name!r} of recording.exclude_when"
-            for rule in exclusions_of(settings)
-        },
-    )
-    recorder.check()
-    claim(own)
-    if clear:
-        _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
     try:
-        housekeeper.repair()
-    except (EpisodicError, OSError) as error:
-        _log.error("not_prepared", task="repair", reason=str(error))
+        recorder = build_recorder(
+            settings,
+            reader=reader,
+            housekeeper=housekeeper,
+            own=own,
+            keep_open=(lock.descriptor,),
+            excluding={
+                rule.topic: f"the rule {rule.name!r} of recording.exclude_when"
+                for rule in exclusions_of(settings)
+            },
+        )
+        recorder.check()
+        claim(own)
+        if clear:
+            _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
+        try:
+            housekeeper.repair()
+        except (EpisodicError, OSError) as error:
+            _log.error("not_prepared", task="repair", reason=str(error))
+    except BaseException:
+        lock.release()
+        raise
+    # From here on it is held until this process ends: what is still under way in its threads then
+    # must meet no other recorder.
     _log.info("starting", bag_dir=str(bag_dir), files=files_in_use(settings))
     if unused := unused_config():
         _log.warning("config_unused", reason=unused)

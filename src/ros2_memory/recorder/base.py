@@ -144,7 +144,7 @@ class Housekeeper:
         """
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
-        """Records that a recording ended unexpectedly, and another one begins.
+        """Records that a recording ended unexpectedly, or was paused until now.
 
         It last grew at the wall time `first`; `how` is a key of `INTERRUPTIONS`.
         """

@@ -8,6 +8,7 @@ later, when the index finds them and nothing writes them.
 from __future__ import annotations
 
 import os
+import threading
 import time
 from contextlib import suppress
 from functools import partial
@@ -158,6 +159,8 @@ class Housekeeping(Housekeeper):
         self._collected = Collected()
         self._status = HouseStatus()
         self._unshipped = 0
+        self._lock = threading.Lock()
+        self._unwritten: list[Loss] = []
 
     def repair(self) -> None:
         """Repairs what a crash left in recordings of this program. Nothing may be recording.
@@ -173,6 +176,8 @@ class Housekeeping(Housekeeper):
                 self._triggers.note_restart(last_alive, now)
             if heartbeat.state is RecorderState.RECORDING:
                 self._note_interruption(last_alive, now, "unclean")
+            elif heartbeat.state is RecorderState.PAUSED:
+                self._note_interruption(min(heartbeat.since, now), now, "paused")
         named = _named_in_heartbeat(self._bag_dir)
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
@@ -260,10 +265,19 @@ class Housekeeping(Housekeeper):
         self._note_interruption(min(first, now), now, how)
 
     def _note_interruption(self, first: Ns, now: Ns, how: Interruption) -> None:
-        try:
-            append_losses(self._bag_dir, [Loss(EVERY_TOPIC, first, now + 1, 0, how)])
-        except OSError as error:
-            _log.warning("losses_not_written", reason=error.strerror or str(error))
+        self._unwritten.append(Loss(EVERY_TOPIC, first, now + 1, 0, how))
+        self._write_losses()
+
+    def _write_losses(self) -> None:
+        """Writes what is noted as missing; what the disk refuses waits for the next call."""
+        with self._lock:
+            try:
+                if self._unwritten:
+                    append_losses(self._bag_dir, self._unwritten)
+            except OSError as error:
+                _log.warning("losses_not_written", reason=error.strerror or str(error))
+            else:
+                self._unwritten.clear()
 
     def announce(self, recording: str) -> None:
         """Holds a recording back until it is screened, where something is to be excluded.
@@ -339,6 +353,7 @@ class Housekeeping(Housekeeper):
             **wanted,
         )
         self._report(before, collected)
+        self._write_losses()  # there may be room now
         if self._triggers is not None and collected.needed:
             self._triggers.note_deleted(collected.needed)
         return collected

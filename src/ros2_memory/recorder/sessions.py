@@ -20,7 +20,11 @@ from ros2_memory.recorder.handover.transfer import (
     HandoverTransfer,
     Step,
 )
-from ros2_memory.recorder.handover.union import settle_handover, unsettled_handovers
+from ros2_memory.recorder.handover.union import (
+    give_up,
+    settle_handover,
+    unsettled_handovers,
+)
 from ros2_memory.recorder.policies import ClockReading, describe_death
 from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.output import LineKind
@@ -167,7 +171,8 @@ class RecordingSessions:
         try:
             new = self._launch(name, now)
         except RecorderError:
-            HandoverTransfer.announce(old, None)
+            self._unsettled.append((old.splits.directory, self._bag_dir / name))
+            self.settle_handovers()
             raise
         self.handover = HandoverTransfer(
             old,
@@ -212,26 +217,6 @@ class RecordingSessions:
             self._abandon(handover)
         return step
 
-    def handle_exits(self, now: ClockReading) -> int:
-        """Handles children that ended by themselves; returns how many.
-
-        If the current one died during a handover, the new one becomes the current one.
-        """
-        deaths = 0
-        new = None if self.handover is None else self.handover.new
-        for session in (new, self.current):
-            if session is not None and session.child.exit_status() is not None:
-                deaths += 1
-                self._report_death(session, now)
-                if session is self.current:
-                    self._finalize(session, now)
-                    self._go_on_without(session)
-                else:
-                    self._go_on_without(session)  # its sidecar says so before it is finalized
-                    self._finalize(session, now)
-                    self.settle_handovers()
-        return deaths
-
     def end_unready(self, now: ClockReading) -> bool:
         """Ends the current session if it does not begin to record; returns whether it did."""
         current = self.current
@@ -245,15 +230,24 @@ class RecordingSessions:
         self.current = None
         return True
 
-    def collect_ended(self, now: ClockReading) -> None:
-        """Signals sessions that are ending again, and finalizes those that have ended."""
-        ended = [
-            session
-            for session in self.running
-            if session.state is SessionState.ENDING and session.child.end() is not None
-        ]
-        for session in ended:
-            if session.has_recorded and session.child.exit_status() == -signal.SIGKILL:
+    def collect_ended(self, now: ClockReading) -> int:
+        """Finalizes sessions that have ended; returns how many did so by themselves.
+
+        Those that are ending are signalled again. If the current one died during a handover, the
+        new one becomes the current one.
+        """
+        running, deaths = self.running, 0
+        # The newest first: none that died as well takes over.
+        for session in reversed(running):
+            is_ending = session.state is SessionState.ENDING
+            status = session.child.end() if is_ending else session.child.exit_status()
+            if status is None:
+                continue
+            if not is_ending:
+                deaths += 1
+                self._report_death(session, status, now)
+                self._go_on_without(session)
+            elif session.has_recorded and status == -signal.SIGKILL:
                 sentence = (
                     f"the ros2 bag record of {session.name} hung: it did not end when it was asked "
                     "to, and was killed (SIGKILL); what it had not written yet is lost"
@@ -262,8 +256,9 @@ class RecordingSessions:
                 self.restarts += 1
                 self._interrupted(session.grew_at, "hung")
             self._finalize(session, now)
-        if ended:
+        if self.running != running:
             self.settle_handovers()
+        return deaths
 
     def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
@@ -339,14 +334,19 @@ class RecordingSessions:
     def _report_output(self, session: RecordingSession) -> None:
         lines = session.new_lines()
         self._events.report_output(session.name, lines)
+        reception = self._orders.reception
         for line in lines:
-            if line.kind is LineKind.QOS_REFUSED and line.topic is not None:
+            if line.topic is None:
+                continue
+            if line.kind is LineKind.QOS_REFUSED:
                 # Of two policies that do not fit only one is named: a volatile publisher may be
                 # best effort, but then another line says that.
                 best_effort = "DURABILITY" not in line.text
-                self._orders.reception.refused(session.name, line.topic, best_effort=best_effort)
-            elif line.kind is LineKind.TOPIC_LOST and line.topic is not None:
-                self._orders.reception.lost(session.name, line.topic, line.count or 0)
+                reception.refused(session.name, line.topic, best_effort=best_effort)
+            elif line.kind is LineKind.SEVERAL_TYPES and line.topic in session.subscribed:
+                reception.refused(session.name, line.topic, best_effort=None)
+            elif line.kind is LineKind.TOPIC_LOST:
+                reception.lost(session.name, line.topic, line.count or 0)
 
     def _flush_later(
         self, session: RecordingSession, directory: Path, names: tuple[str, ...]
@@ -376,9 +376,9 @@ class RecordingSessions:
     def _abandon(self, handover: HandoverTransfer) -> None:
         """Ends the new session; the old one continues."""
         self.handover = None
-        with self._reporting_failures(handover.old):
-            handover.abandon()
         self._unsettled.append(handover.directories)
+        with self._reporting_failures(handover.old):
+            give_up(*handover.directories)
         handover.new.end()
 
     def _go_on_without(self, session: RecordingSession) -> None:
@@ -422,10 +422,10 @@ class RecordingSessions:
             else:
                 self._events.resolve("handover_not_settled", old.name)
 
-    def _report_death(self, session: RecordingSession, now: ClockReading) -> None:
+    def _report_death(self, session: RecordingSession, status: int, now: ClockReading) -> None:
         self._report_output(session)
         lived_s = session.age_s(now)
-        sentence = describe_death(session.child.exit_status() or 0, session.last_output)
+        sentence = describe_death(status, session.last_output)
         self._events.fail("recorder_died", sentence, recording=session.name, lived_s=lived_s)
         self.restarts += 1
         self._interrupted(session.grew_at, "died")

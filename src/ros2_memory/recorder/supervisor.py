@@ -137,7 +137,12 @@ class Supervisor:
             raise RecorderError(f"{self._bag_dir}: {error.strerror or error}") from error
         self._check_space(now)
         if not self._paused:
-            self._begin_recording(now)
+            try:
+                self._begin_recording(now)
+            except RecorderError as error:
+                self._events.fail("recorder_not_started", str(error))
+                self._write_heartbeat(RecorderState.STOPPED)
+                raise
         self.stopped = False
         self._write_heartbeat()
 
@@ -163,6 +168,9 @@ class Supervisor:
         self._reception.flush()
         self._paused = False
         if not self._disk.away:
+            if self._paused_at is not None:
+                self._housekeeper.note_restart(self._paused_at, "paused")
+                self._paused_at = None
             self._housekeeper.finish()
             # What was held back could not be compared before.
             self._sessions.settle_handovers()
@@ -182,7 +190,6 @@ class Supervisor:
             ("rotation", 0.0, False, self._check_rotation),
             ("restart", 0.0, True, self._check_restart),
             ("topics", TOPICS_S, False, lambda at: self._topic_watch.look(at, self._sessions)),
-            ("reap", 0.0, False, self._sessions.collect_ended),
             ("interruptions", 0.0, True, self._report_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
             ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
@@ -230,8 +237,7 @@ class Supervisor:
 
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
-        deaths = self._sessions.handle_exits(now)
-        for _ in range(deaths):
+        for _ in range(self._sessions.collect_ended(now)):
             self._postpone("rotate", self._rotation_backoff.failed(), now)
             self._postpone("restart", self._backoff.failed(), now)
         if self._sessions.end_unready(now):

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import threading
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ import structlog
 import zstandard
 
 from ros2_memory import queries
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Receipt, append_receipts, read_losses
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.errors import NoDataError
@@ -21,6 +23,7 @@ from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.retention.delete import remove_bag
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_db3, write_mcap
+from tests.support.fakes import failing
 from tests.support.housekeepers import (
     PLENTY,
     background_keeper_of,
@@ -28,7 +31,6 @@ from tests.support.housekeepers import (
     keeper_of,
     later,
     reader_of_both,
-    recorded_before,
     recording_now,
     size_of,
 )
@@ -423,16 +425,27 @@ class TestRemoval:
         assert (tmp_path / "moved/a_0.mcap").exists()
 
 
-@pytest.mark.parametrize(("unclean", "found"), [(True, ["unclean"]), (False, [])])
+@pytest.mark.parametrize(
+    ("state", "found"),
+    [
+        (RecorderState.RECORDING, [("unclean", 60)]),
+        (RecorderState.PAUSED, [("paused", 10)]),
+        (RecorderState.STOPPED, []),
+    ],
+)
 def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
-    tmp_path: Path, unclean: bool, found: list[str]
+    tmp_path: Path, state: RecorderState, found: list[tuple[str, int]]
 ) -> None:
-    if unclean:
-        recording_now(tmp_path, OWN)
-    else:
-        recorded_before(tmp_path)
-    keeper_of(tmp_path).repair()
-    assert [each.by for each in read_losses(tmp_path, 0, MAX_NS)] == found
+    """Though the disk is full at first."""
+    beat = Heartbeat(1, 60, state, (), 10, 0, (), (), None, 2.0)
+    write_heartbeat(tmp_path, beat)
+    keeper = keeper_of(tmp_path, clock=later(0))
+    with pytest.MonkeyPatch.context() as full:
+        full.setattr("ros2_memory.bag_dir.json_files.append_durably", failing(errno.ENOSPC))
+        keeper.repair()
+    keeper.apply()
+    keeper.wait()
+    assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found
 
 
 def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:

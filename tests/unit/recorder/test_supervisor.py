@@ -8,6 +8,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.simulated_recorders import (
     World,
@@ -35,6 +36,20 @@ class TestStart:
         world = World(tmp_path, defaults={"ready_s": 10**9}).started(130)
         assert world.supervisor.is_recording
         assert len(world.recorders) == 1
+
+    def test_one_that_cannot_begin_leaves_the_reason_and_nothing_that_looks_begun(
+        self, tmp_path: Path
+    ) -> None:
+        world = World(tmp_path)
+        world.refuse = "no more processes"
+        with pytest.raises(RecorderError, match="no more processes"):
+            world.supervisor.start()
+        beat = world.heartbeat()
+        assert (beat["state"], beat["recordings"], beat["last_error"]) == (
+            "stopped",
+            [],
+            "no more processes",
+        )
 
 
 class TestRotation:
@@ -87,7 +102,7 @@ class TestRotation:
     def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20, subscribe_timeout_s=6).started(19)
         world.defaults = {"topics": ("/bumper",)}
-        [said] = world.logged(12, "rotated_without")
+        [said] = world.logged(12.25, "rotated_without")
         assert world.recorders[0].status == 0
         assert "does not subscribe to /door yet" in str(said["reason"])
         assert world.heartbeat()["last_error"] is None
@@ -155,13 +170,24 @@ class TestMessagesOfOneRecordingAlone:
         world.run(0.75)
         world.recorders[which].deaf = False
         # Compared as soon as the first split of the new one is closed, long before it ends.
-        world.run(12)
+        world.run(15)
         assert len(world.running) == 1
         stands = {at for at in world.published(counting=False) if at < world.wall - 7 * NS_PER_S}
         counts = world.published(counting=True)
         assert {at: counts[at] for at in stands} == dict.fromkeys(stands, 1)
         world.supervisor.stop()
         assert_each_counts_once(world)
+
+    @pytest.mark.parametrize("deaf_s", [2, 8, 15])
+    def test_what_one_missed_since_long_before_a_rotation_counts_in_the_other(
+        self, tmp_path: Path, deaf_s: float
+    ) -> None:
+        """Some recorders live and write nothing, which is why they are rotated."""
+        world = World(tmp_path, session_duration_s=20).started(20 - deaf_s)
+        world.recorders[0].deaf = True
+        world.run(deaf_s + 15)
+        world.supervisor.stop()
+        assert_what_stands_counts_once(world)
 
 
 class TestClock:

@@ -12,6 +12,7 @@ from unittest.mock import Mock
 import pytest
 from structlog.testing import capture_logs
 
+from ros2_memory.bag_dir import handover_file
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder import sessions
@@ -181,6 +182,21 @@ class TestFailingDisk:
         FailingDisk(monkeypatch, lambda path: path == new.directory)
         assert "Input/output error" in world.logged(1, "rotation_failed")[0]["reason"]
         assert world.running == [old]
+
+    @pytest.mark.parametrize("refused_s", [0.5, 30])
+    def test_one_that_is_given_up_counts_not_though_its_sidecar_was_refused_at_first(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused_s: float
+    ) -> None:
+        """It takes its time to end, and records meanwhile."""
+        world = World(tmp_path, session_duration_s=20, defaults={"obeys_after": 20}).started(20)
+        with monkeypatch.context() as full:
+            full.setattr(handover_file, "write_all_durably", failing(errno.ENOSPC))
+            [reported, *_] = world.logged(refused_s, "rotation_failed")
+        assert "No space left on device" in reported["reason"]
+        world.run(40)
+        world.supervisor.stop()
+        assert len(world.recorders) > 2
+        assert_each_counts_once(world)
 
     def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

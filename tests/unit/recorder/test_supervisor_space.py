@@ -77,6 +77,18 @@ class TestSpace:
         world.run(2)
         assert world.heartbeat()["state"] == "paused"
 
+    def test_a_pause_that_a_stop_ends_is_noted(self, tmp_path: Path) -> None:
+        world, housekeeping = self.world(tmp_path)
+        world.started(3)
+        world.free = 900
+        paused = world.wall
+        world.run(30)
+        assert housekeeping.restarts == []
+        world.supervisor.stop()
+        [(since, how)] = housekeeping.restarts
+        assert how == "paused"
+        assert 0 <= since - paused <= NS_PER_S
+
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
         world.started(3)

@@ -9,6 +9,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.handover_file import read_handover
+from ros2_memory.bag_dir.state_files import read_losses
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import (
     PlayedHousekeeper,
@@ -84,6 +86,23 @@ class TestWatch:
             "/scan: messages of this publisher are not recorded"
         )
         assert world.heartbeat()["last_error"] == reported["reason"]
+
+    @pytest.mark.parametrize(("topic", "found"), [("/door", {"refused"}), ("/other", set())])
+    def test_what_comes_of_another_type_than_subscribed_is_noted_as_missing(
+        self, tmp_path: Path, topic: str, found: set[str]
+    ) -> None:
+        """No QoS would fit it, and no new recording subscribes to it while the old one has it."""
+        world = World(tmp_path)
+        world.before_start = lambda directory: world.orders.reception.overrides(directory.name)
+        world.started(6)
+        world.recorders[0].lines.append(
+            f"[ERROR] [1.5] [ROSBAG2_TRANSPORT]: Topic '{topic}' has more than one type "
+            "associated. Only topics with one type are supported"
+        )
+        world.run(40)
+        assert len(world.recorders) == 1
+        losses = read_losses(tmp_path, MIN_NS, MAX_NS)
+        assert {loss.by for loss in losses if loss.topic == topic} == found
 
 
 class TestHeartbeat:

@@ -28,7 +28,6 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
-from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.handover.union import cut_clock, intended
@@ -72,11 +71,6 @@ class Bounds(NamedTuple):
 def pending(old_name: str) -> Handover:
     """Returns the new sidecar as soon as its directory exists: until the cut it does not count."""
     return Handover(state=Counting.PENDING, previous=old_name)
-
-
-def void(old_name: str) -> Handover:
-    """Returns the sidecar of a new recording that did not take over: the old one went on."""
-    return Handover(state=Counting.VOID, previous=old_name, compared=False)
 
 
 def complete_sidecars(
@@ -164,17 +158,17 @@ class HandoverTransfer:
         self._closed_before = old.splits.closed_names
 
     @staticmethod
-    def announce(old: RecordingSession, new_name: str | None) -> None:
+    def announce(old: RecordingSession, new_name: str) -> None:
         """Writes the name of the new recording, which is about to be started, into the old sidecar.
 
-        None in place of the name withdraws it, if the old directory still exists.
-
         Raises:
-            RecorderError: it cannot be written.
+            RecorderError: it cannot be written, or the one before that was given up is not settled.
         """
         directory = old.splits.directory
-        if new_name is not None or _is_there(directory):
-            write_handover(directory, intended(handover_to_change(directory), new_name))
+        before = handover_to_change(directory)
+        if before.next is not None:
+            raise RecorderError(f"{directory}: its handover to {before.next} is not settled yet")
+        write_handover(directory, intended(before, new_name))
 
     @property
     def directories(self) -> tuple[Path, Path]:
@@ -236,16 +230,6 @@ class HandoverTransfer:
         write_handovers({self.new.splits.directory: new, self.old.splits.directory: old})
         return True
 
-    def abandon(self) -> None:
-        """Marks the new recording as not counting: the old one continues.
-
-        Raises:
-            RecorderError: a sidecar cannot be written.
-        """
-        if _is_there(self.new.splits.directory):
-            write_handover(self.new.splits.directory, void(self.old.name))
-        self.announce(self.old, None)
-
     def add_late_splits(self) -> None:
         """Adds the splits that the old recorder opened after the cut, while it was ending.
 
@@ -266,15 +250,3 @@ class HandoverTransfer:
         if not closed:
             return CutClock.PUBLISH
         return cut_clock(self.old.splits.directory / closed[-1], self._reader)
-
-
-def _is_there(recording: Path) -> bool:
-    """Whether the directory of a recording exists.
-
-    Raises:
-        RecorderError: it cannot be looked at.
-    """
-    try:
-        return is_folder(recording)
-    except OSError as error:
-        raise RecorderError(f"{recording}: {error.strerror or error}") from error

@@ -107,16 +107,39 @@ def settle_handover(old: Path, new: Path, reader: BagReader, running: Collection
             return True
         begun = read_handover(old).handover
         if begun.next == new.name and begun.counts_until is None:
-            if old.name in running and is_folder(new):
+            if old.name not in running:
+                _write_cut(old, new, reader)
+                _log.info("handover_settled", recording=old.name, next=new.name)
+            elif new.name in running:
                 return False
-            _write_cut(old, new, reader)
-            _log.info("handover_settled", recording=old.name, next=new.name)
+            else:
+                give_up(old, new)
         return not is_folder(new) or _compare(old, new, reader, running)
     except OSError as error:
         raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
     except BagUnreachableError as error:
         # What the disk cannot show at present must not be taken for missing.
         raise RecorderError(str(error)) from error
+
+
+def give_up(old: Path, new: Path) -> None:
+    """Marks a new recording as not counting: it did not take over, and the old one goes on.
+
+    Raises:
+        RecorderError: a sidecar cannot be written, or it is not known whether there is a recording.
+    """
+    try:
+        if is_folder(new):
+            write_handover(new, void(old.name))
+        if is_folder(old):
+            write_handover(old, intended(handover_to_change(old), None))
+    except OSError as error:
+        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
+
+
+def void(old_name: str) -> Handover:
+    """Returns the sidecar of a new recording that did not take over: the old one went on."""
+    return Handover(state=Counting.VOID, previous=old_name, compared=False)
 
 
 def intended(old: Handover, new_name: str | None) -> Handover:
@@ -289,14 +312,17 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
 
 def _against_the_cut(old: _Side, new: _Side, reader: BagReader) -> tuple[_AgainstCut, _AgainstCut]:
     """Returns what counts against the cut, for the sidecars of the old and the new recording."""
-    window = TimeWindow.everything()
-    if old.bags and new.bags:
-        start, end = max(old.start, new.start), min(old.end, new.end)
-        window = TimeWindow(start - STALL_NS, end + STALL_NS + 1)
+    of_old, of_new = _AgainstCut(set(), set()), _AgainstCut(set(), set())
+    spans = [*_hidden_in(old), *_hidden_in(new)]
+    if old.bags and new.bags and (start := max(old.start, new.start)) <= min(old.end, new.end):
+        spans.append((start, min(old.end, new.end)))
+    if not spans:
+        return of_old, of_new
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    window = TimeWindow(first - STALL_NS, last + STALL_NS + 1)
     # The cut does not apply to latched channels, but all of a recording without effect is hidden.
     latched = new.handover.state is Counting.VOID
     in_old, in_new = (_copies(side, window, reader, latched=latched) for side in (old, new))
-    of_old, of_new = _AgainstCut(set(), set()), _AgainstCut(set(), set())
     for message in in_old.keys() | in_new.keys():
         old_copies, new_copies = in_old.get(message, _NOWHERE), in_new.get(message, _NOWHERE)
         if old_copies is None or new_copies is None:
@@ -306,6 +332,16 @@ def _against_the_cut(old: _Side, new: _Side, reader: BagReader) -> tuple[_Agains
         of_old.add(message, old_copies, counts_here=counts_in_old)
         of_new.add(message, new_copies, counts_here=not counts_in_old)
     return of_old, of_new
+
+
+def _hidden_in(side: _Side) -> Iterator[tuple[Ns, Ns]]:
+    """Yields between which log times the cut may hide messages of a recording, both included."""
+    for name, bag in side.bags.items():
+        rule = side.cut.rule(name)
+        for _, _, log_from, log_until in () if rule is None else rule.exclusions:
+            span = max(bag.start, log_from), min(bag.end, log_until)
+            if span[0] <= span[1]:
+                yield span
 
 
 def _weight(copies: _Copies) -> tuple[int, int]:

@@ -164,17 +164,18 @@ class LossCounter:
         if len(back) > 1:  # several publishers
             self.unclear([topic])
             return
-        first, last = positions[0] if series is None else series.positions[0], positions[-1]
+        last = positions[-1]
         if back and last.value < positions[back[0] - 1].value:
             # Its publisher began anew. Else what it had sent before came again, as latched.
             series, positions = None, positions[back[0] :]
-        elif last.value < first.value and last.log_time > first.log_time:
-            series = None
+        elif series is not None and last.value < series.positions[0].value:
+            series = None  # likewise, or the clock was set back
         known_positions = [] if series is None else series.positions
         by_value = dict(sorted((*known_positions, *positions), reverse=True))
         merged = [Position(*item) for item in sorted(by_value.items())]
         if series is not None:
-            merged = [position for position in merged if position.value >= first.value]
+            settled = series.positions[0]
+            merged = [position for position in merged if position.value >= settled.value]
         self._series[topic] = _Series(progress.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:

@@ -326,20 +326,22 @@ class Reception:
                 raise RecorderError(f"losses cannot be written: {reason}") from error
             self._unwritten.clear()
 
-    def refused(self, recording: str, topic: str, *, best_effort: bool = True) -> None:
+    def refused(self, recording: str, topic: str, *, best_effort: bool | None = True) -> None:
         """Notes that a publisher does not fit how a recording subscribed to the topic.
 
         The next recordings ask for what fits every publisher; without `best_effort` for what fits a
-        volatile one, or, of a topic that counts as latched, adapt to the publishers they find. What
-        that publisher sent is missing from each split of this recording, until it ends.
+        volatile one, or, of a topic that counts as latched, adapt to the publishers they find. With
+        None it is of another type, which no QoS fits. What that publisher sent is missing from each
+        split of this recording, until it ends.
         """
         with self._lock:
             state = self._recordings.get(recording)
             if state is not None:
                 state.refused.add(topic)
-            before = self._asked_anew.get(topic)
-            best_effort |= before is not None and before.best_effort
-            self._asked_anew[topic] = _Anew(best_effort)
+            if best_effort is not None:
+                before = self._asked_anew.get(topic)
+                best_effort |= before is not None and before.best_effort
+                self._asked_anew[topic] = _Anew(best_effort)
 
     def rotation_due(self, recording: str, now_s: float) -> Rotation | None:
         """Returns why a recording should be rotated now; None where it need not be."""
@@ -349,7 +351,7 @@ class Reception:
                 return None
             refused = frozenset(
                 topic
-                for topic in state.refused
+                for topic in state.refused & self._asked_anew.keys()
                 if topic not in state.asked_anew
                 or now_s - self._asked_s.get(topic, -ASK_AGAIN_S) >= ASK_AGAIN_S
             )

@@ -23,8 +23,8 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder.handover import union
-from ros2_memory.recorder.handover.transfer import Bounds, complete_sidecars, pending, void
-from ros2_memory.recorder.handover.union import intended, settle_handover
+from ros2_memory.recorder.handover.transfer import Bounds, complete_sidecars, pending
+from ros2_memory.recorder.handover.union import intended, settle_handover, void
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.examples import examples

@@ -208,6 +208,21 @@ def test_a_counter_that_begins_anew_loses_nothing_and_is_followed_from_there() -
     assert counter.flush() == []
 
 
+def test_stamps_of_a_clock_that_was_set_back_are_followed_from_there() -> None:
+    counter = LossCounter()
+    counter.measured("a", progress([*range(1000)]))
+    an_hour = 3600 * 50
+    counter.begun("b")
+    losses: list[Loss] = []
+    for split in range(9):
+        first = 1000 + split * 100 - an_hour
+        ticks = [tick for tick in range(first, first + 100) if tick - first not in {40, 41}]
+        losses += counter.measured("b", progress(ticks))
+    losses += counter.flush()
+    assert sum(loss.lost for loss in losses) == 9 * 2
+    assert all(loss.stop < T0 for loss in losses)
+
+
 def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
     counter = LossCounter()
     counter.begun("old")
