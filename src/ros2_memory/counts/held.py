@@ -37,11 +37,12 @@ from ros2_memory.history.coverage import (
     note_unread,
     recorded_reach,
     recording_gaps,
+    seconds,
     unix_text,
 )
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.held_values import Held, HeldValues
-from ros2_memory.history.no_data import matching_topics, no_data_between, seconds
+from ros2_memory.history.no_data import matching_topics, no_data_between
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import blocks, scan
 from ros2_memory.results import BinColumn, Bins
