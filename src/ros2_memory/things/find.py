@@ -103,14 +103,11 @@ def find_things(
     found = sorted(finder.find(asked), key=lambda thing: (-thing.last, thing.label, thing.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
-        others = [*anywhere.find({known.labels.key(beside.label)})] if beside.label else []
+        key = known.labels.key(beside.label)
+        others = [*anywhere.find({key})] if beside.label else []
         found = [*beside.those_near(found, others)]
-        if beside.label and not others:
-            view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
-            asked[known.labels.key(beside.label)] = beside.label
-        elif not found:
-            within = f"within {beside.circle.radius_m:g} m"
-            view.notes.add(f"near: nothing is {within} of it; for more give a larger radius_m")
+        view.notes.add(*beside.lack(found, others))
+        asked |= {key: beside.label} if beside.label and not others else {}
     note_unread(view, whole, nothing=not found, gaps=not found)
     if not found and asked_for != whole:
         view.notes.add(describe_misdated(view.snapshot.misdated))
@@ -210,6 +207,14 @@ class Near(NamedTuple):
                 near_m, place = min(near)
                 at_once = min(thing.at_once or 1, len(near)) if thing.also_at else thing.at_once
                 yield thing._replace(near_m=near_m, place=place, at_once=at_once)
+
+    def lack(self, found: Sequence[_FoundThing], others: Sequence[_FoundThing]) -> Iterator[str]:
+        """Yields why nothing was found near it."""
+        if self.label and not others:
+            yield f"near: there is no thing {abbreviate(self.label)} in this window"
+        elif not found:
+            within = f"within {self.circle.radius_m:g} m"
+            yield f"near: nothing is {within} of it; for more give a larger radius_m"
 
 
 def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
