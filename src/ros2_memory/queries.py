@@ -47,6 +47,7 @@ from ros2_memory.history.coverage import (
     note_edges,
     note_unread,
     note_unrecorded,
+    seconds,
     unix_text,
 )
 from ros2_memory.history.driven_path import (
@@ -65,7 +66,6 @@ from ros2_memory.history.no_data import (
     require_recorded,
     resolve_pose_topic,
     resolve_topic,
-    seconds,
     topics_of_robot,
     topics_with,
     transform_topics,

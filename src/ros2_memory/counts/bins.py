@@ -220,17 +220,16 @@ class TrueIntervals:
         return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
 
 
-def first_of_days(bins: TimeBins, times: ArrayLike) -> list[Ns]:
-    """Returns the first of these times in each local day that has one, in order.
+def first_of_days(bins: TimeBins, times: ArrayLike) -> list[tuple[int, Ns]]:
+    """Returns the local days that have some of these times, in order, each with its first one.
 
     None of bins whose pieces may lie in several days.
     """
     if bins.day_of is None:
         return []
     ordered = np.sort(np.asarray(times, np.int64))
-    days = bins.day_of[bins.pieces(ordered)]
-    _, first = np.unique(days, return_index=True)
-    return [int(at) for at in ordered[first]]
+    days, first = np.unique(bins.day_of[bins.pieces(ordered)], return_index=True)
+    return list(zip(days.tolist(), ordered[first].tolist(), strict=True))
 
 
 def usual_time(times: Sequence[Ns], of_days: int, offset: Offset = local_offset) -> Usual:
@@ -434,21 +433,27 @@ class BinnedWindow:
         return [None if last == MIN_NS else last for last in last_of_bins]
 
     def usual_of(self, times: Ints) -> Usual | None:
-        """Returns the usual time of day of the first of these times in each day."""
-        firsts = first_of_days(self.bins, times)
-        return usual_time(firsts, self._days_recorded()) if firsts else None
+        """Returns the usual time of day of the first of these times in each day.
 
-    def _days_recorded(self) -> int:
-        """Returns how many local days have something recorded."""
+        Of a day that is not counted from its begin, the first is not known.
+        """
+        days = self._days_recorded()
+        firsts = [at for day, at in first_of_days(self.bins, times) if day in days]
+        return usual_time(firsts, len(days)) if firsts else None
+
+    def _days_recorded(self) -> set[int]:
+        """Returns the local days that have something recorded, and are counted from their begin."""
         if self.bins.day_of is None:
-            return 0
+            return set()
         edges, days = self.bins.edges.tolist(), self.bins.day_of.tolist()
-        recorded_days = set()
+        recorded_days, cut_days = set(), set()
         for start, stop, day in zip(edges[:-1], edges[1:], days, strict=True):
             missing = sum(max(min(end, stop) - max(begin, start), 0) for begin, end in self.gaps)
             if missing < stop - start:
                 recorded_days.add(day)
-        return len(recorded_days)
+            if self._since is not None and start < self._since:
+                cut_days.add(day)
+        return recorded_days - cut_days
 
     def _time_in_bins(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
         """Returns how much time (ns) of half-open spans passed in each bin."""
@@ -487,9 +492,9 @@ class BinnedWindow:
 
     def answer(self) -> Bins:
         """Returns the answer, with notes on what could not be read."""
-        bounds = [self._counted_bounds]
-        recorded = self._time_in_bins(bounds) - self._time_in_bins(self.gaps)
-        recorded_in_all = self._time_in_window(bounds) - self._time_in_window(self.gaps)
+        start, end = bounds = self._counted_bounds
+        recorded = self._time_in_bins([bounds]) - self._time_in_bins(self.gaps)
+        recorded_in_all = self._time_in_window([bounds]) - self._time_in_window(self.gaps)
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
         columns = zip(recorded.tolist(), *self._values, strict=True)
@@ -503,8 +508,8 @@ class BinnedWindow:
         return Bins(
             by=self._by,
             about=self._topics,
-            start=self.window.start,
-            end=self.window.stop,
+            start=start,
+            end=end,
             columns=(("recorded_s", "duration"), *self._columns),
             rows=tuple(rows),
             all=(recorded_in_all, *self._all),

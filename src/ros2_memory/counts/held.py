@@ -37,11 +37,12 @@ from ros2_memory.history.coverage import (
     note_unread,
     recorded_reach,
     recording_gaps,
+    seconds,
     unix_text,
 )
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.held_values import Held, HeldValues
-from ros2_memory.history.no_data import matching_topics, no_data_between, seconds
+from ros2_memory.history.no_data import matching_topics, no_data_between
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import blocks, scan
 from ros2_memory.results import BinColumn, Bins
@@ -129,12 +130,12 @@ def count_labels(
         )
     if len(rows) > _MOST_LABELS:
         view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
-    start, end = asked.asked() if reader.since is None else window.asked()
+    start, end = asked.asked()
     first, last = recorded_reach(view.snapshot, asked) or (start, end)
     return Bins(
         by=BY_LABEL,
         about=tuple(topics),
-        start=min(max(start, first), end),
+        start=min(max(start, reader.since or first), end),
         end=max(min(end, last), start),
         columns=_COLUMNS,
         rows=tuple(rows[:_MOST_LABELS]),
@@ -330,7 +331,7 @@ def count_values(
         if not values_held:
             raise
         start = values.reached
-        view.notes.add_lack(f"{error}: only what is after {unix_text(start)} is counted")
+        view.notes.add_lack(f"only what is after {unix_text(start)} is counted: {error}")
     if not values_held:
         raise no_data_between(view, (topic,), asked)
     outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]

@@ -30,8 +30,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.timebase import Ns, unix_from_ns
-from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.no_data import seconds
+from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import of_columns, scan
 from ros2_memory.index.clock_faults import FaultyClock

@@ -23,6 +23,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.handover_file import LOG_CLOCK_NOTE
 from ros2_memory.bag_dir.layout import OWN_FOLDER, is_carried
 from ros2_memory.bag_dir.state_files import (
@@ -183,7 +184,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
 
 
 def _span_text(start: Ns, end: Ns) -> str:
-    return f"{unix_text(start)} to {unix_text(end)} ({unix_from_ns(end - start):.3g} s)"
+    return f"{unix_text(start)} to {unix_text(end)} ({seconds(end - start)})"
 
 
 def _unrecorded(
@@ -276,6 +277,14 @@ def note_edges(view: View, window: TimeWindow) -> None:
 def _ends_after(window: TimeWindow, latest: Ns) -> bool:
     """Whether a window was asked to end after the newest data, whose time replies round up."""
     return window.asked()[1] >= latest + NS_PER_US
+
+
+def seconds(duration: Ns) -> str:
+    """Returns a duration for a sentence: three digits, and to the second or better up to a week."""
+    length = unix_from_ns(duration)
+    if duration > LONGEST_OFF_NS:
+        return f"{length / 86_400:.0f} days"
+    return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
 
 
 def unix_text(at: Ns) -> str:

@@ -196,7 +196,7 @@ class HeldValues:
 
     def _check(self, _: Ns) -> None:
         if self._reading.expired():
-            raise QueryTimeoutError("out of time")
+            raise QueryTimeoutError("out of time; ask about a shorter window")
 
     def _runs_of_columns(self, parts: Sequence[tuple[IntArray, Texts]]) -> list[_Run]:
         """Returns the runs of rows that overlap in time, in order."""

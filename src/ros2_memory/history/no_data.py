@@ -30,6 +30,7 @@ from ros2_memory.history.coverage import (
     gap_around,
     note_unread,
     note_unrecorded,
+    seconds,
     unix_text,
     why_nothing,
 )
@@ -54,14 +55,6 @@ _CLOCKS_DIFFER_NS: Final[Ns] = 60 * NS_PER_S
 """A time that is later than now by no more may be now by the clock of who asks."""
 ON_DISK_S: Final = 3
 """A message that the recorder received longer ago is on disk, as small as its chunks are."""
-
-
-def seconds(duration: Ns) -> str:
-    """Returns a duration for a sentence: three digits, and to the second or better up to a week."""
-    length = unix_from_ns(duration)
-    if duration > LONGEST_OFF_NS:
-        return f"{length / 86_400:.0f} days"
-    return f"{length:.0f} s" if length >= 100 else f"{length:.3g} s"
 
 
 def resolve_topic(view: View, name: str) -> str:

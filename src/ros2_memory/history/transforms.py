@@ -53,13 +53,12 @@ from ros2_memory.core.timebase import (
     Ns,
 )
 from ros2_memory.history.context import Note
-from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.coverage import seconds, unix_text
 from ros2_memory.history.no_data import (
     between,
     beyond,
     no_data_at,
     not_recorded,
-    seconds,
 )
 from ros2_memory.history.scan import (
     joined_back,

@@ -70,7 +70,12 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
     except QueryTimeoutError:
         if view.call.deadline.expired():
             raise
-        return False  # The time for reading is over: what can be found without them is.
+        # What can be found without them is.
+        view.notes.add_lack(
+            f"out of time before it was known whether an empty text ends those on {topics[0]}: "
+            "each message counts alone, and may have held for longer than duration_s"
+        )
+        return False
 
 
 def find_episodes(
@@ -186,8 +191,7 @@ class SaidMeanwhile:
             except QueryTimeoutError as error:
                 self._is_over = True
                 self._view.notes.add_lack(
-                    f"{error} before what {self._topic} said was read for all of them: ask for "
-                    "fewer, or in a shorter window"
+                    f"what {self._topic} said was not read for all of them: {error}, or for fewer"
                 )
         return None
 
@@ -214,14 +218,15 @@ def topic_changes(
     topic = resolve_topic(view, topic)
     values = HeldValues(view, topic, *fields, asked="changes")
     start, _ = window.asked()
+    is_all = True
     try:
         held = values.during(start, window.stop)
     except QueryTimeoutError as error:
-        held = values.known[::-1]
+        held, is_all = values.known[::-1], False
         if not held:
             raise
         view.notes.add_lack(
-            f"{error}: only what is after {unix_text(values.reached)} is listed; to see the "
+            f"only what is after {unix_text(values.reached)} is listed: {error}; to see the "
             "rest, ask again with that as end"
         )
     if not held:
@@ -244,7 +249,7 @@ def topic_changes(
     return Changes(
         topic,
         ", ".join(sorted(types)),
-        len(spells),
+        (len(spells), is_all),
         tuple(spells[:max_samples]),
         notes=view.notes.sentences(),
     )

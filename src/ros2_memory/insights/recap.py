@@ -28,9 +28,9 @@ from ros2_memory.history.coverage import (
     note_unread,
     note_unrecorded,
     recording_gaps,
+    seconds,
 )
 from ros2_memory.history.driven_path import length_notes
-from ros2_memory.history.no_data import seconds
 from ros2_memory.history.view import TimeRange, View, open_span
 from ros2_memory.insights.changes_before import (
     SLACK_NS,

@@ -142,10 +142,11 @@ def find_matches(
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     shown_at = [sighting.first for sighting in sightings] + [episode.first for episode in episodes]
     start, end = _searched_times(view, window, shown_at)
+    total = rows.total if scope.since is None else None
     return Sightings(
         sightings,
-        more=rows.total is None or rows.total > shown_rows,
-        total=rows.total,
+        more=total is None or total > shown_rows,
+        total=total,
         start=start,
         end=end,
         now=now,

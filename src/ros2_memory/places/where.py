@@ -277,6 +277,7 @@ class Scope:
     Attributes:
         window: that is searched.
         unknown: the recorded times of it in which it is not known whether matches count.
+        since: back to when the robot's place is known, where the time was over before; else None.
 
     Raises:
         InvalidArgumentsError: `where` is no place, or nothing can meet one of the other conditions.
@@ -292,10 +293,12 @@ class Scope:
     ) -> None:
         self.window = window
         self.unknown: Spans = []
+        self.since: Ns | None = None
         self._inside: Spans | None = None
         if where is not None:
             place = parse_where(view.limits, where)
             joined = joined_in_region(view, place, window)
+            self.since = joined.since
             inside = joined.inside(place.region, window)
             self._inside = united((stay.start, stay.stop + 1) for stay in inside)
             mixed = note_robots(view, resolve_path_topic(view), window)

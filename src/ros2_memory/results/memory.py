@@ -401,11 +401,13 @@ class Status(AnswerWithNotes):
         count, length = self.stalled
         if count:
             times = "once" if count == 1 else f"{count} times"
-            yield f"while the recorder ran, nothing was recorded {times} ({seconds(length):.3g} s)"
+            yield f"while the recorder ran, nothing was recorded {times} ({seconds(length):.10g} s)"
         if len(self.clock_steps) == 1:
             [(_, by)] = self.clock_steps
             how = (
-                f"{seconds(by):.3g} s ahead" if by > 0 else f"back by {seconds(-by):.3g} s or more"
+                f"{seconds(by):.10g} s ahead"
+                if by > 0
+                else f"back by {seconds(-by):.10g} s or more"
             )
             yield f"the clock was set {how}"
         elif self.clock_steps:

@@ -20,6 +20,7 @@ from ros2_memory.core.reply import (
     TENTHS_OF_S,
     TENTHS_OF_S_AGO,
     TIME,
+    TOTAL,
     LocalTimes,
     an_object,
     digits,
@@ -125,13 +126,16 @@ def _last_until(answer: Changes) -> Ns | None:
     return answer.changes[-1].until if answer.changes else None
 
 
-@result("topic", "type", "total", OBJECTS("changes"), span=(_first_change, _last_until))
+@result("topic", "type", TOTAL("total"), OBJECTS("changes"), span=(_first_change, _last_until))
 class Changes(AnswerWithNotes):
-    """The values that a topic held in a window, in order: the first of `total` of them."""
+    """The values that a topic held in a window, in order: the first of `total` of them.
+
+    With `total` whether that is all of them.
+    """
 
     topic: str
     type: str
-    total: int
+    total: tuple[int, bool]
     changes: tuple[Spell, ...]
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -98,10 +99,11 @@ def find_things(
     found = sorted(finder.find(asked), key=lambda thing: (-thing.last, thing.label, thing.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
-        others = [*anywhere.find({known.labels.key(beside.label)})] if beside.label else []
+        key = known.labels.key(beside.label)
+        others = [*anywhere.find({key})] if beside.label else []
         found = [*beside.those_near(found, others)]
-        if beside.label and not others:
-            view.notes.add(f"near: there is no thing {abbreviate(beside.label)} in this window")
+        view.notes.add(*beside.lack(found, others))
+        asked |= {key: beside.label} if beside.label and not others else {}
     note_unread(view, whole, nothing=not found, gaps=not found)
     if not found and asked_for != whole:
         view.notes.add(describe_misdated(view.snapshot.misdated))
@@ -202,6 +204,14 @@ class Near(NamedTuple):
                 at_once = min(thing.at_once or 1, len(near)) if thing.also_at else thing.at_once
                 yield thing._replace(near_m=near_m, place=place, at_once=at_once)
 
+    def lack(self, found: Sequence[_FoundThing], others: Sequence[_FoundThing]) -> Iterator[str]:
+        """Yields why nothing was found near it."""
+        if self.label and not others:
+            yield f"near: there is no thing {abbreviate(self.label)} in this window"
+        elif not found:
+            within = f"within {self.circle.radius_m:g} m"
+            yield f"near: nothing is {within} of it; for more give a larger radius_m"
+
 
 def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
     """Returns what a value of the argument `near` means: a label, or a point with a radius.
@@ -209,18 +219,19 @@ def parse_near(limits: QuerySettings, value: JsonValue) -> Near:
     Raises:
         InvalidArgumentsError: it is neither.
     """
-    given: JsonValue = {"label": value} if isinstance(value, str) else value
-    label = given.get("label", "") if isinstance(given, dict) else None
-    if isinstance(given, dict) and given.keys() <= {"label", "radius_m"}:
-        label = label or None
-        given = {"x": 0, "y": 0, **{name: part for name, part in given.items() if name != "label"}}
-    region = parse_where(limits, given, _NEAR_M, "near").region
-    if not isinstance(region, Circle) or not isinstance(label, str):
-        raise InvalidArgumentsError(
-            f'near was {abbreviate(value)}; give {{"label": "table", "radius_m": 1.0}}, or '
-            '{"x": 1.0, "y": 2.0, "radius_m": 0.5} (m)'
-        )
-    return Near(region, label)
+    at: JsonValue = {"label": value} if isinstance(value, str) else value
+    label: JsonValue = ""
+    if isinstance(at, dict) and at.keys() <= {"label", "radius_m"}:
+        label = at.get("label") or None
+        at = {"x": 0, "y": 0, "radius_m": at.get("radius_m", _NEAR_M)}
+    with suppress(InvalidArgumentsError):
+        region = parse_where(limits, at, _NEAR_M).region
+        if isinstance(region, Circle) and isinstance(label, str):
+            return Near(region, label)
+    raise InvalidArgumentsError(
+        f'near was {abbreviate(value)}; give {{"label": "table", "radius_m": 1.0}}, or '
+        '{"x": 1.0, "y": 2.0, "radius_m": 0.5} (m)'
+    )
 
 
 @dataclass(frozen=True, slots=True)

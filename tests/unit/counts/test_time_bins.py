@@ -141,12 +141,12 @@ def test_the_usual_time_is_the_median_of_the_first_ones() -> None:
         for each in ("02T08:10", "02T07:50", "03T08:30", "04T07:00", "04T23:00", "05T08:00")
     ]
     firsts = first_of_days(bins, times)
-    assert [datetime.fromtimestamp(each / S, UTC).strftime("%d %H:%M") for each in firsts] == [
+    assert [datetime.fromtimestamp(at / S, UTC).strftime("%d %H:%M") for _, at in firsts] == [
         "02 07:50",
         "03 08:30",
         "04 07:00",
         "05 08:00",
     ]
-    usual = usual_time(firsts, 5, zone("UTC"))
+    usual = usual_time([at for _, at in firsts], 5, zone("UTC"))
     assert usual == Usual(7 * H + 55 * 60, 7 * H, 8 * H + 1800, days=4, of_days=5)
     assert not first_of_days(bins, [])

@@ -12,7 +12,7 @@ from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import Transform
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, QuerySettings
-from ros2_memory.history.no_data import seconds
+from ros2_memory.history.coverage import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import as_json

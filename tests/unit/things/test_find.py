@@ -14,6 +14,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.text import abbreviate
 from ros2_memory.history.context import Memory, QuerySettings
 from tests.support.bags import (
     Msg,
@@ -814,8 +815,13 @@ def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
     assert near({"label": "mug", "radius_m": 9}, label="mug") == [("mug", 2.55), ("mug", 2.55)]
     there = {"x": 3.4, "y": 0.9, "radius_m": 0.2}
     assert near("table", where=there) == [("mug", 0.5)]
-    assert near("sofa") == []
-    assert 'near: there is no thing "sofa" in this window' in ask(tmp_path, near="sofa")["notes"]
+    beside = {"label": "plates", "radius_m": 0.1}
+    assert near(beside, label="mug") == []
+    assert any("within 0.1 m" in note for note in ask(tmp_path, near=beside, label="mug")["notes"])
+    assert near("tabel") == []
+    notes = ask(tmp_path, near="tabel")["notes"]
+    assert 'near: there is no thing "tabel" in this window' in notes
+    assert any("did you mean table?" in note for note in notes)
 
 
 @pytest.mark.parametrize(
@@ -828,6 +834,8 @@ def test_things_near_a_point_or_near_a_thing_of_a_label(tmp_path: Path) -> None:
         {"label": "mug", "x": 1},
         {"x": 1},
         {"label": "mug", "radius_m": -1},
+        {"label": "mug", "radius_m": "1"},
+        {"label": "mug", "radius": 1},
         [1, 2],
         {"x": [0, 1], "y": [0, 1]},
     ],
@@ -837,7 +845,7 @@ def test_what_is_no_near_is_named_with_what_to_give(tmp_path: Path, near: Any) -
     write_splits(tmp_path, looked(0, 3, HERE, ("mug", 3.0, 0.5)))
     reply = ask(tmp_path, near=near)
     assert reply["error"] == "invalid_arguments"
-    assert "near" in reply["detail"]
+    assert reply["detail"].startswith(f"near was {abbreviate(near)}; give ")
 
 
 def test_a_thing_with_a_routine_has_its_usual_places(tmp_path: Path) -> None:
