@@ -13,7 +13,6 @@ from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from ros2_memory.core.arrays import gathered
 from ros2_memory.core.errors import EpisodicError
@@ -29,6 +28,7 @@ from ros2_memory.storage.mcap.chunk import (
     decompressed_chunk,
     index_groups,
     pairs_in,
+    require_indexed,
 )
 from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
@@ -42,19 +42,7 @@ if TYPE_CHECKING:
 MAX_GROUP_CHUNKS: Final = 4096
 _TWICE: Final = "damaged: a message index holds a message twice"
 
-_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _UINT32: Final = np.dtype("<u4")
-_MESSAGE: Final = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<i8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<i8"),
-        ("publish_time", "<i8"),
-    ],
-    align=False,
-)
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
 _CHUNK_STEP: Final = 6
 _PLACE_BITS: Final = 29
@@ -156,16 +144,6 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
-def _require_as_indexed(pairs: Pairs, heads: np.ndarray[tuple[int], np.dtype[np.void]]) -> None:
-    """Compares the heads of message records with what the indexes say of them."""
-    if (
-        (heads["opcode"] != _MESSAGE_OPCODE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
-    ):
-        raise UnreadableError(NOT_THERE)
-
-
 def batches_of(
     content: ReadChunks,
     pairs: Pairs,
@@ -193,16 +171,9 @@ def batches_of(
     begins = ends - sizes
     begin, end = begins[pairs.chunks], ends[pairs.chunks]
     at = pairs.offsets + begin
-    if (
-        pairs.offsets.min() < 0
-        or int((at - end).max()) > -MESSAGE.size
-        or len(buffer) < MESSAGE.size
-    ):
-        raise UnreadableError(NOT_THERE)
-    heads = gathered(buffer, _MESSAGE, at)
+    heads = require_indexed(pairs, buffer, at)
     stops = at + RECORD.size + heads["length"]
-    _require_as_indexed(pairs, heads)
-    if (stops > end).any() or (stops < at + MESSAGE.size).any():
+    if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
     in_file = np.sort(at)
     if (in_file[1:] == in_file[:-1]).any():
