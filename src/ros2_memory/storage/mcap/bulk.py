@@ -8,7 +8,6 @@ some 200 indexes of a few messages each, and takes three times as long. Whatever
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -18,7 +17,7 @@ from ros2_memory.core.arrays import gathered
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask
+from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
 from ros2_memory.storage.errors import SizeLimit, UnreadableError
 from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
@@ -225,17 +224,11 @@ def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
     if batch.channel.encoding != "cdr" or not compressed.any():
         yield batch
         return
-    begin, size = 0, 0
-    payloads: list[bytes] = []
-    for nth in range(compressed.size):
-        payload = batch.payload(nth)
-        if compressed[nth]:
-            payload = uncompressed(batch.channel, payload)
-        payloads.append(payload)
-        size += len(payload)
-        if size >= BATCH_BYTES or nth == compressed.size - 1:
-            yield _with_payloads(batch.taken(np.arange(begin, nth + 1)), payloads)
-            begin, size, payloads = nth + 1, 0, []
+    records = map(batch.record, range(batch.sizes.size))
+    plain = (
+        record._replace(payload=uncompressed(batch.channel, record.payload)) for record in records
+    )
+    yield from batched(zip(batch.places.tolist(), plain, strict=True))
 
 
 def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
@@ -246,11 +239,6 @@ def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
     are_frames = np.zeros(is_long.size, np.bool_)
     are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
     return are_frames
-
-
-def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:
-    sizes = np.array([len(payload) for payload in payloads], np.int64)
-    return replace(batch, buffer=b"".join(payloads), starts=np.cumsum(sizes) - sizes, sizes=sizes)
 
 
 def bare_batches(
