@@ -48,7 +48,7 @@ _REASON_LENGTH: Final = 300
 
 _SEPARATOR: Final = re.compile(r"^=+[ \t]*\n(MSG|IDL):[ \t]*(\S+)[ \t]*\n", re.MULTILINE)
 _WIDE: Final = frozenset({"wchar", "wstring"})
-"""Types that rosbags makes no deserializer for: it parses them in IDL, and in `.msg` as messages."""
+"""Types that rosbags makes no deserializer for; in a `.msg` it takes them for messages."""
 _EVENT: Final = "_Event"
 _HALVES: Final = ("Request", "Response")
 _SERVICE_HEADER: Final = re.compile(r"={80}\nSRV: .*\n")

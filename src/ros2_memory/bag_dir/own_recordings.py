@@ -371,17 +371,13 @@ class OwnRecordings:
             RecorderError: they cannot be listed.
         """
         with self._lock:
-            rows = [
-                self._adopted_row(name, identity) for name, identity in sorted(identities.items())
-            ]
+            rows: list[ListRow] = []
+            for name, identity in sorted(identities.items()):
+                row = self._row_of(name, identity)
+                with suppress(OSError):
+                    row = row.with_bags(path.name for path in bags_in(self._bag_dir / name))
+                rows.append(row)
             self._append(rows)
-
-    def _adopted_row(self, name: str, identity: Identity) -> ListRow:
-        """Returns the line of a directory that is adopted."""
-        row = self._row_of(name, identity)
-        with suppress(OSError):
-            return row.with_bags(path.name for path in bags_in(self._bag_dir / name))
-        return row
 
     def _row_of(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory, one of the list or another."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from ros2_memory.columns.pack import FORMAT
 from ros2_memory.columns.schema import PRAGMAS, STATEMENTS, TABLES
+from ros2_memory.core.errors import sqlite_code
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
@@ -477,19 +478,13 @@ def is_transient(error: Exception) -> bool:
     that is missing (`SQLITE_ERROR`) and text that is not UTF-8 (no code) are faults of the content.
     """
     is_operational = isinstance(error, sqlite3.OperationalError)
-    is_of_content = _code(error) in {0, sqlite3.SQLITE_ERROR}
+    is_of_content = sqlite_code(error) in {0, sqlite3.SQLITE_ERROR}
     return isinstance(error, MemoryError) or (is_operational and not is_of_content)
 
 
 def is_busy(error: Exception) -> bool:
     """Returns whether another program holds the database."""
-    return _code(error) in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
-
-
-def _code(error: Exception) -> int:
-    """Returns SQLite's primary result code; 0 where the error is not SQLite's."""
-    code: object = getattr(error, "sqlite_errorcode", 0)
-    return code & 0xFF if isinstance(code, int) else 0
+    return sqlite_code(error) in {sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED}
 
 
 def files_of(path: Path) -> list[Path]:

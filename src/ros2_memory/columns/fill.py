@@ -21,7 +21,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns
-from ros2_memory.index.scan import settled
+from ros2_memory.index.scan import Stamp, settled
 from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
@@ -395,14 +395,13 @@ class Filling:
 def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
     """Returns whether a bag is as the index found it, for a while now, and none of it goes."""
     try:
-        stat = os.lstat(bag.path)
+        stamp = Stamp.of(os.lstat(bag.path), _mtime_ns(bag.path.with_name(HANDOVER_FILE)))
     except OSError:
         return False
-    sidecar_ns = _mtime_ns(bag.path.with_name(HANDOVER_FILE))
     return (
-        (stat.st_size, stat.st_mtime_ns, sidecar_ns) == (bag.size, bag.mtime_ns, bag.sidecar_ns)
-        and settled(stat.st_mtime_ns, now)
-        and settled(sidecar_ns, now)
+        stamp.is_of(bag)
+        and settled(stamp.mtime_ns, now)
+        and settled(stamp.sidecar_ns, now)
         and not (bag_dir / ERASING_FILE).exists()
     )
 

@@ -159,3 +159,9 @@ class RecorderError(EpisodicError):
     """Recording cannot start or continue; the sentence advises what to do."""
 
     code = "recorder"
+
+
+def sqlite_code(error: Exception) -> int:
+    """Returns the primary result code of SQLite; 0 for an error that is not SQLite's."""
+    code: object = getattr(error, "sqlite_errorcode", 0)
+    return code & 0xFF if isinstance(code, int) else 0

@@ -16,7 +16,7 @@ from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
-from ros2_memory.index.copied_files import is_copy
+from ros2_memory.index.copied_files import alike_among, is_copy
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
 from ros2_memory.index.snapshot import Snapshot
@@ -173,7 +173,7 @@ class BagTable:
     def _copies(self) -> tuple[BagFile, ...]:
         """Returns the bags that are copies of others in their folder; compares each once."""
         compared, self._compared = self._compared, {}
-        for pair in self._timeline.alike:
+        for pair in alike_among(self._timeline.bags):
             with suppress(OSError):
                 self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
         return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)

@@ -6,31 +6,29 @@ One of them counts. Messages of one folder are no copies of each other, so all w
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING, Final, TypeAlias
+from collections import Counter
+from typing import TYPE_CHECKING, Final
+
+from ros2_memory.index.segment import folder_of
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.core.model import BagFile
 
-Alike: TypeAlias = "tuple[tuple[BagFile, BagFile], ...]"
-"""Bags that may be copies, each behind the one that it may be a copy of."""
 _BLOCK_BYTES: Final = 64 << 10
 _BLOCKS: Final = 16
 
 
-def alike_among(bags: Sequence[BagFile]) -> Alike:
-    """Returns those of some bags that have folder, size and summary of one with a shorter name."""
-    if len({bag.start for bag in bags}) == len(bags):
-        return ()
+def alike_among(bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, BagFile]]:
+    """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
+    starts = Counter(bag.start for bag in bags)
+    suspects = [bag for bag in bags if starts[bag.start] > 1]
     originals: dict[tuple[str, int, int, int], BagFile] = {}
-    pairs = []
-    for bag in sorted(bags, key=lambda bag: (len(bag.file), bag.file)):
-        key = (bag.file.rpartition("/")[0], bag.size, bag.start, bag.end)
-        original = originals.setdefault(key, bag)
+    for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
+        original = originals.setdefault((folder_of(bag), bag.size, bag.start, bag.end), bag)
         if original is not bag and original.summary == bag.summary:
-            pairs.append((original, bag))
-    return tuple(pairs)
+            yield original, bag
 
 
 def is_copy(original: BagFile, bag: BagFile) -> bool:

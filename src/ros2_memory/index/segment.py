@@ -19,7 +19,6 @@ from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.copied_files import Alike, alike_among
 from ros2_memory.index.holes import Pause, pauses_between, pauses_within
 from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
@@ -206,11 +205,6 @@ class Segment:
         return {
             folder: Tally(*tally) for folder, tally in zip(folders, tallies.tolist(), strict=True)
         }
-
-    @cached_property
-    def alike(self) -> Alike:
-        """The bags that may be copies of others in the same folder."""
-        return alike_among(self.bags)
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from bisect import bisect_left, bisect_right
 from functools import cached_property, reduce
-from itertools import accumulate, chain, pairwise
+from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
@@ -19,7 +19,6 @@ from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import Spans, overlap_spans, united, without
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.copied_files import Alike, alike_among
 from ros2_memory.index.segment import (
     Pace,
     Segment,
@@ -171,17 +170,6 @@ class Timeline:
         whole = [bag for bag in around if not is_thinned(bag.file) and not is_carried(bag.file)]
         # Between the bags of a moment nothing is missing.
         return without(days, united([(bag.start, bag.end + 1) for bag in whole], NS_PER_S))
-
-    @property
-    def alike(self) -> Alike:
-        """The bags that may be copies of others in the same folder."""
-        seams = (
-            alike_among([*before.bags, *after.bags])
-            for before, after in pairwise(self.segments)
-            if before.bags[-1].start == after.bags[0].start
-        )
-        within = (segment.alike for segment in self.segments)
-        return tuple(dict.fromkeys(chain.from_iterable(chain(within, seams))))
 
     @property
     def disk_use(self) -> tuple[int, int]:

@@ -22,6 +22,7 @@ from ros2_memory.core.errors import (
     BagUnreachableError,
     BagVanishedError,
     EpisodicError,
+    sqlite_code,
 )
 
 if TYPE_CHECKING:
@@ -125,7 +126,7 @@ def reason_of(error: Exception) -> str:
         return f"it cannot be opened or read: {error.strerror or error}"
     if isinstance(error, MemoryError):
         return "there is not enough memory to read it"
-    if _sqlite_code(error) in _DISK_ERRORS:
+    if sqlite_code(error) in _DISK_ERRORS:
         return f"it cannot be opened or read: {error}"
     words = " ".join(str(error).split())[:160]
     return f"damaged: {words} ({type(error).__name__})" if words else type(error).__name__
@@ -135,13 +136,7 @@ def _may_pass(error: Exception) -> bool:
     """Returns whether reading the same bytes again may succeed."""
     if isinstance(error, (OSError, MemoryError, UnreachableError)):
         return True
-    return _sqlite_code(error) in _DISK_ERRORS
-
-
-def _sqlite_code(error: Exception) -> int | None:
-    """Returns the primary result code of SQLite; None for any other error."""
-    code: object = getattr(error, "sqlite_errorcode", None)
-    return code & 0xFF if isinstance(code, int) else None
+    return sqlite_code(error) in _DISK_ERRORS
 
 
 MAX_CHUNK_MB: Final = 64

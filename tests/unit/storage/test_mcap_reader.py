@@ -79,7 +79,7 @@ class TestReadingOnlyWhatIsWanted:
         path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
         reader = McapReader()
         whole = read(reader, path)
-        for name in ("index_from_summary", "chunk_columns", "chunk_data"):
+        for name in ("index_from_summary", "pairs_in", "chunk_data"):
             monkeypatch.delattr(bag_file, name)
         assert read(reader, path) == whole
         with pytest.raises(BagError):

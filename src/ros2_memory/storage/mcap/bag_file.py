@@ -8,7 +8,6 @@ messages themselves where the indexes of a file are missing or wrong (see `mcap.
 
 from __future__ import annotations
 
-import struct
 from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -68,7 +67,6 @@ from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     DoubtError,
     McapIndex,
-    chunk_columns,
     chunk_data,
     index_from_summary,
 )
@@ -425,21 +423,19 @@ class McapBags:
                 missing.add(channel)
         if not missing:
             return columns
-        if chunk.index_places is None:
-            walked = walk_chunk(self._chunk_data(file, chunk) if data is None else data)
-            read = walked.pairs.columns(missing)
-        elif data is None:
-            return [*columns, *chunk_columns(file, chunk, missing).values()]
-        else:
-            try:
-                read = chunk_columns(file, chunk, missing)
-                for channel, fresh in read.items():
-                    require_indexed(data, channel, fresh)
-            except (UnreadableError, ValueError, struct.error) as error:
-                raise _ContradictedError(reason_of(error), chunk) from error
+        if data is None and chunk.index_places is None:
+            data = self._chunk_data(file, chunk)
+        try:
+            pairs = _pairs(file, chunk, missing, data or b"")
+            if data is not None:
+                require_indexed(pairs, data, pairs.offsets)
+            read = pairs.columns(missing)
+        except (UnreadableError, ValueError, IndexError) as error:
+            raise _ContradictedError(reason_of(error), chunk) from error
         for channel, fresh in read.items():
-            self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
-        return [*columns, *(read[channel] for channel in missing)]
+            if data is not None:
+                self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
+        return [*columns, *read.values()]
 
     def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
         """Compares the chunks beside a window with their records, each once.

@@ -8,18 +8,16 @@ some 200 indexes of a few messages each, and takes three times as long. Whatever
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-from mcap.opcode import Opcode
 
 from ros2_memory.core.arrays import gathered
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
-from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask
+from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
 from ros2_memory.storage.errors import SizeLimit, UnreadableError
 from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
@@ -29,6 +27,7 @@ from ros2_memory.storage.mcap.chunk import (
     decompressed_chunk,
     index_groups,
     pairs_in,
+    require_indexed,
 )
 from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
@@ -42,19 +41,7 @@ if TYPE_CHECKING:
 MAX_GROUP_CHUNKS: Final = 4096
 _TWICE: Final = "damaged: a message index holds a message twice"
 
-_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _UINT32: Final = np.dtype("<u4")
-_MESSAGE: Final = np.dtype(
-    [
-        ("opcode", "u1"),
-        ("length", "<i8"),
-        ("channel", "<u2"),
-        ("sequence", "<u4"),
-        ("log_time", "<i8"),
-        ("publish_time", "<i8"),
-    ],
-    align=False,
-)
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
 _CHUNK_STEP: Final = 6
 _PLACE_BITS: Final = 29
@@ -156,16 +143,6 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
-def _require_as_indexed(pairs: Pairs, heads: np.ndarray[tuple[int], np.dtype[np.void]]) -> None:
-    """Compares the heads of message records with what the indexes say of them."""
-    if (
-        (heads["opcode"] != _MESSAGE_OPCODE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
-    ):
-        raise UnreadableError(NOT_THERE)
-
-
 def batches_of(
     content: ReadChunks,
     pairs: Pairs,
@@ -193,16 +170,9 @@ def batches_of(
     begins = ends - sizes
     begin, end = begins[pairs.chunks], ends[pairs.chunks]
     at = pairs.offsets + begin
-    if (
-        pairs.offsets.min() < 0
-        or int((at - end).max()) > -MESSAGE.size
-        or len(buffer) < MESSAGE.size
-    ):
-        raise UnreadableError(NOT_THERE)
-    heads = gathered(buffer, _MESSAGE, at)
+    heads = require_indexed(pairs, buffer, at)
     stops = at + RECORD.size + heads["length"]
-    _require_as_indexed(pairs, heads)
-    if (stops > end).any() or (stops < at + MESSAGE.size).any():
+    if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
     in_file = np.sort(at)
     if (in_file[1:] == in_file[:-1]).any():
@@ -254,17 +224,11 @@ def _decompressed(batch: Batch, uncompressed: Uncompressed) -> Iterator[Batch]:
     if batch.channel.encoding != "cdr" or not compressed.any():
         yield batch
         return
-    begin, size = 0, 0
-    payloads: list[bytes] = []
-    for nth in range(compressed.size):
-        payload = batch.payload(nth)
-        if compressed[nth]:
-            payload = uncompressed(batch.channel, payload)
-        payloads.append(payload)
-        size += len(payload)
-        if size >= BATCH_BYTES or nth == compressed.size - 1:
-            yield _with_payloads(batch.taken(np.arange(begin, nth + 1)), payloads)
-            begin, size, payloads = nth + 1, 0, []
+    records = map(batch.record, range(batch.sizes.size))
+    plain = (
+        record._replace(payload=uncompressed(batch.channel, record.payload)) for record in records
+    )
+    yield from batched(zip(batch.places.tolist(), plain, strict=True))
 
 
 def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
@@ -275,11 +239,6 @@ def _are_frames(buffer: bytes, starts: IntArray, sizes: IntArray) -> Mask:
     are_frames = np.zeros(is_long.size, np.bool_)
     are_frames[is_long] = gathered(buffer, _UINT32, starts) == _MAGIC
     return are_frames
-
-
-def _with_payloads(batch: Batch, payloads: Sequence[bytes]) -> Batch:
-    sizes = np.array([len(payload) for payload in payloads], np.int64)
-    return replace(batch, buffer=b"".join(payloads), starts=np.cumsum(sizes) - sizes, sizes=sizes)
 
 
 def bare_batches(

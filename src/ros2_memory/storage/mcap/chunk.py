@@ -6,7 +6,6 @@ a Python object for every record of a chunk (2.4 ms a chunk, where walking its b
 
 from __future__ import annotations
 
-import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
@@ -48,8 +47,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.file_io import OpenFile
 
 
-INDEX_HEAD: Final = struct.Struct("<BQHI")
-"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
 OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
@@ -58,17 +55,10 @@ INDEX_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
 _INDEX: Final = np.dtype(
     [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
 )
+"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 NOT_THERE: Final = "damaged: a message is not where its index says"
-_MESSAGE_OPCODE: Final = bytes((Opcode.MESSAGE,))
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
-_LENGTH_AT: Final = 1
-_CHANNEL_AT: Final = 9
-_LOG_TIME_AT: Final = 15
-"""Where these fields lie in a message record."""
-_UINT16: Final = np.dtype("<u2")
-_INT64: Final = np.dtype("<i8")
-_EVERY_BYTE: Final = (1,)
 _EMPTY: Final[IntArray] = np.zeros(0, dtype=np.int64)
 _ZERO: Final[IntArray] = np.zeros(1, dtype=np.int64)
 
@@ -267,42 +257,46 @@ def index_groups(
             begin, size = nth + 1, 0
 
 
-def require_indexed(data: bytes, channel: int, column: Column) -> None:
-    """Compares a column with the records of its chunk.
+_HEAD: Final = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time", "<i8"),
+        ("publish_time", "<i8"),
+    ],
+    align=False,
+)
+"""The heads of message records: all but their payloads."""
+
+
+def require_indexed(
+    pairs: Pairs, data: bytes, places: IntArray
+) -> np.ndarray[tuple[int], np.dtype[np.void]]:
+    """Compares messages with their records, and returns the heads of these.
 
     Together with the number of messages, which `mcap.index` compares with the statistics, this
-    proves that the column has all messages of the channel in this chunk. It takes some microseconds
-    a chunk.
+    proves that all messages of these channels are there.
 
     Args:
-        data: the decompressed records of the chunk, which its checksum protects.
-        channel: the number of the channel.
-        column: what the message index of the channel holds.
+        pairs: the messages, by their indexes.
+        data: the decompressed records, which checksums protect.
+        places: where the record of each message begins.
 
     Raises:
         UnreadableError: a message is not there, or has another channel or log time.
     """
-    times, places = column
-    count = times.size
-    stop = len(data) - MESSAGE.size + 1
-    if not count:
-        return
-    if stop <= 0 or places.min() < 0:
+    if places.size and (places.min() < 0 or places.max() > len(data) - _HEAD.itemsize):
         raise UnreadableError(NOT_THERE)
-    # Strided views with an element at every byte: indexing one with `places` gathers a field of all
-    # messages at once, aligned or not.
-    try:
-        opcodes = np.ndarray(stop, np.uint8, data, 0, _EVERY_BYTE)[places]
-        channels = np.ndarray(stop, _UINT16, data, _CHANNEL_AT, _EVERY_BYTE)[places]
-        stated = np.ndarray(stop, _INT64, data, _LOG_TIME_AT, _EVERY_BYTE)[places]
-    except IndexError:
-        raise UnreadableError(NOT_THERE) from None
+    heads = gathered(data, _HEAD, places)
     if (
-        opcodes.tobytes() != _MESSAGE_OPCODE * count
-        or channels.tobytes() != channel.to_bytes(2, "little") * count
-        or stated.tobytes() != times.tobytes()
+        (heads["opcode"] != Opcode.MESSAGE).any()
+        or (heads["channel"] != pairs.channels).any()
+        or (heads["log_time"] != pairs.times).any()
     ):
         raise UnreadableError(NOT_THERE)
+    return heads
 
 
 def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, bytes]]:
@@ -320,12 +314,9 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     """
     places = np.sort(np.concatenate([column.places for column in columns] or [_EMPTY]))
     size = len(data)
-    lengths = _EMPTY
-    if places.size:
-        stop = size - RECORD.size + 1
-        lengths = np.ndarray(stop, _INT64, data, _LENGTH_AT, _EVERY_BYTE)[places]
-        if lengths.min() < 0 or lengths.max() > size:
-            raise UnreadableError(NOT_THERE)
+    lengths = gathered(data, _HEAD, places)["length"]
+    if ((lengths < 0) | (lengths > size)).any():
+        raise UnreadableError(NOT_THERE)
     begins = np.concatenate([_ZERO, places + RECORD.size + lengths])
     ends = np.append(places, size)
     if bool((begins > ends).any()):

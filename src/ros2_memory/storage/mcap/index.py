@@ -32,7 +32,6 @@ from ros2_memory.storage.errors import (
     reason_of,
 )
 from ros2_memory.storage.mcap.chunk import (
-    INDEX_HEAD,
     INDEX_OFFSET,
     OUTSIDE,
     Chunk,
@@ -56,7 +55,7 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from mcap.records import Statistics
 
@@ -240,26 +239,6 @@ class McapIndex(NamedTuple):
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
         return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
-
-
-def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
-    """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
-
-    All indexes of the file were found right together (`index_from_summary`).
-
-    Raises:
-        UnreadableError, ValueError: they have changed.
-    """
-    base = chunk.offset + chunk.length
-    region = file.read(base, chunk.index_length)
-    columns: dict[int, Column] = {}
-    for number, offset in _INDEX_OFFSET.iter_unpack(chunk.index_places or b""):
-        if number in wanted:
-            _, _, _, size = INDEX_HEAD.unpack_from(region, offset - base)
-            at = offset - base + INDEX_HEAD.size
-            pairs = np.frombuffer(region, "<i8", size // 8, at).reshape(-1, 2)
-            columns[number] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
-    return columns
 
 
 class Contents:
