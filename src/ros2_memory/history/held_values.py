@@ -88,17 +88,24 @@ class HeldValues:
         topic: its name.
         field: dot-path of the value in the messages; None for all that they have.
         asked: the argument that asks for it, as errors name it.
+        until: the moment before which it is asked for; a topic may have had other types then.
 
     Attributes:
         reached: what began from then on was yielded by `back`.
         known: what `during` found, newest first, also where time was over.
 
     Raises:
-        InvalidArgumentsError: what the newest message has there is no single value.
+        InvalidArgumentsError: what the newest message before then has there is no single value.
     """
 
     def __init__(
-        self, view: View, topic: str, field: str | None = None, *, asked: str = ""
+        self,
+        view: View,
+        topic: str,
+        field: str | None = None,
+        *,
+        asked: str = "",
+        until: Ns = MAX_NS,
     ) -> None:
         self._view = view
         self._topic = topic
@@ -108,7 +115,7 @@ class HeldValues:
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
-        newest = view.stream.newest(topic, TimeWindow.everything())
+        newest = view.stream.newest(topic, TimeWindow(MIN_NS, until))
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
             value = self._said(message, newest.type)

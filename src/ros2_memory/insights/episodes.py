@@ -212,7 +212,7 @@ def topic_changes(
         raise InvalidArgumentsError("changes are of one field: name one in fields")
     view, window = open_span(memory, call, span)
     topic = resolve_topic(view, topic)
-    values = HeldValues(view, topic, *fields, asked="changes")
+    values = HeldValues(view, topic, *fields, asked="changes", until=window.stop)
     start, _ = window.asked()
     try:
         held = values.during(start, window.stop)
