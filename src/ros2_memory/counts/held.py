@@ -319,7 +319,7 @@ def count_values(
     """
     if len(fields) > 1:
         raise InvalidArgumentsError("by value counts one field: name one in fields")
-    values = HeldValues(view, topic, *fields, asked="by value")
+    values = HeldValues(view, topic, *fields, asked="by value", until=asked.stop)
     start, end = asked.asked()
     first, last = recorded_reach(view.snapshot, asked) or (start, end)
     start, stop = max(start, first), min(end, last) + 1

@@ -33,7 +33,7 @@ from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
-from ros2_memory.insights.sightings import only_messages_count, read_sightings
+from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 
@@ -100,8 +100,7 @@ def count_matches(
         held, since = _held_by_events(binned, topics, condition, value, scope)
     if held is None:
         spans, since = read_sightings(view, topic, condition, scope)
-        lasting = _held_at_begin(binned, topics, condition, scope)
-        held = TrueIntervals.of([*lasting, *((first, last, True) for first, last in spans)])
+        held = TrueIntervals.of(spans)
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
@@ -151,8 +150,9 @@ def _held_by_events(
         if condition.field is not None or not isinstance(value, str) or any(map(has_errors, types)):
             return None, None
         return _label_held(binned, topics, condition, scope)
-    if len(topics) > 1 or (condition.field is None and _has_lists(view, topic)):
-        return None, None  # booleans in lists are no events
+    # What texts say of a topic that had them before is no event, nor are booleans in lists.
+    if len(types) > 1 or len(topics) > 1 or (not condition.field and _has_lists(view, topic)):
+        return None, None
     parts, since = _events_in_order(view, topic, binned.counted)
     before = _met_before(binned, topic, condition) if since is None else None
     spans = _flag_held(binned, topic, parts, condition, before, wanted=wanted)
@@ -304,31 +304,14 @@ def _with_time_before(
     return [(start, stop, False) if before else (since, stop, True), *later]
 
 
-def _held_at_begin(
-    binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
-) -> Iterator[tuple[Ns, Ns, bool]]:
-    """Yields until when latched topics still met a condition, by messages before the window."""
-    view = binned.view
-    start, end = binned.counted.asked()
-    for topic in topics:
-        if scope.is_bounded:
-            if view.limits.latching.is_latched(view.snapshot, topic):
-                view.notes.add(only_messages_count(topic))
-        elif _met_before(binned, topic, condition):
-            yield start, held_until(view, topic, start, end), False
-
-
 def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:
     """Returns whether what a latched topic said last before the window meets a condition.
 
     None where it said nothing that still held when the window began.
     """
-    view = binned.view
-    held = held_at(view, topic, binned.counted.asked()[0])
-    message = None if held is None else view.bags.decode(held)
-    if held is None or message is None:
-        return None
-    return condition.matches(view.extractor.exact(message, held.type))
+    held = held_at(binned.view, topic, binned.counted.asked()[0])
+    value = None if held is None else binned.view.value(held)
+    return None if value is None else condition.matches(value)
 
 
 def _spans_of_flag(

@@ -88,17 +88,24 @@ class HeldValues:
         topic: its name.
         field: dot-path of the value in the messages; None for all that they have.
         asked: the argument that asks for it, as errors name it.
+        until: the moment before which it is asked for; a topic may have had other types then.
 
     Attributes:
         reached: what began from then on was yielded by `back`.
         known: what `during` found, newest first, also where time was over.
 
     Raises:
-        InvalidArgumentsError: what the newest message has there is no single value.
+        InvalidArgumentsError: what the newest message before then has there is no single value.
     """
 
     def __init__(
-        self, view: View, topic: str, field: str | None = None, *, asked: str = ""
+        self,
+        view: View,
+        topic: str,
+        field: str | None = None,
+        *,
+        asked: str = "",
+        until: Ns = MAX_NS,
     ) -> None:
         self._view = view
         self._topic = topic
@@ -108,7 +115,7 @@ class HeldValues:
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
-        newest = view.stream.newest(topic, TimeWindow.everything())
+        newest = view.stream.newest(topic, TimeWindow(MIN_NS, until))
         message = None if newest is None else view.bags.decode(newest)
         if newest is not None and message is not None:
             value = self._said(message, newest.type)
@@ -270,7 +277,7 @@ class HeldValues:
 def _breaks(view: View, topic: str) -> list[Ns]:
     """Returns the moments from which on what a topic said before is not known to hold, in order."""
     breaks = set(_ends_of_clocks(view))
-    if not view.limits.latching.is_latched(view.snapshot, topic):
+    if not is_latched(view, topic):
         breaks.update(start for start, _ in view.snapshot.breaks)
     return sorted(breaks)
 
@@ -295,6 +302,11 @@ def _as_said(value: JsonValue) -> JsonValue:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+def is_latched(view: View, topic: str) -> bool:
+    """Returns whether a topic is latched: what it said last holds."""
+    return view.limits.latching.is_latched(view.snapshot, topic)
+
+
 def is_text(view: View, topic: str) -> bool:
     """Returns whether all messages of a topic are plain texts."""
     return set(view.timeline.types_of(topic)) == {TEXT}
@@ -306,7 +318,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
     On a latched topic to its next message, or as far as something is recorded. On another one to
     its next message, too, and not at all after `last` where that comes later than `SILENCE_NS`.
     """
-    lasting = view.limits.latching.is_latched(view.snapshot, topic)
+    lasting = is_latched(view, topic)
     stop = end if lasting else last + SILENCE_NS
     following = view.stream.first([topic], TimeWindow(last + 1, stop + 1))
     if lasting:
@@ -318,7 +330,7 @@ def held_until(view: View, topic: str, last: Ns, end: Ns) -> Ns:
 
 def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     """Returns the message before a moment that still held then, on a latched topic."""
-    if not view.limits.latching.is_latched(view.snapshot, topic):
+    if not is_latched(view, topic):
         return None
     before = view.stream.first([topic], TimeWindow(MIN_NS, moment), newest_first=True)
     breaks = _breaks(view, topic)
@@ -329,9 +341,9 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
 
 def holds_on(view: View, topics: Iterable[str]) -> bool:
     """Returns whether the newest messages of topics hold on: they are latched, or seldom."""
-    latching, timeline = view.limits.latching, view.timeline
+    timeline = view.timeline
     return all(
-        latching.is_latched(view.snapshot, topic)
+        is_latched(view, topic)
         or all(timeline.pace(topic, recording).is_rare for recording in timeline.recordings(topic))
         for topic in topics
     )

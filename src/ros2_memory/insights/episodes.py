@@ -216,7 +216,7 @@ def topic_changes(
         raise InvalidArgumentsError("changes are of one field: name one in fields")
     view, window = open_span(memory, call, span)
     topic = resolve_topic(view, topic)
-    values = HeldValues(view, topic, *fields, asked="changes")
+    values = HeldValues(view, topic, *fields, asked="changes", until=window.stop)
     start, _ = window.asked()
     is_all = True
     try:

@@ -20,11 +20,12 @@ from ros2_memory.core.arrays import rows_of, stacked
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.history.held_values import held_until, is_latched
 from ros2_memory.history.reverse_search import RowCondition
 from ros2_memory.history.scan import messages_at, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -325,6 +326,8 @@ def find_runs(
 ) -> SearchedRuns:
     """Returns the runs of matches in a scope, on all topics of a search; of a log each message.
 
+    What a latched topic states holds on: of its runs there are the parts that lie in the scope.
+
     Args:
         view: what is searched.
         search: which topics, and for what.
@@ -341,15 +344,19 @@ def find_runs(
     # What lies outside of a scope is not read, and may well be decodable.
     tester.ruled_out = scope.is_bounded
     is_log = view.timeline.is_log
+    latched = [topic for topic in search.topics if scope.is_bounded and is_latched(view, topic)]
+    if latched:
+        enough = None
     runs_by_topic = {topic: _TopicRuns(topic, apart=is_log(topic)) for topic in search.topics}
     reached = searched = scope.window.stop
     try:
-        for window in scope.narrowed():
+        for window in [scope.window] if latched else scope.narrowed():
             for topic_runs in runs_by_topic.values():
                 topic_runs.end_in(view, TimeWindow(window.stop, searched))
             searched = window.start
             for block in _merged_blocks(tester, runs_by_topic, window):
-                counted = _scoped(block, scope) if scope.is_bounded else block
+                is_whole = not scope.is_bounded or block.topic in latched
+                counted = block if is_whole else _scoped(block, scope)
                 runs_by_topic[block.topic].add(counted)
                 reached = block.first if len(runs_by_topic) == 1 else block.last
                 if enough is not None and _has_enough(runs_by_topic, enough, reached):
@@ -360,14 +367,38 @@ def find_runs(
         runs = [run for topic_runs in runs_by_topic.values() for run in topic_runs.cut()]
         if not runs:
             raise
-        return SearchedRuns(sorted(runs, key=_by_last), reached, is_over=True)
+        parts = [*_parts_in(view, runs, scope, latched)]
+        return SearchedRuns(sorted(parts, key=_by_last), reached, is_over=True)
     runs = _newest_first(runs_by_topic)
+    if latched:
+        runs = sorted(_parts_in(view, runs, scope, latched), key=_by_last)
     if enough is not None and len(runs) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_untested(replace(scope.window, start=runs[enough - 1].first))
         return SearchedRuns(runs, reached)
     search.close(scope.window, is_found=bool(runs), ruled_out=tester.ruled_out)
     return SearchedRuns(runs)
+
+
+def _parts_in(
+    view: View, runs: Iterable[Run], scope: Scope, latched: Collection[str]
+) -> Iterator[Run]:
+    """Yields runs, and of those of latched topics the parts of a scope in which they held."""
+    _, end = scope.window.asked()
+    for run in runs:
+        if run.topic not in latched:
+            yield run
+            continue
+        until = held_until(view, run.topic, run.last, end)
+        for first, stop in scope.parts_of(run.first, until):
+            said = TimeWindow(first, min(run.last, stop) + 1)
+            messages = 0
+            if first <= run.last:
+                messages = sum(1 for _ in view.stream.messages([run.topic], said))
+            if messages or first < stop:
+                last = max(first, min(run.last, stop))
+                begun = run.begun and first == run.first
+                yield Run(run.topic, first, last, messages, run.until, begun)
 
 
 def _merged_blocks(

@@ -29,7 +29,7 @@ from ros2_memory.core.timebase import (
 )
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
-from ros2_memory.history.held_values import held_at, held_until
+from ros2_memory.history.held_values import held_at, held_until, is_latched
 from ros2_memory.history.no_data import matching_topics, require_recorded
 from ros2_memory.history.reverse_search import (
     ReverseSearch,
@@ -124,7 +124,7 @@ def find_matches(
     else:
         search = ReverseSearch(view, topic, condition)
         rows = _runs_as_sightings(view, search, scope, shown, fields)
-        view.notes.add(*_latched_notes(view, search, window, scope))
+        view.notes.add(*_latched_notes(view, search, window))
     elapsed = elapsed_in(view, rows.searched)
     sightings = tuple(_completed(sighting, elapsed, other) for sighting in rows.sightings)
     episodes = tuple(_completed(episode, elapsed, other) for episode in rows.episodes)
@@ -263,10 +263,11 @@ def _runs_as_sightings(
 
 def read_sightings(
     view: View, pattern: str, condition: Condition, scope: Scope
-) -> tuple[list[tuple[Ns, Ns]], Ns | None]:
+) -> tuple[list[tuple[Ns, Ns, bool]], Ns | None]:
     """Returns the times (inclusive) of all sightings in a scope, oldest first.
 
-    With them since when they are known, where the call's time is over before all is searched.
+    And whether each is known to begin then: what a latched topic had said before may hold on. With
+    them since when they are known, where the call's time is over before all is searched.
 
     Raises:
         InvalidArgumentsError: no value of the topics can meet the condition.
@@ -276,47 +277,52 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        return [(goal.first, _goes_on_until(view, goal, scope)) for goal in reversed(goals)], None
+        ends = [(goal.first, _goes_on_until(view, goal, scope), True) for goal in reversed(goals)]
+        return ends, None
     if says_episodes(view, topics):
-        return episode_times(view, topics[0], condition, scope)
+        times, since = episode_times(view, topics[0], condition, scope)
+        return [(first, until, True) for first, until in times], since
     result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-    spans = [(run.first, _lasted_until(view, run, scope)) for run in reversed(result.runs)]
-    return spans, spans[0][0] if result.is_over else None
+    start, end = scope.window.asked()
+    # Without a scope the oldest may have begun before what there was time to search.
+    is_whole = not scope.is_bounded
+    spans = [
+        (run.first, _lasted_until(view, run, scope), run.begun or is_whole)
+        for run in reversed(result.runs)
+    ]
+    since = spans[0][0] if result.is_over else None
+    for topic in topics if since is None else ():
+        if met_before(view, topic, condition, start):
+            parts = scope.parts_of(start, held_until(view, topic, start, end))
+            spans += [(first, last, False) for first, last in parts]
+    return sorted(spans), since
 
 
-def _latched_notes(
-    view: View, search: ReverseSearch, window: TimeWindow, scope: Scope
-) -> Iterator[str]:
-    """Yields which latched topics met a condition when a window began, by an earlier message.
+def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
+    """Returns what a latched topic had said last before a moment, if it meets a condition."""
+    held = held_at(view, topic, moment)
+    if held is None or not condition.matches(view.value(held)):
+        return None
+    return held
 
-    In a scope, which of them may have met it whenever the scope began.
-    """
-    start = window.asked()[0]
+
+def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Iterator[str]:
+    """Yields which latched topics met a condition when a window began, by an earlier message."""
     for topic in search.topics:
-        if scope.is_bounded:
-            if view.limits.latching.is_latched(view.snapshot, topic):
-                yield only_messages_count(topic)
-            continue
-        before = held_at(view, topic, start)
-        if before is not None and search.matches(before):
+        before = met_before(view, topic, search.condition, window.asked()[0])
+        if before is not None:
             yield (
                 f"{topic} met this already when the window began: what it said at "
                 f"{unix_text(before.time)} holds until its next message"
             )
 
 
-def only_messages_count(topic: str) -> str:
-    """Returns the note on a latched topic in a scope: what it said before is not looked for."""
-    return (
-        f"with where or while, only messages of {topic} that came then count, and not what it "
-        f"said before, which may have held on: ask about the other topic, with {topic} in while"
-    )
-
-
 def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage | None:
-    """Returns the last match; None where its bag was deleted since."""
+    """Returns the last match, or what held without one; None where its bag was deleted since."""
+    if not run.messages:
+        return view.stream.newest(run.topic, TimeWindow(MIN_NS, run.last + 1))
     at = TimeWindow(run.last, run.last + 1)
     at_once = view.stream.messages([run.topic], at, newest_first=True)
     return next(islice(filter(search.matches, at_once), run.later, None), None)
@@ -332,7 +338,7 @@ def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
     if view.timeline.is_log(run.topic):
         return last
     _, end = scope.window.asked()
-    if run.until is None or view.limits.latching.is_latched(view.snapshot, run.topic):
+    if run.until is None or is_latched(view, run.topic):
         return scope.holds_until(last, held_until(view, run.topic, last, end))
     is_silent = run.until - last > SILENCE_NS
     return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
@@ -357,7 +363,7 @@ def _sighting(
     labels = {detection.label for detection in detections}
     thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun
-    at = run.first if robot_at_first else newest.time
+    at = run.first if robot_at_first else run.last
     newest_recording = newest.bag.recording
     recording = recording_at(view, newest.topic, at, newest_recording) or newest_recording
     robot = robot_at(view, at, recording, frame_id)

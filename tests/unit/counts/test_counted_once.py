@@ -163,3 +163,29 @@ def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool
         assert [each["count"] for each in answer["sightings"]] == [20]
         newest = asked(memory, tmp_path, "find_last_match", **sought)
         assert newest["timestamp"] == T + 19
+
+
+@each_way
+def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """A text for 100 s, then a boolean; true for 10 s of 20, and nothing or false in between."""
+    said = [
+        text((T + at) * NS_PER_S, "true" if at % 20 < 10 else "no", "/on")
+        for at in range(0, 100, 2)
+    ]
+    said += [boolean((T + at) * NS_PER_S, at % 20 < 10, "/on") for at in range(100, 200, 2)]
+    said += [odom((T + at) * NS_PER_S, 1.0, 0.0, topic="/on") for at in range(200, 220, 2)]
+    write_splits(tmp_path, said, 40)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"topic": "/on", "start": T, "end": T + 198}
+    on = {**window, "condition_type": "contains", "value": "true"}
+    found = asked(memory, tmp_path, "find_matches", **on, limit=20)
+    counted = asked(memory, tmp_path, "find_matches", **on, by="day")
+    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    assert found["total"] == 10
+    assert (whole["count"], whole["seconds"]) == (10, 100)
+    changes = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
+    assert [row["value"] for row in changes["changes"]] == ["true", "no"] * 5 + [True, False] * 5
+    values = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
+    assert values["all"][0] == 20

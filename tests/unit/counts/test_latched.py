@@ -96,15 +96,36 @@ def test_a_latched_text_or_number_lasts_into_the_window(tmp_path: Path, *, recal
 
 
 @each_way
-def test_it_is_said_that_a_latched_topic_in_a_scope_is_found_by_its_messages(
-    bag_dir: Path, *, recalls: bool
+def test_what_a_latched_topic_states_is_found_while_a_scope_holds(
+    tmp_path: Path, *, recalls: bool
 ) -> None:
+    """auto from 0 to 45 s and from 70 s on; bumped from 20 to 30, from 40 to 50 and from 80 s."""
+    bumps = [at for at in range(0, 101, 2) if 20 <= at < 30 or 40 <= at < 50 or at >= 80]
+    messages = [boolean(T0 + at * S, at in bumps, BUMPER) for at in range(0, 101, 2)]
+    said = ((0, "auto"), (45, "manual"), (70, "auto 2"), (85, "auto 3"))
+    messages += [text(T0 + at * S, words, "/mode") for at, words in said]
+    messages += [odom(T0 + at * S, at / 10, 0.0) for at in range(101)]
+    layout = McapLayout(latched=frozenset({"/mode"}))
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", sorted(messages, key=at_log_time), layout)
+    memory = memory_of(tmp_path, recalls=recalls)
     bumped = {"topic": BUMPER, "condition_type": "equals", "value": True}
-    answer = matches(bag_dir, DOCKED, 0, 1000, recalls=recalls, **{"while": bumped})
-    assert "ask about the other topic, with /docked in while" in " ".join(answer["notes"])
-    docked = {**bumped, "topic": DOCKED}
-    answer = matches(bag_dir, BUMPER, 0, 1000, recalls=recalls, **{"while": docked})
-    assert not any("in while" in note for note in answer.get("notes", ()))
+    auto = {"topic": "/mode", "condition_type": "contains", "value": "auto", "while": bumped}
+    found = asked(memory, tmp_path, "find_matches", **auto)
+    rows = [(row["first_seen"] - T0 / S, row["duration_s"]) for row in found["sightings"]]
+    assert rows == [(85, 15), (80, 5), (40, 5), (20, 10)]
+    texts = [row["matched"] for row in found["sightings"]]
+    assert texts == [["auto 3"], ["auto 2"], ["auto"], ["auto"]]
+    assert [row.get("count") for row in found["sightings"]] == [1, None, None, None]
+    assert [row["robot"]["x"] for row in found["sightings"]] == [8.5, 8.0, 4.0, 2.0]
+    assert (found["total"], "notes" in found) == (4, False)
+    counted = asked(memory, tmp_path, "find_matches", **auto, by="day")
+    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    assert (whole["seconds"], whole["count"]) == (35, 1)
+    later = asked(memory, tmp_path, "find_matches", **auto, by="day", start=T0 / S + 25)
+    assert dict(zip(later["columns"][1:], later["all"], strict=True))["seconds"] == 30
+    place = {"x": [1.0, 3.0], "y": [-1, 1]}
+    inside = asked(memory, tmp_path, "find_matches", **{**auto, "while": [bumped]}, where=place)
+    assert [row["first_seen"] for row in inside["sightings"]] == [T0 / S + 20]
 
 
 @each_way
