@@ -296,23 +296,23 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         head, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
         if head is None or body is None:
             continue
-        x, y, _ = body.translation
         yaw = _yaw(body.rotation)
-        posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
+        pose = np.stack((*body.translation, yaw, 0 * yaw), axis=1)
+        posed = np.where(body.valid[:, None], pose, math.nan)
         robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
         head_frame, body_frame = carriers
         if head_frame != body_frame:
             is_known = head.valid & body.valid
-            robot[rows, 3] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
+            robot[rows, 4] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
     return robot
 
 
 def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
-    """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
+    """Returns x, y, z (m) and heading (rad) of the robot at some times; NaN where not known.
 
     That is farther than 1 s from a pose, or where no transform leads from its frame.
     """
-    robot = np.full((len(times), 3), math.nan)
+    robot = np.full((len(times), 4), math.nan)
     placed = frames.poses(poses.frames.words[0], times) if len(poses) else None
     if placed is None:
         return robot
@@ -329,9 +329,9 @@ def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     turn = np.remainder(heading[after] - heading[before] + np.pi, 2 * np.pi) - np.pi
     half = (heading[before] + turn * ratio) / 2
     level = np.zeros(len(times))
-    x, y, _ = placed.points((x, y, z))
     yaw = _yaw(multiply(placed.rotation, (level, level, np.sin(half), np.cos(half))))
-    return np.where(is_known[:, None], np.stack((x, y, yaw), axis=1), math.nan)
+    pose = np.stack((*placed.points((x, y, z)), yaw), axis=1)
+    return np.where(is_known[:, None], pose, math.nan)
 
 
 def _yaw(rotation: Rotations) -> Floats:
