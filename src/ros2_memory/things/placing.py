@@ -132,14 +132,16 @@ class Placer:
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
             messages = joined_detected([self.rows.of(rows) for rows in of_topic])
-            is_named = any(
-                is_named_for_detections(rows.table.channel.type) and self.rows.have_labels(rows)
-                for rows in of_topic
-            )
+            is_named = any(map(self._are_of_detector, of_topic))
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
         return detected, detectors
+
+    def _are_of_detector(self, rows: Rows) -> bool:
+        """Returns whether the type of some rows is named for detections, and has labels."""
+        name = rows.table.channel.type.rpartition("/")[2].casefold()
+        return any(word in name for word in _OF_DETECTORS) and self.rows.have_labels(rows)
 
     def _poses(self, session: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -237,12 +239,6 @@ class Placer:
                 sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))
                 if sigma is not None and frame == memory.limits.map_frame:
                     yield stored.time, sigma
-
-
-def is_named_for_detections(type_name: str) -> bool:
-    """Returns whether a type is one of a detector by its name."""
-    name = type_name.rpartition("/")[2].casefold()
-    return any(word in name for word in _OF_DETECTORS)
 
 
 def _in_target(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
