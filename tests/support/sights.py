@@ -48,13 +48,14 @@ def sights_of_messages(messages: Sequence[Message]) -> Sights:
 def seen_in(messages: Sequence[Message]) -> DetectorMessages:
     """Messages of one topic as arrays."""
     nowhere = (math.nan, math.nan, math.nan)
-    robots = [(*(message.robot or nowhere), 0.0) for message in messages]
+    poses = [message.robot or nowhere for message in messages]
+    robots = [(x, y, 0.0, yaw, 0.0) for x, y, yaw in poses]
     every = [(row, one) for row, message in enumerate(messages) for one in message.things]
     scores = [math.nan if one.score is None else one.score for _, one in every]
     labels = Texts.of([one.label for _, one in every])
     return DetectorMessages(
         np.array([message.time for message in messages], np.int64),
-        np.array(robots, np.float64).reshape(-1, 4),
+        np.array(robots, np.float64).reshape(-1, 5),
         np.array([row for row, _ in every], np.int64),
         labels.codes.astype(np.int64),
         labels.words,

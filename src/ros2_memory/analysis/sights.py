@@ -35,7 +35,9 @@ Flags: TypeAlias = NDArray[np.bool_]
 CELL_MM: Final = 250
 CELL_DECIDEG: Final = 100
 NO_YAW: Final = -1
-_CELL: Final = (CELL_MM, CELL_MM, CELL_DECIDEG, CELL_DECIDEG)
+STOREY_MM: Final = 2_000
+"""What differs so much in height is on another floor."""
+_CELL: Final = (CELL_MM, CELL_MM, STOREY_MM, CELL_DECIDEG, CELL_DECIDEG)
 SCORE_BINS: Final = 20
 """Scores are counted in bins of 0.05, what lies above 1 in the last one."""
 SLICE_NS: Final = 10 * NS_PER_S
@@ -101,6 +103,7 @@ class Look(IntEnum):
     N = 6
     FIRST = 7
     LAST = 8
+    Z = 9
 
 
 class Hit(IntEnum):
@@ -163,8 +166,8 @@ class DetectorMessages(NamedTuple):
 
     Attributes:
         times: log times of the messages (ns).
-        robot: x, y (m) and yaw (rad) of the robot at each, and how far the detector was turned from
-            that (rad) by what moves it (M x 4); NaN where that is not known.
+        robot: x, y, z (m) and yaw (rad) of the robot at each, and how far the detector was turned
+            from that (rad) by what moves it (M x 5); NaN where that is not known.
         rows: of each detection its message, ascending.
         labels: the place of their names in `names`.
         names: of labels; there may be some that none has.
@@ -305,18 +308,20 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:
     """Returns the look of each message, -1 where the robot's pose is not known; and all looks."""
     is_known = ~np.isnan(seen.robot.sum(axis=1))
-    x, y, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
+    x, y, z, yaw, pan = np.where(is_known[:, None], seen.robot, 0.0).T
     turned = np.rint(_decideg(pan) / CELL_DECIDEG).astype(np.int64) * CELL_DECIDEG % 3600
-    columns = (_mm(x), _mm(y), np.where(is_known, _decideg(yaw) % 3600, NO_YAW), turned)
+    facing = np.where(is_known, _decideg(yaw) % 3600, NO_YAW)
+    columns = (_mm(x), _mm(y), _mm(z) + STOREY_MM // 2, facing, turned)
     cells = [column // size for column, size in zip(columns, _CELL, strict=True)]
     _, number = distinct_rows((slices, *cells))
     look = np.where(is_known, number, -1)
     by = Groups.of(number)
-    means = [by.sums(column) // by.sizes for column in columns]
+    x_mm, y_mm, z_mm, *turns = (by.sums(column) // by.sizes for column in columns)
     first, last = by.ends(_rounded(seen.times))
     slices = slices[by.firsts]
     topic = np.zeros(len(slices), np.int64)
-    return look, np.stack((slices, topic, *means, by.sizes, first, last), axis=1)
+    rows = (slices, topic, x_mm, y_mm, *turns, by.sizes, first, last, z_mm - STOREY_MM // 2)
+    return look, np.stack(rows, axis=1)
 
 
 def _detections(seen: DetectorMessages, slices: Ints) -> tuple[_Detections, tuple[str, ...]]:

@@ -346,7 +346,7 @@ def _in_labels(values: Values, leaf: Leaf) -> Detections:
     """Returns the labels of lists that are not empty, without a score."""
     texts = texts_of(values, leaf)
     is_label = np.array([bool(word) for word in texts.words], np.bool_)
-    positions = np.flatnonzero(is_label[texts.codes]) if texts.words else np.empty(0, np.int64)
+    positions = np.flatnonzero(is_label[texts.codes])
     return _detections_at(values, leaf.level, texts, positions, np.full(len(texts), math.nan))
 
 
@@ -367,7 +367,7 @@ def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
             values.size(parent) or 0,
         )
     is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
-    positions = positions[is_named[name.codes[positions]]] if name.words else positions[:0]
+    positions = positions[is_named[name.codes[positions]]]
     if positions.size < size and any(
         detections.rows.size
         for inner in source.otherwise

@@ -91,9 +91,7 @@ class ThingsBetween:
         """Whether a thing was seen there in either window."""
         frame = self.known.frames[instance.epoch]
         places = [stay.part.place for stay in (before, after) if stay is not None]
-        if self.where is None:
-            return bool(places)
-        return any(self.where.contains(frame, x, y) for x, y, _ in places)
+        return any(self.where is None or self.where.contains(frame, x, y) for x, y, _ in places)
 
     def _difference(
         self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None

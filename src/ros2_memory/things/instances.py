@@ -17,6 +17,7 @@ import numpy as np
 
 from ros2_memory.analysis.sights import (
     SCORE_BINS,
+    STOREY_MM,
     Flags,
     Floats,
     Hit,
@@ -491,8 +492,11 @@ def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
 def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]:
     """Adds the places of several things that stand together; yields the spots of the others."""
     rows = observed.firm(group.rows)
-    x, y, slices = observed.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.SLICE]].T
-    place = places_of(x, y, observed.counts[rows], slices)
+    x, y, z, slices = observed.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z, Spot.SLICE]].T
+    place = np.full(len(rows), -1, np.int64)
+    for floor in _floors(z):
+        on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
+        place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
     several = _are_several(place, observed.groups[rows])
     counts = np.bincount(place, observed.counts[rows])
@@ -503,6 +507,12 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
             group.places.append(rows_there)
         elif counts[number] >= _FEWEST:
             yield rows_there
+
+
+def _floors(z: Ints) -> list[Ints]:
+    """Returns the rows of some heights (mm) that are on one floor: next ones are not far apart."""
+    order = np.argsort(z, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(z[order]) > STOREY_MM) + 1)
 
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
@@ -613,9 +623,10 @@ class _Hosts:
         self._stays, self._observed, self._keys = stays, observed, keys
         self._beside = _by_spot(observed.sights.beside, observed.sights)
         rows = [
-            (stay.x, stay.y, stay.first, stay.last, group.epoch, stay.weak) for group, stay in stays
+            (stay.x, stay.y, stay.z, stay.first, stay.last, group.epoch, stay.weak)
+            for group, stay in stays
         ]
-        table = np.array(rows, np.float64).reshape(-1, 6)
+        table = np.array(rows, np.float64).reshape(-1, 7)
         self._order = np.argsort(table[:, 0], kind="stable")
         self._columns = table[self._order].T
 
@@ -657,10 +668,10 @@ class _Hosts:
     def _near(self, group: _Group, stay: PlacedStay) -> list[tuple[int, float]]:
         """Returns the numbers of stays near one at that time, in order, and how far (mm)."""
         start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
-        x, y, first, last, epoch, weak = self._columns[:, start:stop]
+        x, y, z, first, last, epoch, weak = self._columns[:, start:stop]
         away = np.hypot(x - stay.x, y - stay.y)
         is_near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
-        is_near &= (epoch == group.epoch) & (weak == 0)
+        is_near &= (epoch == group.epoch) & (weak == 0) & (np.abs(z - stay.z) <= STOREY_MM)
         numbers = self._order[start:stop][is_near].tolist()
         return sorted(zip(numbers, away[is_near].tolist(), strict=True))
 
@@ -722,7 +733,8 @@ def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:
 
 
 def _is_far(one: PlacedStay, other: PlacedStay) -> bool:
-    return math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
+    is_above = abs(one.z - other.z) > STOREY_MM
+    return is_above or math.hypot(one.x - other.x, one.y - other.y) > GATE_MM
 
 
 def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -> list[PlacedStay]:

@@ -132,14 +132,16 @@ class Placer:
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
             messages = joined_detected([self.rows.of(rows) for rows in of_topic])
-            is_named = any(
-                is_named_for_detections(rows.table.channel.type) and self.rows.have_labels(rows)
-                for rows in of_topic
-            )
+            is_named = any(map(self._are_of_detector, of_topic))
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
         return detected, detectors
+
+    def _are_of_detector(self, rows: Rows) -> bool:
+        """Returns whether the type of some rows is named for detections, and has labels."""
+        name = rows.table.channel.type.rpartition("/")[2].casefold()
+        return any(word in name for word in _OF_DETECTORS) and self.rows.have_labels(rows)
 
     def _poses(self, session: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -239,12 +241,6 @@ class Placer:
                     yield stored.time, sigma
 
 
-def is_named_for_detections(type_name: str) -> bool:
-    """Returns whether a type is one of a detector by its name."""
-    name = type_name.rpartition("/")[2].casefold()
-    return any(word in name for word in _OF_DETECTORS)
-
-
 def _in_target(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
     """Returns messages with the robot's poses and the detections placed in the target frame."""
     detections = detected.found
@@ -296,23 +292,23 @@ def _robot_at(poses: Poses, detected: Detected, frames: FrameTree) -> Floats:
         head, body = (frames.poses(carrier, times[rows]) for carrier in carriers)
         if head is None or body is None:
             continue
-        x, y, _ = body.translation
         yaw = _yaw(body.rotation)
-        posed = np.where(body.valid[:, None], np.stack((x, y, yaw, 0 * x), axis=1), math.nan)
+        pose = np.stack((*body.translation, yaw, 0 * yaw), axis=1)
+        posed = np.where(body.valid[:, None], pose, math.nan)
         robot[rows] = np.where(np.isnan(robot[rows]), posed, robot[rows])
         head_frame, body_frame = carriers
         if head_frame != body_frame:
             is_known = head.valid & body.valid
-            robot[rows, 3] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
+            robot[rows, 4] = np.where(is_known, _yaw(head.rotation) - yaw, math.nan)
     return robot
 
 
 def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
-    """Returns x, y (m) and heading (rad) of the robot at some times; NaN where not known.
+    """Returns x, y, z (m) and heading (rad) of the robot at some times; NaN where not known.
 
     That is farther than 1 s from a pose, or where no transform leads from its frame.
     """
-    robot = np.full((len(times), 3), math.nan)
+    robot = np.full((len(times), 4), math.nan)
     placed = frames.poses(poses.frames.words[0], times) if len(poses) else None
     if placed is None:
         return robot
@@ -329,9 +325,9 @@ def _posed_at(poses: Poses, times: Ints, frames: FrameTree) -> Floats:
     turn = np.remainder(heading[after] - heading[before] + np.pi, 2 * np.pi) - np.pi
     half = (heading[before] + turn * ratio) / 2
     level = np.zeros(len(times))
-    x, y, _ = placed.points((x, y, z))
     yaw = _yaw(multiply(placed.rotation, (level, level, np.sin(half), np.cos(half))))
-    return np.where(is_known[:, None], np.stack((x, y, yaw), axis=1), math.nan)
+    pose = np.stack((*placed.points((x, y, z)), yaw), axis=1)
+    return np.where(is_known[:, None], pose, math.nan)
 
 
 def _yaw(rotation: Rotations) -> Floats:

@@ -22,6 +22,7 @@ import numpy as np
 from ros2_memory.analysis.sights import (
     CELL_DECIDEG,
     CELL_MM,
+    STOREY_MM,
     Flags,
     Floats,
     Hit,
@@ -98,6 +99,7 @@ class Cells:
             self.topic + poor * (len(sights.topics) + 1),
             epoch[self.slice],
             looks[:, Look.PAN],
+            (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM,
         )
         cells, cell = distinct_rows(columns)
         self.cell = _joined(cells, cell, np.stack((self.x, self.y, self.yaw)), self.n)[cell]
@@ -191,8 +193,8 @@ def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
         wanted = _hashed(beside)
         other = order[np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)]
         turn = np.abs((yaw[other] - yaw + 180.0) % 360.0 - 180.0)
-        near = (keys[other] == wanted) & (turn <= CELL_DECIDEG / 10) & (cells[:, 0] >= 0)
-        near &= np.hypot(x[other] - x, y[other] - y) <= CELL_MM
+        near = (keys[other] == wanted) & (turn < CELL_DECIDEG / 10) & (cells[:, 0] >= 0)
+        near &= np.hypot(x[other] - x, y[other] - y) < CELL_MM
         best = np.where(near, np.maximum(best, rank[other]), best)
     leader = np.argsort(rank, kind="stable")[best]
     joined: Ints = np.where(leader[leader] == leader, leader, np.arange(len(cells)))

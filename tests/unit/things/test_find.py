@@ -56,10 +56,11 @@ def scene(
     in_map: bool = True,
     score: float = 0.9,
     map_off: float = 0.0,
+    height: float = 0.0,
 ) -> list[Msg]:
     """All messages of one moment: the robot at a pose in the map, and what it detects.
 
-    `map_off` is how far (m, along y) the map has moved under odometry.
+    `map_off` is how far (m, along y) the map has moved under odometry, `height` that of the floor.
     """
     at = BEGIN * S + round(at_s * S)
     x, y, yaw = robot
@@ -69,7 +70,7 @@ def scene(
     px, py = (x - ox) * cos - (y - oy) * sin, (x - ox) * sin + (y - oy) * cos
     messages = [odom(at, px, py, yaw - turn), tf(at, base(at, px, py, yaw - turn))]
     if in_map:
-        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, 0.0), turn)))
+        messages.append(tf(at, transform(at, "map", "odom", (ox, oy, height), turn)))
     cos, sin = math.cos(-yaw), math.sin(-yaw)
     things = []
     for label, thing_x, thing_y in seen:
@@ -409,6 +410,27 @@ def test_a_place_is_looked_at_from_where_it_was_seen_however_poses_are_divided(
     [mug] = ask(tmp_path, label="mug")["things"]
     state = "not_looked_at_since" if beside_m > 0.5 else "not_seen_where_expected"
     assert state in mug["still_there"]
+
+
+def test_floors_on_top_of_each_other_are_told_apart(tmp_path: Path) -> None:
+    chair, cup, bed = ("chair", 4.0, -0.5), ("cup", 3.0, 0.5), ("bed", 3.0, 0.5)
+    write_splits(
+        tmp_path,
+        [
+            *looked(0, 60, HERE, chair, cup),
+            *looked(100, 160, HERE, chair, bed, height=3.0),
+            *looked(200, 230, HERE, chair, cup),
+            *looked(300, 400, HERE, chair, bed, height=3.0),
+        ],
+    )
+    things = ask(tmp_path)["things"]
+    assert [(each["label"], each["place"]["z"], each["count"]) for each in things] == [
+        *(("bed", 3.7, 160), ("chair", 3.7, 160)),
+        *(("chair", 0.7, 90), ("cup", 0.7, 90)),
+    ]
+    states = [[*each["still_there"]] for each in things]
+    assert states == [["in_view"]] * 2 + [["not_looked_at_since"]] * 2
+    assert not any("moved" in each for each in things)
 
 
 def test_with_an_end_it_is_told_whether_the_thing_was_seen_since(tmp_path: Path) -> None:

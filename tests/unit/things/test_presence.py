@@ -97,7 +97,7 @@ def _seen(
     for step, place, n, seen in given_looks:
         bag += step
         time = len(looks) * 1000
-        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, 0, n, time, time + 900))
+        looks.append((bag, 0, place * CELL_MM + 100, 100, 0, 0, n, time, time + 900, 0))
         if seen > 0:  # few looks see it
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
