@@ -19,6 +19,7 @@ import re
 import sys
 from contextlib import contextmanager
 from dataclasses import fields
+from itertools import combinations
 from pathlib import Path
 from typing import (
     TYPE_CHECKING,
@@ -67,7 +68,6 @@ _T = TypeVar("_T")
 EXIT_CODE: Final = 2
 _SECRET_WORDS: Final = ("secret", "password", "token", "credential", "access-key", "key-id", "auth")
 """Settings of pyiceberg with one of these in their name are not shown, so not given openly."""
-_FEWEST_CORNERS: Final = 3
 
 
 def _home_expanded(path: Path) -> Path:
@@ -551,14 +551,21 @@ class PlaceShape:
         box = isinstance(x, tuple) and isinstance(y, tuple) and x[0] < x[1] and y[0] < y[1]
         alone = x is None and y is None
         if self.polygon is not None:
-            is_shape = alone and self.radius_m is None and len(self.polygon) >= _FEWEST_CORNERS
+            is_shape = alone and self.radius_m is None and not _lie_in_a_line(self.polygon)
         else:
             is_shape = circle or (box and self.radius_m is None)
         if not is_shape:
             raise ValueError(
                 "must be a circle (x, y, radius_m), a rectangle (x: [from, to], y: [from, to]) "
-                "or a polygon of 3 corners or more ([[x, y], ...])"
+                "or a polygon of 3 corners or more ([[x, y], ...]) that do not lie in a line"
             )
+
+
+def _lie_in_a_line(corners: Sequence[tuple[float, float]]) -> bool:
+    (x, y), *others = corners or [(0.0, 0.0)]
+    return all(
+        (bx - x) * (cy - y) == (by - y) * (cx - x) for (bx, by), (cx, cy) in combinations(others, 2)
+    )
 
 
 @section

@@ -46,6 +46,7 @@ def test_the_file_that_is_shipped_names_no_place() -> None:
         "{x: 6, y: 0.6}",
         "{x: [5, 0], y: [0, 9]}",
         "{polygon: [[0, 0], [2, 0]]}",
+        "{polygon: [[0, 0], [2, 2], [5, 5], [1, 1]]}",
         "{x: 1, y: 1, radius_m: 1, polygon: [[0, 0], [2, 0], [0, 2]]}",
         "{x: [0, 1], y: [0, 1], radius_m: 1}",
         "{x: .nan, y: 0, radius_m: 1}",

@@ -66,7 +66,6 @@ SET_BACK: Final = "the clock was set back between recordings"
 """The begin of a sentence on recordings that one recorder made, and that overlap in time."""
 ADVICE: Final = "; data.recording selects one recording"
 """The end of a sentence on robots that are mixed."""
-_BY_CLOCK: Final = "after a clock was set back, or from two robots"
 _RECENT_NS: Final[Ns] = 60 * NS_PER_S
 _DESCRIBED: Final[Key[list[tuple[Ns, tuple[str, ...]]]]] = Key()
 """Of a memory: when it was last looked whether robots are mixed, and what was found."""
@@ -183,15 +182,12 @@ def describe_mixed(memory: Memory, call: Call) -> tuple[str, ...]:
 
 
 def _mixed_sentences(memory: Memory, call: Call) -> Iterator[str]:
-    mixed = [
-        recordings for recordings in mixed_recordings(memory, call) if recordings.topic is not None
-    ]
-    one = [recordings for recordings in mixed if are_of_one_recorder(memory, recordings.pair)]
-    several = [recordings for recordings in mixed if recordings not in one]
-    for overlapping, what, but in (
-        (several, "robots are mixed", "answers treat them as one robot"),
-        (one, SET_BACK, "one recorder made them, one after the other"),
+    mixed = [both for both in mixed_recordings(memory, call) if both.topic is not None]
+    for is_one, what, but in (
+        (False, "robots are mixed", "answers treat them as one robot"),
+        (True, SET_BACK, "one recorder made them, one after the other"),
     ):
+        overlapping = [both for both in mixed if are_of_one_recorder(memory, both.pair) is is_one]
         if not overlapping:
             continue
         names = sorted({name for recordings in overlapping for name in recordings.pair.names})
@@ -285,6 +281,18 @@ class ParallelRecordings(NamedTuple):
     bags: frozenset[str] = frozenset()
     """Of the other one, the files of which messages are beside those of the first; none: all."""
 
+    def described(self, topic: str) -> str:
+        """Returns what a clock made, as a sentence without a full stop."""
+        span = f"from {unix_text(self.span.start)} to {unix_text(self.span.stop - 1)}"
+        if self.first == self.other:
+            return (
+                f"{self.first.name} has the time {span} twice, as the clock was set back meanwhile"
+            )
+        return (
+            f"{self.first.name} and {self.other.name} have different messages on {topic} {span}, "
+            "as after a clock was set back, or from two robots"
+        )
+
 
 def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     """Checks that a path by this topic is that of one robot: else it jumps between several.
@@ -308,34 +316,29 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
             "a time with one of them, or set data.recording to one",
         )
     for pair in [*beside, *_times_recorded_twice(view, window)]:
-        name, start, stop = (
-            pair.first.name,
-            unix_text(pair.span.start),
-            unix_text(pair.span.stop - 1),
-        )
-        view.notes.add(
-            f"{name} has the time from {start} to {stop} twice, as the clock was set back "
-            "meanwhile: the path there is that of files from before"
-            if pair.first == pair.other
-            else f"{name} and {pair.other.name} have different messages on {topic} from {start} to "
-            f"{stop}, as {_BY_CLOCK}: the path there is that of {name}"
-        )
+        before = "files from before" if pair.first == pair.other else pair.first.name
+        view.notes.add(f"{pair.described(topic)}: the path there is that of {before}")
 
 
 def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     """Notes the recordings that hold messages of their own on a topic at the same time.
 
-    Returns these times, without those that a clock made which was set back.
+    And the times that one holds twice. Returns these times, without those that two recordings share
+    by a clock which was set back.
     """
     beside = parallel_recordings(view, topic, window)
-    for by_clock, why in ((False, "from several robots"), (True, _BY_CLOCK)):
-        names = _recording_names([pair for pair in beside if pair.by_clock is by_clock])
-        if names:
-            view.notes.add(
-                f"{len(names)} recordings have different messages on {topic} at the same time, as "
-                f"{why}, and the answer does not separate them: {listed(names)}"
-            )
-    return united((pair.span.start, pair.span.stop) for pair in beside if not pair.by_clock)
+    names = _recording_names([pair for pair in beside if not pair.by_clock])
+    if names:
+        view.notes.add(
+            f"{len(names)} recordings have different messages on {topic} at the same time, as "
+            f"from several robots, and the answer does not separate them: {listed(names)}"
+        )
+    recordings = view.timeline.recordings(topic)
+    twice = [pair for pair in _times_recorded_twice(view, window) if pair.first in recordings]
+    for pair in [*(pair for pair in beside if pair.by_clock), *twice]:
+        view.notes.add(f"{pair.described(topic)}: the answer does not separate the two")
+    spans = [*(pair.span for pair in beside if not pair.by_clock), *(pair.span for pair in twice)]
+    return united((span.start, span.stop) for span in spans)
 
 
 def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:

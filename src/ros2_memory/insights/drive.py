@@ -114,16 +114,12 @@ class Drive:
         recorded_s = trajectory.totals.duration_s - unix_from_ns(trajectory.totals.gap_ns)
         if ns_from_unix(recorded_s) > SILENCE_NS * max(trajectory.poses - 1, 1):
             return None
-        if not stood:
-            is_hidden = (
-                length >= SHORTEST_NS and trajectory.totals.distance_m <= CREEP_MPS * recorded_s
-            )
-            return None if is_hidden else 0
         else_s = recorded_s - unix_from_ns(stood)
-        is_hidden = else_s > recorded_s / 2 and trajectory.totals.distance_m < CREEP_MPS * else_s
-        if is_hidden and not trajectory.totals.gaps and ns_from_unix(else_s) > SHORTEST_NS:
-            return None
-        return stood
+        is_slow = else_s > recorded_s / 2 and trajectory.totals.distance_m <= CREEP_MPS * else_s
+        # A window without a standstill may begin and end beyond its poses.
+        lasted = ns_from_unix(else_s) if stood else length
+        is_hidden = is_slow and lasted >= SHORTEST_NS and not (stood and trajectory.totals.gaps)
+        return None if is_hidden else stood
 
 
 def drive_in(view: View, window: TimeWindow) -> Drive:

@@ -389,28 +389,23 @@ class RegionVisits:
         None where no pose is inside: the robot's line alone touches the region.
         """
         whole = visit.whole
-        start = self._first_inside(visit) if whole.entered else whole.start
-        stop = self._last_inside(visit) if whole.left else whole.stop
-        return whole._replace(start=start, stop=stop) if start <= stop else None
+        first = self._inside_near(visit, whole.start) if whole.entered else [whole.start]
+        last = self._inside_near(visit, whole.stop) if whole.left else [whole.stop]
+        if not first or not last or min(first) > max(last):
+            return None
+        return whole._replace(start=min(first), stop=max(last))
 
-    def _first_inside(self, visit: RegionVisit) -> Ns:
-        """Returns when the first pose of a visit is inside; `MAX_NS` where none is."""
+    def _inside_near(self, visit: RegionVisit, at: Ns) -> list[Ns]:
+        """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
         whole = visit.whole
-        poses = self._poses_around(visit.track, whole.start)
-        inside = [time for time in self._poses_inside(poses) if time <= whole.stop]
-        # What lies before an absence is of the visit before.
-        returns = [back for left, back in _absences(poses.times, inside) if left < whole.start]
-        own = (time for time in inside if time >= max(returns, default=MIN_NS))
-        return min(chain(own, self._vertices_inside(visit.track, whole)), default=MAX_NS)
-
-    def _last_inside(self, visit: RegionVisit) -> Ns:
-        """Returns when the last pose of a visit is inside; `MIN_NS` where none is."""
-        whole = visit.whole
-        poses = self._poses_around(visit.track, whole.stop)
-        inside = [time for time in self._poses_inside(poses) if time >= whole.start]
-        leaves = [left for left, back in _absences(poses.times, inside) if back > whole.stop]
-        own = (time for time in inside if time <= min(leaves, default=MAX_NS))
-        return max(chain(own, self._vertices_inside(visit.track, whole)), default=MIN_NS)
+        poses = self._poses_around(visit.track, at)
+        inside = [*self._poses_inside(poses)]
+        absences = [*_absences(poses.times, inside)]
+        # What lies beyond an absence is of the visit before, or after.
+        begin = max((back for left, back in absences if left < whole.start), default=MIN_NS)
+        end = min((left for left, back in absences if back > whole.stop), default=MAX_NS)
+        own = (time for time in inside if begin <= time <= end)
+        return [*own, *self._vertices_inside(visit.track, whole)]
 
     def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
         return self._times_inside(poses.times, poses.x, poses.y)

@@ -226,7 +226,7 @@ def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
     match [_finite_number(bound) for bound in value] if isinstance(value, list) else []:
-        case [float(low), float(high)] if low <= high:
+        case [float(low), float(high)] if low < high:
             return low, high
     raise InvalidArgumentsError(
         f"{axis} was {abbreviate(value)}, which is not a range [from, to]; {_EXPECTED}"

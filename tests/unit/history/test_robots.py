@@ -307,3 +307,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         assert path["distance_m"] == pytest.approx(20.0, abs=1.2)
         assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
         assert any("run has the time from" in note for note in path["notes"])
+        # At log time 40 it was at x = 20 m and, 30 s later, at x = 35 m.
+        visits = asked(memory, tmp_path, "visits", x=35.0, y=0.0, radius_m=1.0)
+        assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
+        assert any("run has the time from" in note for note in visits["notes"])

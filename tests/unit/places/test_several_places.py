@@ -203,6 +203,7 @@ def test_compare_has_the_minutes_in_each_and_recap_what_happened_in_any(
         ({"x": 1, "y": 2, "radius": 3}, 'where has no "radius"; give'),
         ({f"p{nth}": {"x": nth, "y": 0, "radius_m": 1} for nth in range(31)}, "more than 30"),
         ({"x": [1, 0], "y": [0, 1]}, "not a range"),
+        ({"x": [1, 1], "y": [0, 1]}, "not a range"),  # a line, on which no pose ever is
         ({"x": [0, 1], "y": [0, 1], "radius_m": 1}, "radius_m and a range"),
         (5, "where was 5; give the name"),
     ],
