@@ -252,6 +252,7 @@ class Fleet:
                 sentence does not tell apart.
             EpisodicError: the lake, which may have it, cannot be read.
         """
+        name = name.strip() if isinstance(name, str) else name
         if isinstance(name, str) and name not in self.robots and call.robots is None:
             self.joined()
         allowed = self.allowed(call)

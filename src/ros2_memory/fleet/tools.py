@@ -191,19 +191,16 @@ class _FleetQuestion:
         Raises:
             EpisodicError: there is none.
         """
-        if named is None:
-            robots = self.fleet.allowed(call)
-        else:
-            names = [*map(str.strip, named.split(","))] if isinstance(named, str) else [named]
-            robots = [self.fleet.named(name, call) for name in names]
+        names = named.split(",") if isinstance(named, str) else [named]
+        robots = self.fleet.allowed(call)
+        if named is not None:
+            found = (self.fleet.named(name, call) for name in names)
+            robots = [*dict.fromkeys(found)]
         tool, given = self.tool.name, self.given
         is_table = tool in TABLE_FOR_ALL and given.get("by") is not None
-        if (
-            (named is None or len(robots) > 1)
-            and (tool in ANSWER_FOR_ALL or is_table)
-            and given.get("between") is None
-        ):
-            return self._of_all([*dict.fromkeys(robots)], call)
+        is_of_all = (tool in ANSWER_FOR_ALL or is_table) and given.get("between") is None
+        if is_of_all and (named is None or len(names) > 1):
+            return self._of_all(robots, call)
         return self._of_one(_only_one(tool, robots), call)
 
     def _of_one(self, robot: Robot, call: Call) -> OfRobot:
@@ -475,37 +472,32 @@ def _combined(
     by_robot: dict[str, JsonObject] = {}
     # Times of robots whose clock is ahead are compared only where there are no others.
     dated = [reply.name for reply in replies if not reply.is_ahead] or [*values]
+    # Where a robot has not counted all, there is no total, but at least so many.
+    is_counted = not any(AT_LEAST in value for value in values.values())
     for key in dict.fromkeys(key for value in values.values() for key in value):
         if key in _LEFT_OUT:
             continue
         of_robots = {name: value[key] for name, value in values.items() if key in value}
-        match merging.get(key, "added" if key == AT_LEAST else ""):
-            case "who":
-                combined[key] = [name for name, is_so in of_robots.items() if is_so]
-            case "counted":
-                sums: Counter[str] = Counter()
-                for counts in of_robots.values():
-                    sums.update(counts if isinstance(counts, dict) else {})
-                combined[key] = dict(sums.most_common())
-            case ("earliest" | "newest") as how:
-                numbers = [
-                    _number(of_robots[name]) for name in dated if of_robots.get(name) is not None
-                ]
-                combined[key] = (min if how == "earliest" else max)(numbers, default=None)
-            case "" if (
-                len(of_robots) == len(values) and len({*map(to_json_text, of_robots.values())}) == 1
-            ):
-                combined[key] = next(iter(of_robots.values()))
-            case how:
-                # Where a robot has not counted all, there is no total, but at least so many.
+        how = merging.get(key, "added" if key == AT_LEAST else "")
+        agree = len({*map(to_json_text, of_robots.values())}) == 1 and len(of_robots) == len(values)
+        if how == "who":
+            combined[key] = [name for name, is_so in of_robots.items() if is_so]
+        elif how == "counted":
+            sums: Counter[str] = Counter()
+            for counts in of_robots.values():
+                sums.update(counts if isinstance(counts, dict) else {})
+            combined[key] = dict(sums.most_common())
+        elif how in ("earliest", "newest"):
+            times = [_number(of_robots[name]) for name in dated if of_robots.get(name) is not None]
+            combined[key] = (min if how == "earliest" else max)(times, default=None)
+        elif how == "" and agree:
+            combined[key] = next(iter(of_robots.values()))
+        else:
+            if how == "added" and (is_counted or key != _TOTAL):
                 totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
-                is_counted = key != _TOTAL or not any(
-                    AT_LEAST in value for value in values.values()
-                )
-                if how == "added" and is_counted:
-                    combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
-                for name, value in of_robots.items():
-                    by_robot.setdefault(name, {})[key] = value
+                combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
+            for name, value in of_robots.items():
+                by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
 
 

@@ -251,6 +251,7 @@ def test_several_that_are_named_answer_as_all_do(folder: Path) -> None:
     assert {row["robot_name"] for row in rows} == {"r1", "r3"}
     for robot, said in (("r1, r9", "no robot"), ("r1, r2", "which robot?")):
         assert said in reply(fleet, "list_frames", {"robot": robot})["detail"]
+    assert reply(fleet, "list_frames", {"robot": "r1,r1 "})["robot_name"] == "r1"
 
 
 @pytest.mark.parametrize(
