@@ -12,9 +12,8 @@ from typing import Final
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools
-from ros2_memory.cli.options import MB, AsJson, Bags, open_memory
+from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
 from ros2_memory.cli.output import format_value, print_json, print_line, print_reply, stdout_console
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import NoDataError, RecorderError
@@ -132,11 +131,8 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     reports: dict[str, JsonObject] = {}
     are_bags = False
     for name in robots or ("",):
-        of_robot = robot_settings(settings, name) if robots else settings
-        memory = open_memory(
-            of_robot, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None
-        )
-        reports[name] = report = _report(of_robot, memory)
+        own, memory = open_robot(settings, name, verbose=bags.verbose)
+        reports[name] = report = _report(own, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:
             stdout_console().rule(name, align="left")
@@ -281,7 +277,10 @@ def describe_budget(budget: dict[str, JsonValue]) -> str:
         text += f": bags {bags}, what is stored beside them {_size_text(state)}"
     if budget.get("foreign_gb"):
         foreign = _size_text(budget["foreign_gb"])
-        text += f"; bags that the recorder did not make take {foreign} more"
+        text += (
+            f"; bags that the recorder did not make take {foreign} more, and are neither counted "
+            "nor deleted: `ros2-memory adopt DIR` takes those of a folder"
+        )
     if growth is not None:
         text += f"; grows by {_size_text(growth)} a day"
     if "full_in_days" in budget:

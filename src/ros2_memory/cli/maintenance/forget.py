@@ -41,6 +41,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
 from ros2_memory.cli.options import (
+    BOUNDED,
     MB,
     STAYS,
     AsJson,
@@ -105,8 +106,8 @@ def forget(
     with lines_as_json(as_json, is_answered=yes or dry_run):
         settings, _ = load_for(bag_dir, overrides)
         require_recorder(settings)
-        if times.last is None and None in (times.start, times.end):
-            raise InvalidArgumentsError("give a time window: --start and --end, or --last")
+        if not times.are_bounded:
+            raise InvalidArgumentsError(f"give a time window: {BOUNDED}")
         memory = open_memory(settings, verbose=verbose)
         if problem := memory.index.snapshot().problem:
             raise RecorderError(problem)
