@@ -40,7 +40,6 @@ from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
 from ros2_memory.core.model import JsonValue, SetAside
-from ros2_memory.core.reply import Scope, shown
 from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -51,7 +50,7 @@ from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import (
     bags_with_remarks,
-    memory_status,
+    budget_of,
     nothing_here,
     required_missing,
     unrecorded,
@@ -211,9 +210,10 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     except OSError as problem:
         yield error(f"{existing} cannot be measured: {problem}", "look after the disk")
     else:
-        budget = memory_status(robot.memory, Call()).budget
+        heartbeat = robot.memory.index.heartbeat()
+        budget = budget_of(robot.memory, robot.snapshot, heartbeat, robot.now)
         used = budget.used / GB
-        seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(shown(budget, Scope()))}"
+        seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
         if free < limits.min_free_gb:
             do = f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
             yield error(seen, f"{do}other files on this disk")

@@ -360,8 +360,6 @@ def parse_time(text: str, now: float) -> float:
             of_day = clock[2] or "00:00"
             if of_day in {"24:00", "24:00:00"}:  # the end of a day in ISO 8601
                 date, of_day = date + timedelta(days=1), "00:00"
-            whole, dot, fraction = of_day.partition(".")
-            of_day = f"{whole}.{fraction:0<6}" if dot else whole
             return datetime.combine(date, time.fromisoformat(of_day)).timestamp()
         return unix_from_text(text)
     raise InvalidArgumentsError(f"{text!r} is not a time; write {TIMES}")
@@ -413,24 +411,21 @@ class Bags:
         Raises:
             InvalidArgumentsError: there is a path, and no topic; or a path that does not exist.
         """
-        others = self.words or []
-        if any(map(is_folder, others)):
+        others, is_there = self.words or [], _exists(first)
+        second = next((word for word in others if "=" not in word), None)
+        if _exists(second) if second is not None else not is_there:
             return first, self
-        if not _exists(first):
-            second = next((word for word in others if "=" not in word), None)
-            if second is None:
-                return first, self
-            raise InvalidArgumentsError(
-                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
-                "folder of bags beside the topic"
-            )
-        topic = next((word for word in others if "=" not in word), None)
-        if topic is None:
+        if second is None:
             kind = "folder" if Path(first).is_dir() else "file"
             raise InvalidArgumentsError(
                 f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
             )
-        return topic, replace(self, words=[first, *(word for word in others if word != topic)])
+        if not is_there:
+            raise InvalidArgumentsError(
+                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
+                "folder of bags beside the topic"
+            )
+        return second, replace(self, words=[first, *(word for word in others if word != second)])
 
 
 @dataclass(frozen=True, kw_only=True)
