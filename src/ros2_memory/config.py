@@ -17,7 +17,7 @@ import glob
 import os
 import re
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields
 from itertools import combinations
 from pathlib import Path
@@ -783,8 +783,11 @@ def unused_config() -> str | None:
     choose it.
     """
     used, beside = config_dir(os.environ) / "config.yaml", Path("config/config.yaml").absolute()
-    if os.environ.get("MEMORY_CONFIG_DIR") or not beside.is_file() or beside.samefile(used):
+    if os.environ.get("MEMORY_CONFIG_DIR") or not beside.is_file():
         return None
+    with suppress(OSError):
+        if beside.read_bytes() == used.read_bytes():  # as in a clone
+            return None
     return f"{beside} is not used, but {used}; MEMORY_CONFIG_DIR={beside.parent} chooses its folder"
 
 

@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.bootstrap import query_settings_of
-from ros2_memory.config import config_dir, load_labels, load_message_schemas, load_settings
+from ros2_memory.config import (
+    config_dir,
+    load_labels,
+    load_message_schemas,
+    load_settings,
+    unused_config,
+)
 from ros2_memory.core.errors import ConfigError
 from tests.support.config_folders import ROOT, copied, edit, refusal
 
@@ -39,6 +45,15 @@ class TestConfigFolder:
         assert settings.reader.schemas_file == ROOT / "config" / "message_schemas.yaml"
         chosen = load_settings((), {"MEMORY_CONFIG_DIR": str(ROOT / "config")})
         assert chosen.recording.topics_file == ROOT / "config" / "topics.yaml"
+
+    def test_one_beside_is_named_as_unused_unless_it_says_the_same(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.delenv("MEMORY_CONFIG_DIR", raising=False)
+        monkeypatch.chdir(copied(tmp_path).parent)
+        assert unused_config() is None
+        edit(Path("config/config.yaml"), "name: episodic", "name: mine")
+        assert "is not used" in (unused_config() or "")
 
     def test_may_be_relative(self, own_config: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(own_config.parent)

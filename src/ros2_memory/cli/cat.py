@@ -2,7 +2,6 @@
 
 import csv
 import json
-import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from io import StringIO
@@ -23,6 +22,7 @@ from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.no_data import resolve_topic
 from ros2_memory.history.view import View
 from ros2_memory.messages.levels import with_level_names
+from ros2_memory.tools.reply_size import to_json_text
 
 Row: TypeAlias = tuple[Ns, JsonValue]
 """The log time of a message, and its extracted value."""
@@ -121,19 +121,7 @@ def _extracted(
 def _line(time: Ns, value: JsonValue, *, as_json: bool) -> str:
     if not as_json:
         return f"{format_time(unix_from_ns(time))}  {format_value(value)}"
-    row = {"time": unix_from_ns(time), "time_ns": time, "value": _finite(value)}
-    return json.dumps(row, ensure_ascii=False)
-
-
-def _finite(value: JsonValue) -> JsonValue:
-    """Returns a value as strict JSON has it: NaN and infinities become null."""
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, list):
-        return [_finite(inner) for inner in value]
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    return value
+    return to_json_text({"time": unix_from_ns(time), "time_ns": time, "value": value})
 
 
 def _csv(rows: Iterable[Row]) -> Iterator[str]:
@@ -146,8 +134,7 @@ def _csv(rows: Iterable[Row]) -> Iterator[str]:
     for time, value in rows:
         cells: dict[str, object] = {}
         for name, inner in leaves(value):
-            is_list = isinstance(inner, list)
-            text = json.dumps(_finite(inner) if is_list else inner, ensure_ascii=not is_list)
+            text = to_json_text(inner) if isinstance(inner, list) else json.dumps(inner)
             cells[name or "value"] = inner if isinstance(inner, str | None) else text
         if columns is None:
             columns = [*cells]

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbe
 from ros2_memory.bag_dir.layout import ERASING_FILE
 from ros2_memory.bag_dir.state_files import describe_leaving
 from ros2_memory.bootstrap import build_recorder
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING
 from ros2_memory.cli.findings import (
     Examined,
     Finding,
@@ -34,8 +34,8 @@ from ros2_memory.cli.findings import (
     ok,
     warning,
 )
-from ros2_memory.cli.info import assumed_active
-from ros2_memory.cli.options import AsJson, Bags, open_memory, reason_of
+from ros2_memory.cli.info import assumed_active, describe_budget
+from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reason_of
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
@@ -50,7 +50,7 @@ from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import (
     bags_with_remarks,
-    memory_status,
+    budget_of,
     nothing_here,
     required_missing,
     unrecorded,
@@ -121,7 +121,7 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         )
     if memory is None:
         for name in robots:
-            yield from _of_robot(name, robot_settings(settings, name), verbose=bags.verbose)
+            yield from _of_robot(name, *open_robot(settings, name, verbose=bags.verbose))
         with spinner("asking the lake"):
             yield from _findings_of({"lake": check_lake} | _OF_SETTINGS, settings)
         return
@@ -147,9 +147,8 @@ def _findings_of(
             yield error(reason_of(problem), _READ, about=about)
 
 
-def _of_robot(name: str, own: Settings, *, verbose: bool) -> Iterator[Finding]:
+def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
     """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
-    memory = open_memory(own, verbose=verbose, setting=ROBOTS_SETTING)
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
     findings: Iterable[Finding]
     if snapshot.problem:
@@ -211,18 +210,10 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     except OSError as problem:
         yield error(f"{existing} cannot be measured: {problem}", "look after the disk")
     else:
-        budget = memory_status(robot.memory, Call()).budget
-        used, state = budget.used / GB, budget.state / GB
-        seen = (
-            f"{free:.1f} GB free on {mount}; {used:.1f} of {limits.max_total_gb:g} GB used: "
-            f"bags {max(used - state, 0):.2g} GB, what is stored beside them {state:.2g} GB"
-        )
-        if budget.foreign:
-            seen += (
-                f"; bags that this recorder did not make take {budget.foreign / GB:.2g} GB more, "
-                "and are neither deleted nor counted: `ros2-memory adopt DIR` takes those of a "
-                "directory"
-            )
+        heartbeat = robot.memory.index.heartbeat()
+        budget = budget_of(robot.memory, robot.snapshot, heartbeat, robot.now)
+        used = budget.used / GB
+        seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
         if free < limits.min_free_gb:
             do = f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
             yield error(seen, f"{do}other files on this disk")

@@ -12,10 +12,16 @@ from typing import Final
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_dispatcher
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.ask import call_tools
-from ros2_memory.cli.options import MB, AsJson, Bags, open_memory
-from ros2_memory.cli.output import format_value, print_json, print_line, print_reply, stdout_console
+from ros2_memory.cli.options import MB, AsJson, Bags, open_robot
+from ros2_memory.cli.output import (
+    format_size,
+    format_value,
+    print_json,
+    print_line,
+    print_reply,
+    stdout_console,
+)
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import NoDataError, RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
@@ -26,14 +32,14 @@ from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import nothing_here
+from ros2_memory.insights.status import budget_of, nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
-from ros2_memory.results import TopicRow
+from ros2_memory.results import Budget, TopicRow
 from ros2_memory.tools.replies import Replies
 
 _TOLD_TWICE: Final = frozenset(
-    {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics"}
+    {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics", "budget"}
 )
 _MOST_ROWS: Final = 10
 """Of a list that are printed."""
@@ -132,11 +138,8 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     reports: dict[str, JsonObject] = {}
     are_bags = False
     for name in robots or ("",):
-        of_robot = robot_settings(settings, name) if robots else settings
-        memory = open_memory(
-            of_robot, verbose=bags.verbose, setting=ROBOTS_SETTING if robots else None
-        )
-        reports[name] = report = _report(of_robot, memory)
+        own, memory = open_robot(settings, name, verbose=bags.verbose)
+        reports[name] = report = _report(own, memory)
         are_bags |= bool(memory.index.snapshot().bags)
         if robots and not as_json:
             stdout_console().rule(name, align="left")
@@ -185,6 +188,9 @@ def _show(memory: Memory, report: JsonObject) -> None:
         **_for_people(_object(status)),
         **_for_people(_object(ranged)),
     }
+    budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
+    if budget.most is not None:  # bags that are only looked at have none
+        report_shown["budget"] = describe_budget(budget)
     left_out: list[str] = []
     silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
@@ -228,19 +234,12 @@ def storage_of(bags: Sequence[BagFile]) -> str:
 
 
 def _for_people(reply: JsonObject) -> JsonObject:
-    """Returns a reply without keys that are empty or repeated, or about a missing recorder.
-
-    Bags that are only looked at have no budget, and the lines above have their size.
-    """
-    shown = {**reply}
-    budget = shown.pop("budget", None)
-    if isinstance(budget, dict) and budget.get("max_gb") is not None:
-        shown["budget"] = describe_budget(budget)
-    has_recorder = shown.get("recorder", "") is not None
+    """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
+    has_recorder = reply.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
         key: _without_itself(value)
-        for key, value in shown.items()
+        for key, value in reply.items()
         if key not in left_out and (value not in ([], 0) or key == "earliest")
     }
 
@@ -271,35 +270,29 @@ def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, N
             continue  # the file was moved or deleted since the scan
 
 
-def describe_budget(budget: dict[str, JsonValue]) -> str:
+def describe_budget(budget: Budget) -> str:
     """Returns how much of the budget the bags take, and what is beside them; how long it lasts."""
-    growth = budget.get("growth_gb_per_day")
-    text = f"{_size_text(budget.get('used_gb'))} of {_size_text(budget.get('max_gb'))}"
-    used, state = budget.get("used_gb"), budget.get("state_gb")
-    if isinstance(used, float) and isinstance(state, float):
-        bags = _size_text(max(used - state, 0.0))
-        text += f": bags {bags}, what is stored beside them {_size_text(state)}"
-    if budget.get("foreign_gb"):
-        foreign = _size_text(budget["foreign_gb"])
-        text += f"; bags that the recorder did not make take {foreign} more"
-    if growth is not None:
-        text += f"; grows by {_size_text(growth)} a day"
-    if "full_in_days" in budget:
-        text += f"; full in {_days(budget['full_in_days'])} at this rate"
-        text += f"; bags older than {_days(budget['keeps_days'])} are deleted"
+    text = (
+        f"{format_size(budget.used)} of {format_size(budget.most or 0)}: "
+        f"bags {format_size(max(budget.used - budget.state, 0))}, "
+        f"what is stored beside them {format_size(budget.state)}"
+    )
+    if budget.foreign:
+        text += (
+            f"; bags that the recorder did not make take {format_size(budget.foreign)} more, and "
+            "are neither counted nor deleted: `ros2-memory adopt DIR` takes those of a folder"
+        )
+    if budget.per_day is not None:
+        text += f"; grows by {format_size(budget.per_day)} a day"
+    if budget.full_in_days is not None and budget.keeps_days is not None:
+        text += f"; full in {_days(budget.full_in_days)} at this rate"
+        text += f"; bags older than {_days(budget.keeps_days)} are deleted"
     return text
 
 
-def _days(value: JsonValue) -> str:
-    days = round(value, 0 if value >= 10 else 1) if isinstance(value, int | float) else value
+def _days(value: float) -> str:
+    days = round(value, 0 if value >= 10 else 1)
     return f"{format_value(days)} {'day' if days == 1 else 'days'}"
-
-
-def _size_text(gigabytes: JsonValue) -> str:
-    """Returns a size in GB, or below 0.1 GB in MB."""
-    if not isinstance(gigabytes, int | float) or gigabytes >= 0.1 or not gigabytes:
-        return f"{format_value(gigabytes)} GB"
-    return f"{gigabytes * 1000:.3g} MB"
 
 
 def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:

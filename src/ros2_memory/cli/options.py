@@ -50,6 +50,8 @@ EXIT_NEGATIVE: Final = 1
 EXIT_CANNOT_RUN: Final = 2
 """Exit code: it could not run, and stderr says why."""
 MB: Final = 1_000_000
+BOUNDED: Final = "--start and --end, or --last"
+"""Options of a window with two ends."""
 STAYS: Final = "stays: "
 """Begins a line on what a command left as it is."""
 
@@ -92,8 +94,6 @@ LOOKING: Final = ("recorder=none", "storage=rosbag2", "data.now=latest")
 """Settings for bags of others: any kind is read, "ago" counts from the newest data."""
 
 AsJson = Annotated[bool, "--json", "Print JSON."]
-Start = Annotated[str | None, "TIME", f"Start time: {TIMES}; local time."]
-End = Annotated[str | None, "TIME", "End time, inclusive, in the same formats."]
 
 
 def _seconds(text: str) -> float:
@@ -152,19 +152,11 @@ def load_to_look(
     """
     named, given = settings_to_look(bag_dir, words, recording)
     loaded = load_for(named, given)
-    if any(word.partition("=")[0] in GROUPS for word in given):
+    folder = loaded[0].recording.bag_dir
+    if named is not None or is_deployment_chosen(given) or has_recorded(folder):
         return loaded
-    settings, _ = loaded
-    folder = settings.recording.bag_dir
-    if named is not None and bag_dir is None:
-        defaults, _ = load_for(None, None)
-        deployed = defaults.recording.bag_dir.absolute()
-        is_of_others = named.absolute() != deployed and not _is_recorded_now(folder)
-    elif is_deployment_chosen(given) or has_recorded(folder) or not folder.is_dir():
-        is_of_others = False
-    else:
-        is_of_others = next(folders_with_bags(folder), None) is not None
-    return load_for(named, [*LOOKING, *given]) if is_of_others else loaded
+    has_bags = folder.is_dir() and next(folders_with_bags(folder), None) is not None
+    return load_for(None, [*LOOKING, *given]) if has_bags else loaded
 
 
 def settings_to_look(
@@ -173,7 +165,7 @@ def settings_to_look(
     """Returns the folder that the words or an option name, and the settings for it.
 
     They are those for bags of others, unless a recorder is at work there, or somebody chose a
-    recorder, a storage or a deployment.
+    recorder, a storage or a deployment: among the words, or elsewhere for this folder.
 
     Raises:
         ConfigError: a variable or a setting is refused.
@@ -194,8 +186,13 @@ def settings_to_look(
         bag_dir = path
         if path.is_file():
             bag_dir, recording = _folder_of(path, recording)
-    if bag_dir is not None and not is_deployment_chosen(given) and not _is_recorded_now(bag_dir):
-        given = [*LOOKING, *given]
+    if bag_dir is not None and not _is_recorded_now(bag_dir):
+        is_chosen = is_deployment_chosen(given)
+        if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in given):
+            deployed, _ = load_for(None, None)
+            is_chosen = bag_dir.absolute() == deployed.recording.bag_dir.absolute()
+        if not is_chosen:
+            given = [*LOOKING, *given]
     if recording is not None:
         given.append(f"data.recording={quoted(recording)}")
     return bag_dir, given
@@ -304,6 +301,19 @@ def open_memory(
     return memory
 
 
+def open_robot(
+    settings: Settings, name: str, *, verbose: bool, cache_mb: int | None = None
+) -> "tuple[Settings, Memory]":
+    """Opens the memory of a robot of a fleet, or of the only one, which has no name.
+
+    Returns its own settings, too.
+    """
+    from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings  # noqa: PLC0415 - as above
+
+    own, setting = (robot_settings(settings, name), ROBOTS_SETTING) if name else (settings, None)
+    return own, open_memory(own, verbose=verbose, setting=setting, cache_mb=cache_mb)
+
+
 def present_time(memory: "Memory") -> Ns:
     """Returns the time that ages count from: the wall clock, or the newest data (`data.now`)."""
     return memory.now(memory.clock.now(), memory.index.snapshot().dating.latest)
@@ -398,33 +408,35 @@ class Bags:
         Raises:
             InvalidArgumentsError: there is a path, and no topic; or a path that does not exist.
         """
-        others = self.words or []
-        if any(map(is_folder, others)):
+        others, is_there = self.words or [], _exists(first)
+        second = next((word for word in others if "=" not in word), None)
+        if _exists(second) if second is not None else not is_there:
             return first, self
-        if not _exists(first):
-            second = next((word for word in others if "=" not in word), None)
-            if second is None:
-                return first, self
-            raise InvalidArgumentsError(
-                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
-                "folder of bags beside the topic"
-            )
-        topic = next((word for word in others if "=" not in word), None)
-        if topic is None:
+        if second is None:
             kind = "folder" if Path(first).is_dir() else "file"
             raise InvalidArgumentsError(
                 f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
             )
-        return topic, replace(self, words=[first, *(word for word in others if word != topic)])
+        if not is_there:
+            raise InvalidArgumentsError(
+                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
+                "folder of bags beside the topic"
+            )
+        return second, replace(self, words=[first, *(word for word in others if word != second)])
 
 
 @dataclass(frozen=True, kw_only=True)
 class Times:
     """The options of a command that takes a time window."""
 
-    start: Start = None
-    end: End = None
+    start: Annotated[str | None, "TIME", f"Start time: {TIMES}; local time."] = None
+    end: Annotated[str | None, "TIME", "End time, inclusive, in the same formats."] = None
     last: Last = None
+
+    @property
+    def are_bounded(self) -> bool:
+        """Whether the window has two ends."""
+        return self.last is not None or None not in (self.start, self.end)
 
     def window(self, memory: "Memory") -> TimeWindow:
         """Returns the window; a side that is not given is open.
@@ -432,7 +444,10 @@ class Times:
         Raises:
             InvalidArgumentsError: the options contradict each other, or one is not a time.
         """
-        now = unix_from_ns(present_time(memory))
+        return self.window_at(unix_from_ns(present_time(memory)))
+
+    def window_at(self, now: float) -> TimeWindow:
+        """Returns the window where "ago" counts from `now` (Unix s); raises likewise."""
         if self.last is None:
             first = unix_from_ns(MIN_NS) if self.start is None else parse_time(self.start, now)
             until = unix_from_ns(MAX_NS)

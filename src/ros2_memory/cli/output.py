@@ -377,6 +377,12 @@ def format_duration(seconds: float) -> str:
     return f"{seconds / 3600:.1f} h" if amount < _DAYS_FROM_S else f"{seconds / 86_400:.0f} days"
 
 
+def format_size(size_bytes: float) -> str:
+    """Formats a size: `0.61 MB`, `23.4 GB`."""
+    unit, name = (1e9, "GB") if size_bytes >= 1e9 else (1e6, "MB")
+    return f"{format_value(float(f'{size_bytes / unit:.3g}'))} {name}"
+
+
 def escape(text: str) -> str:
     """Returns the text with control characters spelled out, so that a terminal ignores them."""
     return "".join(

@@ -19,8 +19,15 @@ from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, ROS_LOG_DIR
 from ros2_memory.bootstrap import build_reader
-from ros2_memory.cli.options import MB, BagDir, Overrides, load_for
-from ros2_memory.cli.output import escape, format_duration, print_line, spinner, stdout_console
+from ros2_memory.cli.options import BagDir, Overrides, load_for
+from ros2_memory.cli.output import (
+    escape,
+    format_duration,
+    format_size,
+    print_line,
+    spinner,
+    stdout_console,
+)
 from ros2_memory.cli.proposal import (
     Choice,
     Disk,
@@ -261,17 +268,17 @@ def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measu
     for topic, (choice, reason) in proposal.items():
         sign = "record" if topic in recorded else choice.replace("record", "-")
         rate = f"{topic.hz:8.3g} Hz {topic.payload_bytes:7.0f} B" if topic.messages else ""
-        daily = f"{_amount(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
+        daily = f"{format_size(disk.bytes_per_day([topic]))} a day" if topic.messages else ""
         detail = f"{topic.type}{f': {reason}' if reason and topic not in recorded else ''}"
         print_line(escape(f"  {sign:<7}{topic.topic:<{width}}{rate:<21}{daily:>17}  {detail}"))
     files = disk.files_per_day
     silent = [topic.topic for topic in recorded if not topic.messages]
     takes = (
-        f"about {_amount(disk.bytes_per_day(recorded) + files)} a day"
-        f"{f' without {listed(silent)}' if silent else ''}, {_amount(files)} of it for files of "
-        f"{disk.split_s:g} s: the budget of {disk.budget_bytes / GB:g} GB (retention.max_total_gb) "
-        f"holds {disk.days(recorded):.3g} days; bags are deleted after {disk.keep_days:g} days "
-        "(retention.max_age_h)"
+        f"about {format_size(disk.bytes_per_day(recorded) + files)} a day"
+        f"{f' without {listed(silent)}' if silent else ''}, {format_size(files)} of it for files "
+        f"of {disk.split_s:g} s: the budget of {format_size(disk.budget_bytes)} "
+        f"(retention.max_total_gb) holds {disk.days(recorded):.3g} days; bags are deleted after "
+        f"{disk.keep_days:g} days (retention.max_age_h)"
     )
     print_line(takes)
     if measured.unknown_types:
@@ -280,10 +287,6 @@ def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measu
             "the setup.bash of their workspace, too: recorder.setup_files=[FILE,FILE]"
         )
     return takes
-
-
-def _amount(size_bytes: float) -> str:
-    return f"{size_bytes / GB:.2f} GB" if size_bytes >= GB else f"{size_bytes / MB:.1f} MB"
 
 
 def _install_script() -> Path:
@@ -372,5 +375,5 @@ def _line_of(beat: Heartbeat) -> tuple[str, str]:
     why = beat.waiting_for or (None if beat.recovered else beat.last_error)
     if beat.silent:
         line += f", silent: {listed(beat.silent)}"
-    line += f", {beat.bytes_written / MB:.1f} MB{f'; {why}' if why else ''}"
+    line += f", {format_size(beat.bytes_written)}{f'; {why}' if why else ''}"
     return f"{beat.state} {heard}", line

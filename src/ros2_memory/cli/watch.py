@@ -20,6 +20,7 @@ from ros2_memory.cli.options import AsJson, Bags
 from ros2_memory.cli.output import (
     escape,
     format_duration,
+    format_size,
     format_time,
     print_json,
     print_line,
@@ -37,7 +38,6 @@ from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status
 from ros2_memory.results import Status
-from ros2_memory.retention.policy import GB
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S
 """Current rates are those of the newest data of this length."""
@@ -238,10 +238,10 @@ def _line(seen: Observation) -> str:
 def _screen(seen: Observation) -> Group:
     """Returns an observation as a screen: a headline, a table of topics, and problems."""
     budget = seen.status.budget
-    most = "" if budget.most is None else f" of {budget.most / GB:.3g}"
+    most = "" if budget.most is None else f" of {format_size(budget.most)}"
     head = Text.assemble(
         (format_time(unix_from_ns(seen.now)), "bold"),
-        f"  {seen.head('  ')}  used: {budget.used / GB:.3g}{most} GB",
+        f"  {seen.head('  ')}  used: {format_size(budget.used)}{most}",
     )
     table = Table("topic", box=SIMPLE_HEAD, pad_edge=False)
     for name in ("Hz", "usually", "last"):

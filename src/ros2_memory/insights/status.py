@@ -94,7 +94,7 @@ def memory_status(memory: Memory, call: Call) -> Status:
         damaged=len(snapshot.damaged),
         incomplete=snapshot.timeline.disk_use[1] + len(read_thinned(view.bag_dir).left_open),
         unread=len(snapshot.unread),
-        budget=_budget(memory, snapshot, heartbeat, wall),
+        budget=budget_of(memory, snapshot, heartbeat, wall),
         moments=moments,
         problems=(
             *problems_of(snapshot, heartbeat, wall),
@@ -258,7 +258,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
             yield SilentTopic(topic, last, usual)
 
 
-def _budget(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
+def budget_of(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:
     """Returns what counts in the budget, how fast that grows, and how much may be kept.
 
     Growth is only predicted while a live recorder records. Where none is configured there is no

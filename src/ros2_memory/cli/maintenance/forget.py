@@ -41,7 +41,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
 from ros2_memory.cli.options import (
-    MB,
+    BOUNDED,
     STAYS,
     AsJson,
     BagDir,
@@ -53,7 +53,7 @@ from ros2_memory.cli.options import (
     open_memory,
     require_recorder,
 )
-from ros2_memory.cli.output import format_time, print_line, spinner
+from ros2_memory.cli.output import format_size, format_time, print_line, spinner
 from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
 from ros2_memory.core import directories
@@ -105,8 +105,8 @@ def forget(
     with lines_as_json(as_json, is_answered=yes or dry_run):
         settings, _ = load_for(bag_dir, overrides)
         require_recorder(settings)
-        if times.last is None and None in (times.start, times.end):
-            raise InvalidArgumentsError("give a time window: --start and --end, or --last")
+        if not times.are_bounded:
+            raise InvalidArgumentsError(f"give a time window: {BOUNDED}")
         memory = open_memory(settings, verbose=verbose)
         if problem := memory.index.snapshot().problem:
             raise RecorderError(problem)
@@ -223,7 +223,7 @@ class _Forget:
         size = sum(path.stat().st_size for path in {holder.paths[0] for holder in survey.holders})
         what = (
             f"{counted(counts.total(), 'message')} of {counted(len(counts), 'topic')}, by "
-            f"rewriting {counted(len(survey.holders), 'bag')} ({size / MB:.1f} MB)"
+            f"rewriting {counted(len(survey.holders), 'bag')} ({format_size(size)})"
         )
         rows = [f"{topic}: {counted(count, 'message')}" for topic, count in sorted(counts.items())]
         if not self._confirmed(what, rows, asks=asks):
@@ -256,7 +256,7 @@ class _Forget:
             return
         first, last = min(bag.start for bag in going), max(bag.end for bag in going)
         size = sum(bag.size for bag in going)
-        what = f"{counted(len(going), 'bag')}, {size / MB:.1f} MB, {_span(first, last)}"
+        what = f"{counted(len(going), 'bag')}, {format_size(size)}, {_span(first, last)}"
         if self._confirmed(what, map(self._name, going) if self._dry_run else (), asks=asks):
             self._delete(going)
 
@@ -408,7 +408,7 @@ class _Forget:
         if carried is not None:
             messages = counted(carried, "latched message is", "latched messages are")
             also = f"; {messages} carried on"
-        print_line(f"deleted: {counted(len(deleted), 'bag')}, {freed / MB:.1f} MB{also}")
+        print_line(f"deleted: {counted(len(deleted), 'bag')}, {format_size(freed)}{also}")
         self._stays(kept)
         for note in notes:
             print_line(note)

@@ -17,7 +17,6 @@ from typing import Annotated, Final
 import typer
 
 from ros2_memory.bootstrap import build_backfill, build_memory, shared_parts
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, robot_settings
 from ros2_memory.cli.options import (
     EXIT_CANNOT_RUN,
     AsJson,
@@ -25,7 +24,7 @@ from ros2_memory.cli.options import (
     Verbose,
     Words,
     load_given,
-    open_memory,
+    open_robot,
 )
 from ros2_memory.cli.output import print_json, progress_bar
 from ros2_memory.columns.fill import Progress
@@ -89,9 +88,7 @@ def index(
 
 def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progress:
     """Fills the store of a robot of a fleet, or of the only one without a name."""
-    setting = ROBOTS_SETTING if robot else None
-    settings = robot_settings(settings, robot) if robot else settings
-    memory = open_memory(settings, verbose=verbose, setting=setting, cache_mb=_cache_mb(settings))
+    settings, memory = open_robot(settings, robot, verbose=verbose, cache_mb=_cache_mb(settings))
     if problem := memory.index.snapshot().problem:
         raise RecorderError(problem)
     backfill = build_backfill(settings, memory)

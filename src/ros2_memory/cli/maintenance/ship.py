@@ -10,16 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, NoReturn
 
 from ros2_memory.bootstrap import SharedParts, shared_parts
 from ros2_memory.bootstrap_fleet import build_robots, lake_location
-from ros2_memory.cli.options import (
-    AsJson,
-    End,
-    Overrides,
-    Start,
-    Verbose,
-    load_for,
-    parse_end,
-    parse_time,
-)
+from ros2_memory.cli.options import BOUNDED, AsJson, Overrides, Times, Verbose, load_for
 from ros2_memory.cli.output import print_json, print_line, print_notes
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, LakeError
@@ -50,10 +41,9 @@ def ship(
     *,
     once: Annotated[bool, "Ship what is there, and end."] = False,
     forget: Annotated[
-        str | None, "ROBOT", "Forget the time from --start to --end of a robot, and end."
+        str | None, "ROBOT", "Forget a time of a robot, from --start to --end or --last, and end."
     ] = None,
-    start: Start = None,
-    end: End = None,
+    times: Times,
     as_json: AsJson = False,
     verbose: Verbose = False,
 ) -> bool:
@@ -64,7 +54,7 @@ def ship(
     ros2-memory[lake].
     """
     settings, _ = load_for(None, overrides)
-    window = _window_of(forget, start, end)
+    window = _window_of(forget, times)
     _keep_little_memory()
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
@@ -105,19 +95,17 @@ def _keep_little_memory() -> None:
     share_one_arena()
 
 
-def _window_of(robot: str | None, start: str | None, end: str | None) -> TimeWindow | None:
+def _window_of(robot: str | None, times: Times) -> TimeWindow | None:
     """Returns the time to forget, if any.
 
     Raises:
         InvalidArgumentsError: a part of it is missing, or is no time.
     """
-    if robot is None and start is None and end is None:
+    if robot is None and times == Times():
         return None
-    if robot is None or start is None or end is None:
-        raise InvalidArgumentsError("give all of --forget, --start and --end, or none of them")
-    now = time.time()
-    first = parse_time(start, now)
-    return TimeWindow.from_unix(first, parse_end(end, now, first))
+    if robot is None or not times.are_bounded:
+        raise InvalidArgumentsError(f"give --forget ROBOT and a time to forget: {BOUNDED}")
+    return times.window_at(time.time())
 
 
 def _forget(
