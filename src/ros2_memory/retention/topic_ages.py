@@ -237,7 +237,8 @@ class TopicCutter:
         ]
         EXPIRED.write(self._bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
-        is_shipped = receipt is not None and receipt.size == before.st_size
+        if receipt is not None and receipt.size != before.st_size:
+            receipt = None
         try:
             with rewritten(
                 self._bag_dir,
@@ -249,12 +250,12 @@ class TopicCutter:
                 left_of=left,
             ) as new:
                 # Before the bag is smaller: else `ship` would take what went out of the lake, too.
-                if receipt is not None and is_shipped:
+                if receipt is not None:
                     shipped = replace(receipt, size=new.stat().st_size)
                     SHIPPED.append(self._bag_dir, [shipped])
         except (EpisodicError, OSError):
             EXPIRED.write(self._bag_dir, expired)
-            if receipt is not None and is_shipped:
+            if receipt is not None:
                 with suppress(OSError):
                     SHIPPED.append(self._bag_dir, [receipt])
             raise

@@ -42,7 +42,6 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
 from ros2_memory.core.errors import (
     BagError,
-    BagUnreachableError,
     EpisodicError,
     RecorderError,
     UndecodableError,
@@ -278,7 +277,7 @@ class Screening:
                 self._retry_s[path] = now_s + RETRY_S
                 return unreleased, False
             except BagError as error:
-                if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
+                if self._failing.may_recover(path, error):
                     raise
                 _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
