@@ -589,8 +589,10 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
     now, path = T0 + MONTH_NS + 2 * 86_400 * S, bag_dir / DAY_FILE
     unthinned = path.stat().st_ino
     days_of(bag_dir).limit(now)
-    thinned = path.stat().st_ino
+    thinned, status = path.stat().st_ino, path.stat()
     assert thinned != unthinned
+    # The bag that could not be deleted yet counts no more than before.
+    assert read_superseded(bag_dir).days == {DAY_FILE: (status.st_size, status.st_mtime_ns)}
     read: list[object] = []
 
     def batches(_: BagDirReader, *of: object, **__: object) -> Iterator[object]:
