@@ -138,8 +138,7 @@ class Supervisor:
         if not self._paused:
             try:
                 self._begin_recording(now)
-            except RecorderError as error:
-                self._events.fail("recorder_not_started", str(error))
+            except RecorderError:
                 self._write_heartbeat(RecorderState.STOPPED)
                 raise
         self.stopped = False
@@ -360,15 +359,18 @@ class Supervisor:
             return
         try:
             self._begin_recording(now)
-        except RecorderError as error:
-            self._events.fail("recorder_not_started", str(error))
+        except RecorderError:
             self._put_off("restart", now)
 
     def _begin_recording(self, now: ClockReading) -> None:
-        make_bag_dir(self._bag_dir)
         self._rotate_now = False
         self._reception.skip_latched(())
-        self._sessions.begin(now)
+        try:
+            make_bag_dir(self._bag_dir)
+            self._sessions.begin(now)
+        except RecorderError as error:
+            self._events.fail("recorder_not_started", str(error))
+            raise
         if self._paused_at is not None:
             self._add_interruption(self._paused_at, "paused")
             self._paused_at = None
