@@ -167,10 +167,10 @@ class RecordingSessions:
         if old is None or self.handover is not None:
             return
         name = recording_name(now.wall, self._bag_dir)
-        HandoverTransfer.announce(old, name)
         try:
+            HandoverTransfer.announce(old, name)
             new = self._launch(name, now)
-        except RecorderError:
+        except (RecorderError, OSError):
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
