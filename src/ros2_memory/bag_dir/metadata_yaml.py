@@ -20,6 +20,7 @@ import yaml
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import integer
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
+from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
@@ -144,6 +145,16 @@ def correct(recording: Path, reader: BagReader) -> bool:
     if written != text:
         write_durably(path, written)
     return written != text
+
+
+def why_not_corrected(recording: Path, reader: BagReader) -> str | None:
+    """Corrects metadata.yaml where there is one; returns why that failed, or None."""
+    try:
+        if (recording / METADATA_FILE).exists():
+            correct(recording, reader)
+    except (BagError, OSError, ValueError) as error:
+        return str(error)
+    return None
 
 
 def is_named_by_rosbag2(recording: Path) -> bool:

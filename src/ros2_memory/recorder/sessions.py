@@ -167,22 +167,14 @@ class RecordingSessions:
         if old is None or self.handover is not None:
             return
         name = recording_name(now.wall, self._bag_dir)
-        HandoverTransfer.announce(old, name)
         try:
+            HandoverTransfer.announce(old, name)
             new = self._launch(name, now)
-        except RecorderError:
+        except (RecorderError, OSError):
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
-        self.handover = HandoverTransfer(
-            old,
-            new,
-            now,
-            self._orders.reader,
-            simulated=self._orders.simulated,
-            is_listed=self._orders.topics.selection.matches,
-            subscribe_timeout_s=self._orders.subscribe_timeout_s,
-        )
+        self.handover = HandoverTransfer(old, new, now, self._orders)
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
@@ -475,5 +467,5 @@ class RecordingSessions:
         """Reports an error of the handover from this session, and continues after the block."""
         try:
             yield
-        except RecorderError as error:
+        except (RecorderError, OSError) as error:
             self._events.fail("rotation_failed", str(error), recording=session.name)

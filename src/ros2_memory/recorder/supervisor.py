@@ -99,8 +99,7 @@ class Supervisor:
         )
         self._topic_watch = TopicWatch(orders, self._events)
         self._beat: Heartbeat | None = None
-        self._backoff = Backoff()
-        self._rotation_backoff = Backoff()
+        self._backoff = {"restart": Backoff(), "rotate": Backoff()}
         self._silence = SilenceWatch(orders.split_duration_s, orders.session_duration_s)
         self._rotating_for_silence = False
         self._rotate_now = False
@@ -139,8 +138,7 @@ class Supervisor:
         if not self._paused:
             try:
                 self._begin_recording(now)
-            except RecorderError as error:
-                self._events.fail("recorder_not_started", str(error))
+            except RecorderError:
                 self._write_heartbeat(RecorderState.STOPPED)
                 raise
         self.stopped = False
@@ -214,7 +212,7 @@ class Supervisor:
         self._splits_closed |= closed
         current = self._sessions.current
         if current is not None and current.splits.messages:
-            self._backoff.succeeded()
+            self._backoff["restart"].succeeded()
             if closed:
                 self._events.recorded()
 
@@ -232,16 +230,16 @@ class Supervisor:
                 "other one, restart the recorder)",
             )
         elif was_away and not is_away:
-            self._postpone("restart", self._backoff.failed(), now)
+            self._put_off("restart", now)
             self._events.info("disk_back", bag_dir=str(self._bag_dir))
 
     def _check_exits(self, now: ClockReading) -> None:
         before = self._sessions.current
         for _ in range(self._sessions.collect_ended(now)):
-            self._postpone("rotate", self._rotation_backoff.failed(), now)
-            self._postpone("restart", self._backoff.failed(), now)
+            self._put_off("rotate", now)
+            self._put_off("restart", now)
         if self._sessions.end_unready(now):
-            self._postpone("restart", self._backoff.failed(), now)
+            self._put_off("restart", now)
         current = self._sessions.current
         if current is not None and current is not before:
             self._silence.began(now.monotonic_s, SETTLE_S)
@@ -257,7 +255,7 @@ class Supervisor:
             self._make_room_or_pause(now, free, enough)
         elif free >= enough:
             self._paused = False
-            self._postpone("restart", 0.0, now)
+            self._due_s["restart"] = now.monotonic_s
             self._events.info("recording_resumed", free_bytes=free)
         elif self._is_due("room", QUIET_RETENTION_S, now):
             # Bags that were being written when recording was paused may be deleted by now.
@@ -292,11 +290,11 @@ class Supervisor:
     def _check_handover(self, now: ClockReading) -> None:
         step = self._sessions.advance_handover(now)
         if step is Step.COMPLETE:
-            self._rotation_backoff.succeeded()
+            self._backoff["rotate"].succeeded()
             self._silence.rotated(for_silence=self._rotating_for_silence)
             self._silence.began(now.monotonic_s, SETTLE_S)
         elif step is Step.ABANDON:
-            self._postpone("rotate", self._rotation_backoff.failed(), now)
+            self._put_off("rotate", now)
 
     def _check_rotation(self, now: ClockReading) -> None:
         current = self._sessions.current
@@ -329,7 +327,7 @@ class Supervisor:
             self._sessions.begin_handover(now)
         except RecorderError as error:
             self._events.fail("rotation_failed", str(error), recording=current.name)
-            self._postpone("rotate", self._rotation_backoff.failed(), now)
+            self._put_off("rotate", now)
             return
         self._rotate_now = False
         if resubscribe is not None:
@@ -361,15 +359,18 @@ class Supervisor:
             return
         try:
             self._begin_recording(now)
-        except RecorderError as error:
-            self._events.fail("recorder_not_started", str(error))
-            self._postpone("restart", self._backoff.failed(), now)
+        except RecorderError:
+            self._put_off("restart", now)
 
     def _begin_recording(self, now: ClockReading) -> None:
-        make_bag_dir(self._bag_dir)
         self._rotate_now = False
         self._reception.skip_latched(())
-        self._sessions.begin(now)
+        try:
+            make_bag_dir(self._bag_dir)
+            self._sessions.begin(now)
+        except RecorderError as error:
+            self._events.fail("recorder_not_started", str(error))
+            raise
         if self._paused_at is not None:
             self._add_interruption(self._paused_at, "paused")
             self._paused_at = None
@@ -506,8 +507,9 @@ class Supervisor:
         self._due_s[task] = now.monotonic_s + every_s
         return True
 
-    def _postpone(self, task: str, wait_s: float, now: ClockReading) -> None:
-        self._due_s[task] = now.monotonic_s + wait_s
+    def _put_off(self, task: str, now: ClockReading) -> None:
+        """Has a task that failed wait before the next attempt."""
+        self._due_s[task] = now.monotonic_s + self._backoff[task].failed()
 
     def _now(self) -> ClockReading:
         return ClockReading(self._monotonic(), self._orders.clock.now())

@@ -105,6 +105,7 @@ class _Pass:
         remaining: bags that stay.
         saved: those of the deleted bags whose files are saved in moments.
         unshipped: those that had to be shipped, in the order in which they were deleted.
+        gave_up: whether some were deleted though what stays of them could not be written.
     """
 
     urgent: bool
@@ -115,6 +116,7 @@ class _Pass:
     remaining: set[str] = field(default_factory=set)
     saved: set[str] = field(default_factory=set)
     unshipped: list[str] = field(default_factory=list)
+    gave_up: bool = False
 
 
 class Outliving(Protocol):
@@ -328,8 +330,7 @@ class GarbageCollector:
         }
         self._carry(to_delete, snapshot, run)
         going = [bag for bag in to_delete if bag.path not in run.remaining]
-        self._keep_memory(going, plan, stock, snapshot, run)
-        going = [bag for bag in going if bag.path not in run.remaining]
+        going = self._keep_memory(going, plan, snapshot, run)
         self._write_down(going)
         for bag in going:
             self._delete_bag(bag, run)
@@ -361,35 +362,38 @@ class GarbageCollector:
 
     def _keep_memory(
         self,
-        to_delete: Sequence[StoredBag],
+        to_delete: list[StoredBag],
         plan: DeletionPlan,
-        stock: RetentionStock,
         snapshot: Snapshot,
         run: _Pass,
-    ) -> None:
-        """Writes what stays of bags. Where that fails, age waits for a day, the budget does not.
+    ) -> list[StoredBag]:
+        """Writes what stays of bags; returns those that go now.
 
-        Then only the bags go that must, and not those that would go with them, in the same hour.
+        Where that fails, age waits for a day, the budget does not. Then only the bags go that must,
+        and not those that would go with them, in the same hour; few at first, as that makes room to
+        write what stays of the others.
         """
         if self._memory is None:
-            return
+            return to_delete
         # A moment has all messages of its bags.
-        saved = {file.inode for file in stock.saved}
-        alone = [bag for bag in to_delete if saved.isdisjoint(file.inode for file in bag.files)]
+        alone = {bag.path for bag in to_delete} - run.saved
         try:
-            self._memory.keep(snapshot, {bag.path for bag in alone})
+            self._memory.keep(snapshot, alone)
         except (EpisodicError, OSError) as error:
             now = self._monotonic()
             since = now if self._memory_fails_since is None else self._memory_fails_since
             self._memory_fails_since = since
             must_go = {bag.path for bag in plan.to_delete}
             must_go -= plan.aged if now - since < RETRIED_S else frozenset()
-            waiting = [bag for bag in to_delete if bag.path not in must_go]
-            run.remaining |= {bag.path for bag in waiting}
-            lost = len(to_delete) - len(waiting)
-            _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=lost)
-        else:
-            self._memory_fails_since = None
+            waiting = {bag.path for bag in to_delete} - must_go
+            run.remaining |= waiting
+            going = [bag for bag in to_delete if bag.path in must_go]
+            if not run.gave_up:
+                run.gave_up, going = True, going[: 1 + len(going) // 8]
+            _log.error("memory_not_kept", reason=str(error), waiting=len(waiting), lost=len(going))
+            return going
+        self._memory_fails_since = None
+        return to_delete
 
     def _write_down(self, going: Sequence[StoredBag]) -> None:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""

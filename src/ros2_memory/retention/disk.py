@@ -10,6 +10,8 @@ import shutil
 import time
 from typing import TYPE_CHECKING, Final
 
+from ros2_memory.core.errors import BagUnreachableError
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
     from pathlib import Path
@@ -99,8 +101,13 @@ class FailingFiles:
         self._monotonic = monotonic
         self._failed: dict[Path, tuple[float, float]] = {}
 
-    def may_recover(self, path: Path) -> bool:
-        """Returns whether a file that fails now has failed for less than `RETRIED_S`."""
+    def may_recover(self, path: Path, error: Exception) -> bool:
+        """Returns whether the disk fails to read a file, and has done so for less than `RETRIED_S`.
+
+        `error` is what reading the file raised now.
+        """
+        if not isinstance(error, BagUnreachableError):
+            return False
         now = self._monotonic()
         first, last = self._failed.get(path, (now, now))
         if now - last > _READ_BETWEEN_S:

@@ -39,13 +39,13 @@ from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import (
     BagError,
-    BagUnreachableError,
     BagVanishedError,
     UndecodableError,
 )
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
+from ros2_memory.retention.repair import beside
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
@@ -306,7 +306,7 @@ class Carrier:
                 yield record
             elif isinstance(record, BagVanishedError):
                 return
-            elif isinstance(record, BagUnreachableError) and self._failing.may_recover(path):
+            elif self._failing.may_recover(path, record):
                 raise record
             elif path == self.path:
                 reason = f"{record.reason}; move it away to give up its messages"
@@ -382,11 +382,10 @@ class Carrier:
             self.path.unlink(missing_ok=True)
             return
         folder.mkdir(exist_ok=True)
-        beside = folder / f".{CARRY_FILE}.tmp"
         try:
-            beside.unlink(missing_ok=True)
-            self._writer.write(beside, records)
-            beside.replace(self.path)
+            with beside(self.path) as new:
+                self._writer.write(new, records)
+                new.replace(self.path)
         except BaseException:
             with suppress(OSError):
                 folder.rmdir()

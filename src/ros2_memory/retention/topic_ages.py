@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import structlog
 
-from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
-from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, METADATA_FILE, SHIPPED_FILE
-from ros2_memory.bag_dir.metadata_yaml import bare_name, recounted
+from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
+from ros2_memory.bag_dir.metadata_yaml import bare_name, why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.text import match_topics
@@ -129,7 +128,6 @@ class TopicCutter:
         self._measure_free = measure_free
         self._monotonic = monotonic
         self._done: dict[str, tuple[Ns, frozenset[str]]] = {}
-        self._known: _Counts | None = None
         self._waits_since_s: float | None = None
 
     def cut(self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot) -> int:
@@ -155,18 +153,16 @@ class TopicCutter:
         receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            counts, bags_before = self._counts_of(recording), bags
+            left, bags_before = left_in(recording, self._reader, {}), bags
             for cut in of_recording:
                 free = self._measure_free(self._bag_dir)
                 if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
                     break
-                gone_here = self._cut_if_held(cut, counts, receipts)
+                gone_here = self._cut_if_held(cut, left, receipts)
                 gone += gone_here or Counter()
                 bags += gone_here is not None
-            if bags > bags_before:
-                _correct_metadata(counts)
-                counts = counts._replace(changed=recording.stat().st_mtime_ns)
-            self._known = counts
+            if bags > bags_before and (reason := why_not_corrected(recording, self._reader)):
+                _log.warning("metadata_not_corrected", recording=recording.name, reason=reason)
             if self._monotonic() >= until_s:
                 break
         if bags:
@@ -186,36 +182,26 @@ class TopicCutter:
             _log.info("topics_wait", reason=reason)
         return now_s - self._waits_since_s >= PATIENCE_S
 
-    def _counts_of(self, recording: Path) -> _Counts:
-        """Returns what the bags of a recording hold; they are read where they have changed.
-
-        Raises:
-            OSError: its folder cannot be read.
-        """
-        changed = recording.stat().st_mtime_ns
-        if (known := self._known) and (known.recording, known.changed) == (recording, changed):
-            return known
-        return _Counts(recording, changed, left_in(recording, self._reader, {}))
-
     def _cut_if_held(
-        self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]
+        self, cut: TopicCut, left: dict[str, Counter[str]], receipts: Mapping[str, Receipt]
     ) -> Counter[str] | None:
         """Cuts a bag that has messages of the topics; returns what went, by topic.
 
-        None where it has none, or cannot be cut: then it is not looked at again until it changes.
+        `left` has what the bags of the recording hold, by bare name. None where this one has none,
+        or cannot be cut: then it is not looked at again until it changes.
         """
-        if not cut.topics.isdisjoint(counts.left.get(bare_name(cut.bag.path.name), ())):
+        if not cut.topics.isdisjoint(left.get(bare_name(cut.bag.path.name), ())):
             try:
-                return self._cut_bag(cut, counts, receipts)
+                return self._cut_bag(cut, left, receipts)
             except (EpisodicError, OSError) as error:
                 _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
         self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
         return None
 
     def _cut_bag(
-        self, cut: TopicCut, counts: _Counts, receipts: Mapping[str, Receipt]
+        self, cut: TopicCut, left: dict[str, Counter[str]], receipts: Mapping[str, Receipt]
     ) -> Counter[str]:
-        """Cuts one bag; returns the messages that went, by topic, and takes them from `counts`.
+        """Cuts one bag; returns the messages that went, by topic, and takes them from `left`.
 
         Raises:
             EpisodicError: it cannot be rewritten; nothing is changed.
@@ -228,7 +214,7 @@ class TopicCutter:
         gone = Counter[str]()
         for topic in going:
             gone[topic.topic] += topic.count
-        left = {**counts.left, name: counts.left[name] - gone}
+        remaining = {**left, name: left[name] - gone}
         bag = os.path.relpath(path, self._bag_dir)
         expired = self._expired()
         losses = [
@@ -237,7 +223,8 @@ class TopicCutter:
         ]
         EXPIRED.write(self._bag_dir, expired.then(bag, losses))
         receipt = receipts.get(bag)
-        is_shipped = receipt is not None and receipt.size == before.st_size
+        if receipt is not None and receipt.size != before.st_size:
+            receipt = None
         try:
             with rewritten(
                 self._bag_dir,
@@ -246,19 +233,19 @@ class TopicCutter:
                 self._writer,
                 takes=lambda name, _logged, _published: name in cut.topics,
                 expected=gone,
-                left_of=left,
+                left_of=remaining,
             ) as new:
                 # Before the bag is smaller: else `ship` would take what went out of the lake, too.
-                if receipt is not None and is_shipped:
+                if receipt is not None:
                     shipped = replace(receipt, size=new.stat().st_size)
                     SHIPPED.append(self._bag_dir, [shipped])
         except (EpisodicError, OSError):
             EXPIRED.write(self._bag_dir, expired)
-            if receipt is not None and is_shipped:
+            if receipt is not None:
                 with suppress(OSError):
                     SHIPPED.append(self._bag_dir, [receipt])
             raise
-        counts.left.update(left)
+        left.update(remaining)
         return gone
 
     def _expired(self) -> Expired:
@@ -275,31 +262,6 @@ class TopicCutter:
             return Expired()
 
 
-class _Counts(NamedTuple):
-    """How many messages of each topic each bag of a recording has, by its bare name.
-
-    `changed` is the mtime (ns) of its folder then.
-    """
-
-    recording: Path
-    changed: Ns
-    left: dict[str, Counter[str]]
-
-
 def is_quiet() -> bool:
     """Returns whether fewer programs ran in the last minute than there are processors."""
     return os.getloadavg()[0] < (os.cpu_count() or 1)
-
-
-def _correct_metadata(counts: _Counts) -> None:
-    """Has metadata.yaml count what is left, where there is one."""
-    path = counts.recording / METADATA_FILE
-    try:
-        text = read_small_file(path)
-        written = recounted(text, counts.left)
-        if written != text:
-            write_durably(path, written)
-    except FileNotFoundError:
-        return
-    except (OSError, ValueError) as error:
-        _log.warning("metadata_not_corrected", recording=path.parent.name, reason=str(error))

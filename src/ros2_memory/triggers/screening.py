@@ -25,12 +25,11 @@ import structlog
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
-    METADATA_FILE,
     SCREENED_FILE,
     bag_kind,
     split_number,
 )
-from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import (
     SCREENED,
     ConditionInterval,
@@ -42,7 +41,6 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary
 from ros2_memory.core.errors import (
     BagError,
-    BagUnreachableError,
     EpisodicError,
     RecorderError,
     UndecodableError,
@@ -278,7 +276,7 @@ class Screening:
                 self._retry_s[path] = now_s + RETRY_S
                 return unreleased, False
             except BagError as error:
-                if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
+                if self._failing.may_recover(path, error):
                     raise
                 _doubt(screen)
                 screen.files[path.name] = FileStep.UNREADABLE
@@ -461,15 +459,12 @@ class Screening:
         screen, files = state.recordings[name], [file.name for file in self._files(name)]
         if any(screen.files.get(file) is not FileStep.RELEASED for file in files):
             return
-        if state.excluded and (self._bag_dir / name / METADATA_FILE).exists():
-            try:
-                correct(self._bag_dir / name, self._reader)
-            except (BagError, OSError, ValueError) as error:
-                _log.warning(
-                    "metadata_not_corrected",
-                    recording=name,
-                    reason=f"metadata.yaml may still count what was excluded: {error}",
-                )
+        if state.excluded and (reason := why_not_corrected(self._bag_dir / name, self._reader)):
+            _log.warning(
+                "metadata_not_corrected",
+                recording=name,
+                reason=f"metadata.yaml may still count what was excluded: {reason}",
+            )
         screen.done = True
         screen.files = {}
 

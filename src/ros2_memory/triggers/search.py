@@ -16,7 +16,7 @@ from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.bag_dir.layout import named_start
 from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, TriggerState
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
-from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
+from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.disk import FailingFiles
@@ -256,7 +256,7 @@ class SplitSearch:
         try:
             yield from self._messages(bag, part, watched)
         except BagError as error:
-            if isinstance(error, BagUnreachableError) and self._failing.may_recover(bag.path):
+            if self._failing.may_recover(bag.path, error):
                 raise
             problem = f"not all could be searched: {bag.path.name}: {error.reason}"
             for rule in {rule.name for rules in watched.values() for rule in rules}:

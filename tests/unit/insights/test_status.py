@@ -164,8 +164,8 @@ def test_what_a_publisher_sent_that_did_not_fit_is_said_to_be_missing(tmp_path: 
     append_losses(tmp_path, [Loss("/odom", *span, 0, "refused") for span in spans])
     sentence = (
         f"messages of a publisher of /odom were not recorded from {BEGIN // S + 10}.000000 to "
-        f"{BEGIN // S + 14}.000000 (4 s), as its QoS or type did not fit the subscription: how many "
-        "is not known"
+        f"{BEGIN // S + 14}.000000 (4 s), as its QoS or type did not fit the subscription: "
+        "how many is not known"
     )
     assert shown(memory, tmp_path)["doubts"] == sentence
 

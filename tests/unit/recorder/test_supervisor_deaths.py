@@ -12,7 +12,7 @@ from unittest.mock import Mock
 import pytest
 from structlog.testing import capture_logs
 
-from ros2_memory.bag_dir import handover_file
+from ros2_memory.bag_dir import durable_write, handover_file
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.recorder import sessions
@@ -196,6 +196,19 @@ class TestFailingDisk:
         world.run(40)
         world.supervisor.stop()
         assert len(world.recorders) > 2
+        assert_each_counts_once(world)
+
+    def test_a_rotation_that_was_noted_and_not_flushed_is_tried_again(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        world = World(tmp_path, session_duration_s=20).started(19)
+        with monkeypatch.context() as failing_disk:
+            failing_disk.setattr(durable_write, "flush", failing(errno.EIO))
+            assert world.logged(3, "rotation_failed")
+        assert len(world.recorders) == 1
+        world.run(20)
+        world.supervisor.stop()
+        assert len(world.recorders) == 2
         assert_each_counts_once(world)
 
     def test_a_recorder_that_dies_is_replaced_though_its_splits_cannot_be_read(

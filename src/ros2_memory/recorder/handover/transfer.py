@@ -34,11 +34,11 @@ from ros2_memory.recorder.handover.union import cut_clock, intended
 from ros2_memory.recorder.policies import ClockReading, set_back
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection
+    from collections.abc import Collection
     from pathlib import Path
 
     from ros2_memory.recorder.session import RecordingSession
-    from ros2_memory.storage.base import BagReader
+    from ros2_memory.recorder.sessions import Orders
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
@@ -128,10 +128,7 @@ class HandoverTransfer:
         old: the session that records.
         new: the session that takes over.
         began: the time just before the new recorder was started.
-        reader: reads splits that are closed.
-        simulated: whether log times come from a simulated clock.
-        is_listed: whether the new session is to record a topic.
-        subscribe_timeout_s: how long topics are waited for.
+        orders: what to record.
     """
 
     def __init__(
@@ -139,21 +136,14 @@ class HandoverTransfer:
         old: RecordingSession,
         new: RecordingSession,
         began: ClockReading,
-        reader: BagReader,
-        *,
-        simulated: bool,
-        is_listed: Callable[[str], bool],
-        subscribe_timeout_s: float,
+        orders: Orders,
     ) -> None:
-        self._is_listed = is_listed
+        self._orders = orders
         self.old = old
         self.new = new
         self._began = self._last = began
-        self._timeout_s = subscribe_timeout_s
         # Since when both record.
         self._both_since: ClockReading | None = None
-        self._reader = reader
-        self._simulated = simulated
         self._marked = False
         self._closed_before = old.splits.closed_names
 
@@ -178,7 +168,8 @@ class HandoverTransfer:
     @property
     def missing(self) -> frozenset[str]:
         """Topics that the old recorder has subscribed to, and the new one has still to."""
-        return frozenset(filter(self._is_listed, self.old.subscribed - self.new.subscribed))
+        is_listed = self._orders.topics.selection.matches
+        return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
         """Returns the step that is due. Must be called several times a second.
@@ -194,7 +185,7 @@ class HandoverTransfer:
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
-        if self.missing and age_s < self._timeout_s:
+        if self.missing and age_s < self._orders.subscribe_timeout_s:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
             self._both_since = None
@@ -214,7 +205,7 @@ class HandoverTransfer:
         if self._both_since is None:
             return False
         both, clock = self._both_since.wall, self._clock_of_cut()
-        if self._simulated and clock is CutClock.LOG:
+        if self._orders.simulated and clock is CutClock.LOG:
             # No time of the wall clock separates them: the old one counts up to its end.
             return True
         old, new = complete_sidecars(
@@ -224,7 +215,7 @@ class HandoverTransfer:
             Bounds(self._began.wall, both, (both + now.wall) // 2, now.wall),
             old_files=self._old_files(),
             new_files=self.new.splits.names(),
-            simulated=self._simulated,
+            simulated=self._orders.simulated,
             clock=clock,
         )
         write_handovers({self.new.splits.directory: new, self.old.splits.directory: old})
@@ -249,4 +240,4 @@ class HandoverTransfer:
         closed = sorted(self.old.splits.closed_names)
         if not closed:
             return CutClock.PUBLISH
-        return cut_clock(self.old.splits.directory / closed[-1], self._reader)
+        return cut_clock(self.old.splits.directory / closed[-1], self._orders.reader)

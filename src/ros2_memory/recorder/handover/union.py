@@ -126,15 +126,13 @@ def give_up(old: Path, new: Path) -> None:
     """Marks a new recording as not counting: it did not take over, and the old one goes on.
 
     Raises:
-        RecorderError: a sidecar cannot be written, or it is not known whether there is a recording.
+        RecorderError: a sidecar cannot be written.
+        OSError: it is not known whether there is a recording.
     """
-    try:
-        if is_folder(new):
-            write_handover(new, void(old.name))
-        if is_folder(old):
-            write_handover(old, intended(handover_to_change(old), None))
-    except OSError as error:
-        raise RecorderError(f"{error.filename}: {error.strerror or error}") from error
+    if is_folder(new):
+        write_handover(new, void(old.name))
+    if is_folder(old):
+        write_handover(old, intended(handover_to_change(old), None))
 
 
 def void(old_name: str) -> Handover:

@@ -38,7 +38,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
-from ros2_memory.core.errors import BagError, BagUnreachableError, UndecodableError
+from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
@@ -46,7 +46,7 @@ from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.memory.thinning import (
     MINUTE_NS,
     TopicThinning,
-    beside,
+    beside_pauses,
     has_numbers,
     is_said,
     is_sampled,
@@ -54,6 +54,7 @@ from ros2_memory.recorder.memory.thinning import (
     shown_by,
 )
 from ros2_memory.retention.disk import FailingFiles
+from ros2_memory.retention.repair import beside
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
@@ -282,8 +283,7 @@ class MemoryDays:
                     metadata = dict.fromkeys([*channel.metadata, _BY_MINUTE])
                     yield record._replace(channel=replace(channel, metadata=(*metadata,)))
 
-        self._write_beside(path, thinned()).replace(path)
-        flush(self._folder)
+        self._replace_day(path, thinned(), ())
 
     def clear(self) -> None:
         """Deletes all days where nothing is to stay (`memory.keep`), a day after saying so.
@@ -310,7 +310,7 @@ class MemoryDays:
             _log.warning("memory_leaves", days=len(days), left_s=left_s)
         if left_s:
             return
-        for path in [*self._folder.glob(".*.thinned.mcap.tmp"), *days, bag_dir / THINNED_FILE]:
+        for path in [*self._folder.glob(".*.thinned.mcap.*"), *days, bag_dir / THINNED_FILE]:
             path.unlink(missing_ok=True)
         _log.warning("memory_deleted", days=len(days), reason="memory.keep is false")
         with suppress(OSError):
@@ -354,7 +354,9 @@ class MemoryDays:
                 chosen.times[topic, kind].update(table.log_times.tolist())
             elif len(table):
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
-                chosen.times[topic, kind].update(beside(shown.pauses, table.log_times).tolist())
+                chosen.times[topic, kind].update(
+                    beside_pauses(shown.pauses, table.log_times).tolist()
+                )
         for key, thinning in thinned.items():
             chosen.times[key].update(thinning.times().tolist())
         return chosen
@@ -409,7 +411,7 @@ class MemoryDays:
 
     def _raise_if_transient(self, path: Path, error: BagError) -> None:
         """Raises an error of the disk again while the disk may recover."""
-        if isinstance(error, BagUnreachableError) and self._failing.may_recover(path):
+        if self._failing.may_recover(path, error):
             raise error
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
@@ -456,46 +458,39 @@ class MemoryDays:
         return not self._people.isdisjoint(map(str.casefold, _WORD.findall(name)))
 
     def _write_day(self, day: str, records: Sequence[Record], bags: Sequence[BagFile]) -> None:
-        """Writes a day anew, with more messages, and lists the bags that these are of.
-
-        From the moment on in which the new file takes its name, those bags count no longer.
+        """Writes a day anew, with more messages, which are those of some bags that stay.
 
         Raises:
             BagError: it cannot be written.
             OSError: likewise.
         """
-        bag_dir = self._folder.parent
         if self._folder.is_symlink():
             raise BagError(str(self._folder), "a symbolic link, which is not followed: remove it")
         self._folder.mkdir(exist_ok=True)
         path = self._writable_file(day)
         self._own.hold(self._folder, [path.name])
-        name = str(path.relative_to(bag_dir))
-        beside = self._write_beside(path, self._merged_by_hour(path, records))
-        status, before = beside.stat(), Superseded()
-        with suppress(ValueError):  # a damaged list is replaced
-            before = SUPERSEDED.read(bag_dir) or before
-        # Those that could not be deleted yet.
-        left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
-        listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
-        days = {other: before.days[other] for other in {*left.values()} - {name}}
-        SUPERSEDED.write(
-            bag_dir, Superseded({**days, name: (status.st_size, status.st_mtime_ns)}, listed)
-        )
-        beside.replace(path)
+        self._replace_day(path, self._merged_by_hour(path, records), bags)
+
+    def _replace_day(self, path: Path, records: Iterator[Record], bags: Sequence[BagFile]) -> None:
+        """Writes a new file that takes the name of a day, and lists the bags that it has now, too.
+
+        From that moment on those bags, and those listed for it before, count no longer.
+        """
+        bag_dir, name = self._folder.parent, f"{MEMORY_FOLDER}/{path.name}"
+        with beside(path) as new:
+            self._writer.write(new, records, dense=True)
+            status, before = new.stat(), Superseded()
+            with suppress(ValueError):  # a damaged list is replaced
+                before = SUPERSEDED.read(bag_dir) or before
+            # Those that could not be deleted yet.
+            left = {bag: day for bag, day in before.bags.items() if (bag_dir / bag).exists()}
+            listed = left | {str(bag.path.relative_to(bag_dir)): name for bag in bags}
+            days = {other: before.days[other] for other in {*left.values()} - {name}}
+            days[name] = status.st_size, status.st_mtime_ns
+            SUPERSEDED.write(bag_dir, Superseded(days, listed))
+            new.replace(path)
         flush(self._folder)
         flush(bag_dir)
-
-    def _write_beside(self, path: Path, records: Iterator[Record]) -> Path:
-        """Writes a new file for a day, to the disk, which is to take its name."""
-        beside = path.with_name(f".{path.name}.tmp")
-        beside.unlink(missing_ok=True)
-        try:
-            self._writer.write(beside, records, dense=True)
-        except BaseException:
-            beside.unlink(missing_ok=True)
-            raise
-        return beside
 
     def _writable_file(self, day: str) -> Path:
         """Returns the file of a day that can be written anew: no damaged one, nor one of others."""

@@ -517,7 +517,7 @@ def _few_a_day(pauses: Iterable[tuple[Ns, Ns]]) -> Iterator[tuple[Ns, Ns]]:
             yield start, end
 
 
-def beside(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:
+def beside_pauses(pauses: Iterable[tuple[Ns, Ns]], times: IntArray) -> IntArray:
     """Returns those of some log times (ns) that lie so near a pause that they show a step."""
     near = np.zeros(times.size, bool)
     for start, end in pauses:

@@ -53,13 +53,22 @@ _COUNTERS: Final = frozenset(
         "frame_number",
     }
 )
-_SIZES: Final = {
-    **dict.fromkeys(("bool", "byte", "char", "int8", "uint8"), 1),
-    **dict.fromkeys(("int16", "uint16"), 2),
-    **dict.fromkeys(("int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("int64", "uint64", "float64"), 8),
+_FORMS: Final = {
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "<h",
+    "uint16": "<H",
+    "int32": "<i",
+    "uint32": "<I",
+    "float32": "<f",
+    "int64": "<q",
+    "uint64": "<Q",
+    "float64": "<d",
 }
-_UNSIGNED: Final = {"uint16": "<H", "uint32": "<I", "uint64": "<Q", "int32": "<i", "int64": "<q"}
+_COUNTED: Final = frozenset({"<H", "<I", "<Q", "<i", "<q"})
 
 Kind = Literal["counter", "stamps"]
 
@@ -224,10 +233,10 @@ def reader_of(schema: Schema) -> ValueReader | None:
     fields = _fields(schema.text.decode(errors="replace"))
     before: list[str] = []
     for kind, name in fields:
-        if name in _COUNTERS and kind in _UNSIGNED:
-            value_of = partial(_counter, before=tuple(before), form=_UNSIGNED[kind])
+        if name in _COUNTERS and (form := _FORMS.get(kind)) in _COUNTED:
+            value_of = partial(_counter, before=tuple(before), form=form)
             return ValueReader("counter", value_of)
-        if kind not in {"string", *_SIZES, *_HEADERS, *_TIMES}:
+        if kind not in {"string", *_FORMS, *_HEADERS, *_TIMES}:
             break
         before.append(kind)
     first_type, _ = fields[0] if fields else ("", "")
@@ -294,8 +303,9 @@ def _stamp(payload: bytes) -> int:
 def _counter(payload: bytes, before: Sequence[str], form: str) -> int:
     at = 0
     for kind in before:
-        if kind in _SIZES:
-            at = _aligned(at, _SIZES[kind]) + _SIZES[kind]
+        if kind in _FORMS:
+            size = struct.calcsize(_FORMS[kind])
+            at = _aligned(at, size) + size
             continue
         at = _aligned(at, 4)
         if kind != "string":

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import structlog
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
 from starlette.datastructures import QueryParams
@@ -589,8 +590,10 @@ def test_a_day_is_thinned_to_minutes_once_and_again_with_what_is_added(
     now, path = T0 + MONTH_NS + 2 * 86_400 * S, bag_dir / DAY_FILE
     unthinned = path.stat().st_ino
     days_of(bag_dir).limit(now)
-    thinned = path.stat().st_ino
+    thinned, status = path.stat().st_ino, path.stat()
     assert thinned != unthinned
+    # The bag that could not be deleted yet counts no more than before.
+    assert read_superseded(bag_dir).days == {DAY_FILE: (status.st_size, status.st_mtime_ns)}
     read: list[object] = []
 
     def batches(_: BagDirReader, *of: object, **__: object) -> Iterator[object]:
@@ -692,6 +695,29 @@ def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_di
     max_bytes = sum(sizes) - min(sizes) // 2
     house(bag_dir, T0 + 7300 * S, max_bytes=max_bytes, memory=memory).apply()
     assert len([*bag_dir.glob("rec_*/*.mcap")]) == 10
+
+
+def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
+    bag_dir: Path,
+) -> None:
+    class FullAtFirst(McapWriter):
+        def write(self, path: Path, records, **how) -> None:  # type: ignore[no-untyped-def]
+            if len([*bag_dir.glob("rec_*/*.mcap")]) == 11:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            super().write(path, records, **how)
+
+    for nth in range(10):
+        split(bag_dir, 60 * nth)
+    split(bag_dir, 7200, name="rec_B")
+    own_all(bag_dir)
+    memory = days_of(bag_dir, writer=FullAtFirst())
+    with structlog.testing.capture_logs() as logs:
+        house(bag_dir, T0 + 7300 * S, max_bytes=1, memory=memory).apply()
+    assert [log["lost"] for log in logs if log["event"] == "memory_not_kept"] == [2]
+    assert len([*bag_dir.glob("rec_*/*.mcap")]) == 1
+    assert {int(one.log_time - T0) // (60 * S) for one in messages_in(bag_dir / DAY_FILE)} == {
+        *range(2, 10)
+    }
 
 
 def unreachable(path: Path) -> BagError | None:
