@@ -145,14 +145,17 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
         }
         row |= {key: value for key, value in body.items() if key not in {*shared, *_OF_WINDOW}}
         rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
-    whole = _added_up(answered)
+    whole = _added_up(answered, is_all=answer.is_all)
     total: JsonObject = {"all": whole} if whole else {}
     return with_notes({**total, **shared, "windows": rows}, [*answer.notes, *common])
 
 
-def _added_up(replies: Sequence[JsonObject]) -> JsonObject:
-    """Returns the sums over replies; `at_least` so many where one of them has no total."""
-    if any("at_least" in reply for reply in replies):
+def _added_up(replies: Sequence[JsonObject], *, is_all: bool) -> JsonObject:
+    """Returns the sums over replies; `at_least` so many where one of them has no total.
+
+    And where they are not all that was asked for.
+    """
+    if not is_all or any("at_least" in reply for reply in replies):
         replies = [{"at_least": reply.get("total"), **reply, "total": None} for reply in replies]
     sums: JsonObject = {}
     for key in _SUMMED:
