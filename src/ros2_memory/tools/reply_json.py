@@ -15,7 +15,7 @@ from ros2_memory.core.reply import JsonObject, Keys, LocalTimes, Scope, render, 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
-from ros2_memory.tools.reply_size import largest, to_json_text
+from ros2_memory.tools.reply_size import HEADERS, largest, to_json_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -30,7 +30,6 @@ FINE_PATH_M: Final = 0.05 + 1e-9
 """The deviation that a simplified path is expected to have; a larger one is noted."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
-_HEADERS: Final = ("columns", "fields")
 _OF_WINDOW: Final = ("start", "end", "local", "at", "now")
 """Keys of a reply that the row of its window has, or has not."""
 _SUMMED: Final = (
@@ -112,7 +111,7 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
     replies = [as_json(window.answer, bag_dir) for window in answer.windows]
     bodies = [reply for reply in replies if isinstance(reply, dict)]
     shared, parts, common = _joined(
-        bodies, lambda key, value: isinstance(value, str) or key in _HEADERS
+        bodies, lambda key, value: isinstance(value, str) or key in HEADERS
     )
     rows: list[JsonValue] = []
     for window, part in zip(answer.windows, parts, strict=True):
