@@ -109,7 +109,7 @@ def test_long_cells_of_a_table_are_cut_and_stay_in_their_columns() -> None:
 @pytest.mark.parametrize("cap", [1_000, 3_000, 6_000])
 @pytest.mark.parametrize("in_windows", [False, True])
 def test_counts_keep_every_cell_of_their_columns(cap: int, in_windows: bool) -> None:
-    names = ["day", *(f"{nth:02}" for nth in range(60))]
+    names: list[Any] = ["day", *(f"{nth:02}" for nth in range(60))]
     table = {"rows": [[f"2026-11-{day}", *range(60)] for day in range(10, 30)], "all": [*range(60)]}
     parts: dict[str, Any] = {"windows": [table] * 9} if in_windows else table
     shown = strict(fit_reply({"columns": names, **parts, "notes": []}, cap))
