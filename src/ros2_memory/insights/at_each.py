@@ -134,6 +134,8 @@ def in_each(
             part = replace(window, stop=window.stop - early)
             answer = ask(fixed_memory, TimeRange.over(part))
         except NoDataError as error:
+            if error.reason is NoDataReason.TOPIC_NOT_RECORDED:
+                raise
             answer = NothingAt(window.start, error.reason, error.detail, notes=error.notes)
         except QueryTimeoutError:
             if not answers:
@@ -142,10 +144,15 @@ def in_each(
             notes = (f"out of time: the last {days_left} left out; ask about a shorter window",)
             break
         answers.append(InWindow(window.start, window.stop, answer))
-    if all(isinstance(day.answer, NothingAt) for day in answers):
+    nothing = [day.answer for day in answers if isinstance(day.answer, NothingAt)]
+    if not answers:
         detail = "nothing is recorded between these hours in this window"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, detail)
-    return InEach(tuple(answers), notes=notes)
+    if len(nothing) == len(answers):
+        newest = nothing[-1]
+        detail = f"none between these hours on any day; on the last {newest.detail}"
+        raise NoDataError(newest.reason, detail, newest.notes)
+    return InEach(tuple(answers), is_all=len(answers) == len(windows), notes=notes)
 
 
 def hours_of_days(window: TimeWindow, begins: time, ends: time) -> list[TimeWindow]:

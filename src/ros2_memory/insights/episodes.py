@@ -191,7 +191,7 @@ class SaidMeanwhile:
             except QueryTimeoutError as error:
                 self._is_over = True
                 self._view.notes.add_lack(
-                    f"what {self._topic} said was not read for all of them: {error}, or for fewer"
+                    f"what {self._topic} said was not read for all of them: {error}"
                 )
         return None
 

@@ -111,9 +111,10 @@ class InWindow(NamedTuple):
 
 @result()
 class InEach(AnswerWithNotes):
-    """The answers for several windows, in the order of time."""
+    """The answers for several windows, in the order of time; `is_all`: time did not run out."""
 
     windows: tuple[InWindow, ...]
+    is_all: bool = True
 
 
 OneAnswer: TypeAlias = (

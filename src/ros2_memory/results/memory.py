@@ -17,8 +17,6 @@ from ros2_memory.core.reply import (
     PLAIN,
     SECONDS,
     TIME,
-    Absent,
-    Unit,
     an_object,
     digits,
     keys,
@@ -289,7 +287,6 @@ class ShownMoment:
 _NEWEST_MOMENTS: Final = keys(
     _MOMENTS, PLAIN("moments_count", "total").if_known, _RULES, span=("oldest", "now")
 )
-_BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS else Absent.ABSENT)
 
 
 @result(
@@ -303,23 +300,17 @@ _BEYOND: Final = Unit(lambda topics, _: len(topics) if len(topics) > _MAX_TOPICS
     TIME("latest").in_short,
     LOCAL("local", "earliest", "latest"),
     SECONDS("newest_age_s").in_short,
-    OBJECTS("fell_silent").first(_MAX_TOPICS, ""),
-    _SILENCES("silences", lambda status: status.silences[::-1]).first(_MAX_TOPICS, ""),
-    OBJECTS("gaps", lambda status: status.gaps[::-1]).first(_MAX_TOPICS, ""),
-    _CLOCK_STEPS("clock_steps", lambda status: status.clock_steps[::-1]).first(_MAX_TOPICS, ""),
-    PLAIN("never_heard").first(_MAX_TOPICS, ""),
-    PLAIN("missing").first(_MAX_TOPICS, ""),
+    OBJECTS("fell_silent").first(_MAX_TOPICS),
+    _SILENCES("silences", lambda status: status.silences[::-1]).first(_MAX_TOPICS),
+    OBJECTS("gaps", lambda status: status.gaps[::-1]).first(_MAX_TOPICS),
+    _CLOCK_STEPS("clock_steps", lambda status: status.clock_steps[::-1]).first(_MAX_TOPICS),
+    PLAIN("never_heard").first(_MAX_TOPICS),
+    PLAIN("missing").first(_MAX_TOPICS),
     PLAIN("damaged").in_short,
     "incomplete",
     "unread",
     OBJECT("budget"),
     an_object(_NEWEST_MOMENTS).spread("moments"),
-    _BEYOND("fell_silent_count", "fell_silent"),
-    _BEYOND("silences_count", "silences"),
-    _BEYOND("gaps_count", "gaps"),
-    _BEYOND("clock_steps_count", "clock_steps"),
-    _BEYOND("never_heard_count", "never_heard"),
-    _BEYOND("missing_count", "missing"),
     span=("earliest", "now"),
 )
 class Status(AnswerWithNotes):

@@ -11,6 +11,7 @@ import threading
 import time
 import uuid
 from collections import deque
+from contextlib import contextmanager
 from difflib import get_close_matches
 from functools import partial
 from threading import Lock
@@ -40,7 +41,7 @@ from ros2_memory.tools.replies import Replies, Reply
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Mapping, Sequence
+    from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.tools.declaration import Tool
@@ -185,13 +186,9 @@ class Dispatcher:
         """
         tools = self._readable if for_resource else self._tools
         begun = time.perf_counter_ns()
-        over = threading.Event()
-        call = self._call(over)
-        call.robots = robots
-        self._begun += 1
         outcome, text = "cancelled", ""
-        correlation_id = uuid.uuid4().hex[:12]
-        with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
+        with self._running() as (call, correlation_id):
+            call.robots = robots
             try:
                 try:
                     outcome, reply = await self._outcome(
@@ -202,7 +199,6 @@ class Dispatcher:
                     outcome, reply = self._internal()
                 text = reply.text
             finally:
-                self._end(over)
                 done = Answered(
                     name if name in tools else UNKNOWN_TOOL,
                     outcome,
@@ -222,11 +218,8 @@ class Dispatcher:
         For the page: it waits in the queue of the calls that may take long, and is no tool call of
         the log and the metrics. Raises nothing but cancellation.
         """
-        over = threading.Event()
-        call = self._call(over)
-        self._begun += 1
-        with structlog.contextvars.bound_contextvars(correlation_id=uuid.uuid4().hex[:12]):
-            try:
+        try:
+            with self._running() as (call, _):
                 _, reply = await self._in_turn(
                     "the page",
                     self.blocking,
@@ -234,10 +227,8 @@ class Dispatcher:
                     call,
                     lambda: Reply(to_json_text(work(call))),
                 )
-            except EpisodicError as error:
-                return self._replies.error(error)
-            finally:
-                self._end(over)
+        except EpisodicError as error:
+            return self._replies.error(error)
         return reply
 
     def idle_call(self) -> Call | None:
@@ -254,21 +245,28 @@ class Dispatcher:
 
         return Call(Deadline.after(_LONGEST_IN_ADVANCE_S, monotonic))
 
-    def _end(self, over: threading.Event) -> None:
-        """Ends a call or a look, and what its query may still do."""
-        over.set()
-        self._ended += 1
-        self._ended_s = time.monotonic()
+    @contextmanager
+    def _running(self) -> Iterator[tuple[Call, str]]:
+        """Yields a call or a look, and its correlation id; in the end ends what it may still do.
 
-    def _call(self, over: threading.Event) -> Call:
-        """Returns a call whose query ends a little before the time of a call does."""
+        Its query ends a little before the time of a call does.
+        """
+        over = threading.Event()
         timeout_s = max(self._call_timeout_s - _QUERY_MARGIN_S, self._call_timeout_s * 0.9)
 
         def monotonic() -> float:
             # Infinite when nobody waits for it any more.
             return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
-        return Call(Deadline.after(timeout_s, monotonic))
+        self._begun += 1
+        correlation_id = uuid.uuid4().hex[:12]
+        with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
+            try:
+                yield Call(Deadline.after(timeout_s, monotonic)), correlation_id
+            finally:
+                over.set()
+                self._ended += 1
+                self._ended_s = time.monotonic()
 
     def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Logs a call that is over, and passes it to the observers."""

@@ -286,7 +286,8 @@ _Labels: TypeAlias = Annotated[
     BeforeValidator(_as_names),
     WithJsonSchema(
         {
-            "anyOf": [{"type": "string"}, {"type": "array", "items": {"type": "string"}}],
+            "type": ["string", "array"],
+            "items": {"type": "string"},
             "examples": ["mug"],
         }
     ),
@@ -355,7 +356,7 @@ _ConditionValue: TypeAlias = Annotated[
     AfterValidator(_check_condition_value),
     WithJsonSchema(
         {
-            "anyOf": [{"type": kind} for kind in ("string", "number", "boolean", "object")],
+            "type": ["string", "number", "boolean", "object"],
             "description": "near_position: {x, y}.",
             "examples": ["scissors"],
         }
@@ -663,7 +664,8 @@ _While: TypeAlias = Annotated[
     BeforeValidator(_as_while),
     WithJsonSchema(
         {
-            "anyOf": [{"type": "object"}, {"items": {"type": "object"}, "type": "array"}],
+            "type": ["object", "array"],
+            "items": {"type": "object"},
             "description": "Only while a topic meets this, e.g. "
             '{"topic": "/is_docked", "condition_type": "equals", "value": false}; of a list, all.',
             "examples": [{"topic": "/is_docked", "condition_type": "equals", "value": False}],

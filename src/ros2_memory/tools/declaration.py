@@ -10,6 +10,7 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 from pydantic import ValidationError
+from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from datetime import time
 
+    from pydantic_core.core_schema import NullableSchema
+
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
@@ -42,7 +45,7 @@ _KINDS: Final = {
     "number": "a number",
     "integer": "a whole number",
     "boolean": "true or false",
-    "array": "a list of texts",
+    "array": "a list",
     "object": "an object",
 }
 _TIME: Final = "Unix seconds or ISO 8601 text"
@@ -107,7 +110,6 @@ class Signature:
                 for key, item in schema.items()
                 if key != "examples" and not (key == "default" and item in (None, []))
             }
-            shown = _with_list_of_types(shown)
             properties[name] = _with_plain_times(shown) if self.plain_times else shown
         required = [*self._required, *(self._either if self.plain_times else ())]
         whole: JsonObject = {"type": "object", "properties": properties}
@@ -187,34 +189,24 @@ class Signature:
             yield f"{name} was {abbreviate(given[name])}{why}; expected {expected}"
 
 
+class _Schema(GenerateJsonSchema):
+    """The JSON schema of arguments: without titles, and without null as an alternative."""
+
+    def nullable_schema(self, schema: NullableSchema) -> JsonSchemaValue:
+        return self.generate_inner(schema["schema"])
+
+    def field_title_should_be_set(self, schema: object) -> bool:
+        del schema
+        return False
+
+
 @cache
 def _properties(arguments: type[Arguments]) -> Mapping[str, JsonObject]:
     """Returns the JSON schema of each argument; an optional one has a default and no null."""
-    schema: dict[str, JsonObject] = arguments.model_json_schema().get("properties", {})
-    return {name: _without_null(described) for name, described in schema.items()}
-
-
-def _without_null(schema: JsonObject) -> JsonObject:
-    """Returns the schema of an argument without its title, and without null as an alternative."""
-    kinds = schema.get("anyOf")
-    kept = {key: item for key, item in schema.items() if key != "title"}
-    if isinstance(kinds, list) and {"type": "null"} in kinds:
-        del kept["anyOf"]
-        kind = next(kind for kind in kinds if kind != {"type": "null"})
-        return {**kind, **kept} if isinstance(kind, dict) else kept
-    return kept
-
-
-def _with_list_of_types(schema: JsonObject) -> JsonObject:
-    """Returns the shorter schema that says the same: what it asks of one type concerns no other."""
-    kinds = schema.get("anyOf")
-    if not isinstance(kinds, list):
-        return schema
-    whole: JsonObject = {}
-    for kind in kinds:
-        whole |= kind if isinstance(kind, dict) else {}
-    types: JsonValue = [kind["type"] for kind in kinds if isinstance(kind, dict)]
-    return {**whole, **{key: item for key, item in schema.items() if key != "anyOf"}, "type": types}
+    schema: Mapping[str, Mapping[str, JsonObject]] = arguments.model_json_schema(
+        schema_generator=_Schema
+    )
+    return schema.get("properties", {})
 
 
 def _with_plain_times(schema: JsonObject) -> JsonObject:
@@ -246,20 +238,14 @@ def _expected(schema: JsonObject) -> str:
 
 
 def _kind(schema: JsonObject) -> str:
-    allowed, several = schema.get("enum"), schema.get("anyOf")
+    allowed, kinds = schema.get("enum"), schema.get("type")
     if isinstance(allowed, list):
-        return f"one of {', '.join(to_json_text(item) for item in allowed)}"
-    if isinstance(several, list):
-        return " or ".join(_kind(kind) for kind in several if isinstance(kind, dict))
-    if schema.get("type") == [*TIME_KINDS]:
+        return f"one of {', '.join(map(to_json_text, allowed))}"
+    if kinds == [*TIME_KINDS]:
         return _TIME
-    items = schema.get("items")
-    if isinstance(items, dict) and items.get("type") == [*TIME_KINDS]:
-        return f"a list of {_TIME}"
-    kinds = schema.get("type")
-    if isinstance(kinds, list):
-        return " or ".join(_KINDS[str(kind)] for kind in kinds)
-    return _KINDS[str(kinds)]
+    return " or ".join(
+        _KINDS[str(kind)] for kind in (kinds if isinstance(kinds, list) else [kinds])
+    )
 
 
 def _example_value(schema: JsonObject) -> JsonValue:

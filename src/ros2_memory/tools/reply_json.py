@@ -15,10 +15,10 @@ from ros2_memory.core.reply import JsonObject, Keys, LocalTimes, Scope, render, 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_rounded_up
 from ros2_memory.history.driven_path import length_notes
 from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
-from ros2_memory.tools.reply_size import largest, to_json_text
+from ros2_memory.tools.reply_size import HEADERS, largest, to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Trajectory
@@ -30,8 +30,7 @@ FINE_PATH_M: Final = 0.05 + 1e-9
 """The deviation that a simplified path is expected to have; a larger one is noted."""
 _OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
 """Keys that a reply about several moments has once, where they have the same value at each."""
-_HEADERS: Final = ("columns", "fields")
-_OF_WINDOW: Final = ("start", "end", "local", "at", "notes", "now")
+_OF_WINDOW: Final = ("start", "end", "local", "at", "now")
 """Keys of a reply that the row of its window has, or has not."""
 _SUMMED: Final = (
     "total",
@@ -96,26 +95,10 @@ def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
 
 def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
     """Returns one row for each moment; what all rows share is above them, and is not repeated."""
-    rows = [render(at_moment, bag_dir) for at_moment in answer.answers]
-    answered = [row for row in rows if "error" not in row]
-    shared: JsonObject = {
-        key: answered[0][key]
-        for key in _OF_ALL
-        if answered
-        and key in answered[0]
-        and all(row.get(key) == answered[0][key] for row in answered)
-    }
-    occurrences = Counter(
-        note for at_moment in answer.answers for note in dict.fromkeys(at_moment.notes)
-    )
-    common = [note for note, times in occurrences.items() if times > 1]
+    rendered = [render(at_moment, bag_dir) for at_moment in answer.answers]
+    shared, rows, common = _joined(rendered, lambda key, _: key in _OF_ALL)
     explained: set[JsonValue] = set()
-    for row, at_moment in zip(rows, answer.answers, strict=True):
-        for key in shared.keys() & row.keys():
-            del row[key]
-        row.pop("notes", None)
-        if notes := [note for note in at_moment.notes if note not in common]:
-            row["notes"] = [*notes]
+    for row in rows:
         if "error" in row:
             if row["reason"] in explained:
                 del row["detail"]
@@ -127,32 +110,50 @@ def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
     """Returns one row for each window, and what all have together."""
     replies = [as_json(window.answer, bag_dir) for window in answer.windows]
     bodies = [reply for reply in replies if isinstance(reply, dict)]
-    answered = [body for body in bodies if "error" not in body]
-    shared: JsonObject = {
-        key: value
-        for key, value in answered[0].items()
-        if (isinstance(value, str) or key in _HEADERS)
-        and all(body.get(key) == value for body in answered)
-    }
-    occurrences = Counter(note for body in bodies for note in _notes_in(body))
-    common = [note for note, times in occurrences.items() if times > 1]
+    shared, parts, common = _joined(
+        bodies, lambda key, value: isinstance(value, str) or key in HEADERS
+    )
     rows: list[JsonValue] = []
-    for window, body in zip(answer.windows, bodies, strict=True):
+    for window, part in zip(answer.windows, parts, strict=True):
         row: JsonObject = {
             "local": LocalTimes(MIN_NS, MAX_NS).text(window.start, window.stop),
             "start": unix_rounded_up(window.start),
             "end": unix_rounded_up(window.stop),
         }
-        row |= {key: value for key, value in body.items() if key not in {*shared, *_OF_WINDOW}}
-        rows.append(with_notes(row, [note for note in _notes_in(body) if note not in common]))
-    whole = _added_up(answered)
+        rows.append(row | {key: item for key, item in part.items() if key not in _OF_WINDOW})
+    whole = _added_up([body for body in bodies if "error" not in body], is_all=answer.is_all)
     total: JsonObject = {"all": whole} if whole else {}
     return with_notes({**total, **shared, "windows": rows}, [*answer.notes, *common])
 
 
-def _added_up(replies: Sequence[JsonObject]) -> JsonObject:
-    """Returns the sums over replies; `at_least` so many where one of them has no total."""
-    if any("at_least" in reply for reply in replies):
+def _joined(
+    replies: Sequence[JsonObject], may_be_shared: Callable[[str, JsonValue], bool]
+) -> tuple[JsonObject, list[JsonObject], list[str]]:
+    """Returns what all replies with an answer share, the rest of each, and the notes of several."""
+    answered = [reply for reply in replies if "error" not in reply]
+    shared: JsonObject = {
+        key: value
+        for key, value in (answered[0] if answered else {}).items()
+        if may_be_shared(key, value) and all(reply.get(key) == value for reply in answered)
+    }
+    occurrences = Counter(note for reply in replies for note in dict.fromkeys(_notes_in(reply)))
+    common = [note for note, times in occurrences.items() if times > 1]
+    rows = [
+        with_notes(
+            {key: value for key, value in reply.items() if key not in shared and key != "notes"},
+            [note for note in _notes_in(reply) if note not in common],
+        )
+        for reply in replies
+    ]
+    return shared, rows, common
+
+
+def _added_up(replies: Sequence[JsonObject], *, is_all: bool) -> JsonObject:
+    """Returns the sums over replies; `at_least` so many where one of them has no total.
+
+    And where they are not all that was asked for.
+    """
+    if not is_all or any("at_least" in reply for reply in replies):
         replies = [{"at_least": reply.get("total"), **reply, "total": None} for reply in replies]
     sums: JsonObject = {}
     for key in _SUMMED:

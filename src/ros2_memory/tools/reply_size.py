@@ -28,7 +28,11 @@ QUOTED: Final = "quoted"
 EVENLY_THINNED: Final = frozenset({"samples", "rows", "waypoints", "value"})
 """Rows along time: some of every part say more than all of one part. Others lose their end."""
 
-_NEVER_THINNED: Final = frozenset({"notes", "fields", QUOTED})
+HEADERS: Final = ("columns", "fields")
+"""Either names the columns of a table, whose cells are in `rows` and, summed up, in `all`."""
+_TABLES: Final = frozenset({"rows", "windows.rows"})
+_WHOLE: Final = frozenset({"notes", "all", QUOTED, *HEADERS})
+"""What stays as it is; each cell belongs to its column."""
 _FEWEST_ROWS: Final = 2
 _SHORTEST_TEXT: Final = 200
 _ARRAY_STEPS: Final = (50, 25, 12, 6, 3, 2)
@@ -127,9 +131,7 @@ def _outline(reply: JsonObject, max_chars: int) -> JsonObject:
 def _fewer_rows(reply: JsonObject, max_chars: int) -> JsonObject:
     """Thins the longest lists of the reply's first level until it fits or few rows are left."""
     lists = {
-        key: item
-        for key, item in reply.items()
-        if isinstance(item, list) and key not in _NEVER_THINNED
+        key: item for key, item in reply.items() if isinstance(item, list) and key not in _WHOLE
     }
     for key in sorted(lists, key=lambda key: len(to_json_text(lists[key])), reverse=True):
         rows = lists[key]
@@ -218,32 +220,34 @@ class _Shortener:
     _arrays: int
     _text: int
     shortened: dict[tuple[str, str], tuple[int, int]] = field(default_factory=dict)
+    _columns: list[JsonValue] = field(default_factory=list)
 
     def shorten(self, reply: JsonObject) -> JsonObject:
-        """Returns the reply with everything within the limits, except notes and its rows."""
-        columns, rows = reply.get("fields"), reply.get("rows")
-        table: JsonObject = {}
-        if isinstance(columns, list) and isinstance(rows, list):
-            table = {"fields": columns, "rows": [self._cells(row, columns) for row in rows]}
+        """Returns the reply with everything within the limits, except `_WHOLE` and its rows."""
+        headers = (reply.get(name) for name in HEADERS)
+        self._columns = next((header for header in headers if isinstance(header, list)), [])
         return {
-            key: table[key]
-            if key in table
-            else item
-            if key in {"notes", QUOTED}
-            else self._rows(key, item)
+            key: [self._row(row, key) for row in item]
+            if isinstance(item, list) and key not in _WHOLE
+            else self._part(key, item, key)
             for key, item in reply.items()
         }
 
-    def _rows(self, key: str, item: JsonValue) -> JsonValue:
-        if isinstance(item, list):
-            return [self._value(row, key) for row in item]
-        return self._value(item, key)
+    def _part(self, key: str, item: JsonValue, path: str) -> JsonValue:
+        """Returns what an object has under a key; lists that stay whole as they are."""
+        is_first = path in {key, f"windows.{key}"}
+        return (
+            item
+            if is_first and key in _WHOLE and isinstance(item, list)
+            else self._value(item, path)
+        )
 
-    def _cells(self, row: JsonValue, columns: list[JsonValue]) -> JsonValue:
-        """Returns a row of a table, of which no cell is left out: each belongs to its column."""
-        if not isinstance(row, list):
-            return row
-        return [self._value(cell, str(name)) for name, cell in zip(columns, row, strict=False)]
+    def _row(self, row: JsonValue, path: str) -> JsonValue:
+        """Returns an element of a list; of a row of a table no cell is left out."""
+        if isinstance(row, list) and path in _TABLES:
+            named = zip(self._columns, row, strict=False)
+            return [self._value(cell, str(name)) for name, cell in named]
+        return self._value(row, path)
 
     def _value(self, value: JsonValue, path: str) -> JsonValue:
         if isinstance(value, str) and len(value) > self._text:
@@ -252,12 +256,13 @@ class _Shortener:
         if isinstance(value, list):
             indices = evenly(len(value), self._arrays)
             self._count(path, "evenly thinned", len(indices), len(value))
-            return [self._value(value[index], path) for index in indices]
+            return [self._row(value[index], path) for index in indices]
         if isinstance(value, dict):
             kept = list(value.items())[: self._keys]
             self._count(path, "keys left out", len(kept), len(value))
             return {
-                shortened(key, self._text): self._value(item, f"{path}.{key}") for key, item in kept
+                shortened(key, self._text): self._part(key, item, f"{path}.{key}")
+                for key, item in kept
             }
         return value
 

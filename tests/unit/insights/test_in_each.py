@@ -10,9 +10,14 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.insights.at_each import hours_of_days
+from ros2_memory.history.context import Call
+from ros2_memory.history.view import TimeRange
+from ros2_memory.insights.at_each import hours_of_days, in_each
+from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.arguments import _as_hours
+from ros2_memory.tools.reply_json import as_json
 from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.rooms import S, asked_of, draw, write
@@ -22,6 +27,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.history.context import Memory
+    from ros2_memory.results import Sightings
 
 DAYS = 3
 SECONDS = 400
@@ -130,7 +136,44 @@ def test_without_bounds_it_is_all_that_is_recorded(memory: Memory, folder: Path)
 
 def test_hours_in_which_nothing_is_recorded_say_so(memory: Memory, folder: Path) -> None:
     reply = asked(memory, folder, "trajectory_summary", between="12:00-13:00", **SPAN)
-    assert (reply["error"], reply["reason"]) == ("no_data", "outside_range")
+    assert (reply["error"], reply["reason"]) == ("no_data", "gap")
+
+
+def test_what_none_of_the_hours_have_is_said_as_it_is_without_them(
+    memory: Memory, folder: Path
+) -> None:
+    given = {**HELLO, "topic": "/chater", "between": "23:59-00:02"}
+    reply = asked(memory, folder, "find_matches", **given, **SPAN)
+    assert reply["reason"] == "topic_not_recorded"
+    assert "similar: /chatter" in reply["detail"]
+    cups = {"topic": "/cups", "between": "23:59-00:02"}
+    write_mcap(folder.parent / "more" / "rec" / "rec_0.mcap", [odom((BEGIN + 60) * S, 0.0, 0.0)])
+    write_mcap(folder.parent / "more" / "b" / "b_0.mcap", [text((BEGIN + 600) * S, "x", "/cups")])
+    more = memory_of(folder.parent / "more")
+    reply = asked(more, folder.parent / "more", "get_topic_in_range", **cups, **SPAN)
+    assert reply["error"] == "no_data"
+    assert "none between these hours on any day" in reply["detail"]
+    assert "no message of /cups" in reply["detail"]
+
+
+def test_days_that_were_not_asked_in_time_leave_no_total(memory: Memory, folder: Path) -> None:
+    whole = asked(memory, folder, "find_matches", **HELLO, between="23:59-00:02", **SPAN)
+    asked_days: list[TimeRange] = []
+
+    def ask(memory: Memory, span: TimeRange) -> Sightings:
+        asked_days.append(span)
+        if len(asked_days) > 1:
+            raise QueryTimeoutError("out of time")
+        topic, kind, value = HELLO.values()
+        return find_matches(
+            memory, Call(), topic, kind, value, start_s=span.start_s, end_s=span.end_s
+        )
+
+    span = TimeRange(SPAN["start"], SPAN["end"])
+    hours = (datetime.min.time().replace(23, 59), datetime.min.time().replace(0, 2))
+    reply = as_json(in_each(memory, Call(), span, hours, ask), folder)
+    assert isinstance(reply, dict)
+    assert reply["all"] == {"at_least": whole["windows"][0]["total"]}
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import math
 from itertools import pairwise
 from typing import Any
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -103,6 +104,19 @@ def test_long_cells_of_a_table_are_cut_and_stay_in_their_columns() -> None:
     shown = strict(fit_reply(reply, 2500))
     assert [(len(row), row[0], row[3]) for row in shown["rows"]] == [(4, 1.5, 7), (4, 2.5, 8)]
     assert "text (texts cut)" in shown["notes"][0]
+
+
+@pytest.mark.parametrize("cap", [1_000, 3_000, 6_000])
+@pytest.mark.parametrize("in_windows", [False, True])
+def test_counts_keep_every_cell_of_their_columns(cap: int, in_windows: bool) -> None:
+    names: list[Any] = ["day", *(f"{nth:02}" for nth in range(60))]
+    table = {"rows": [[f"2026-11-{day}", *range(60)] for day in range(10, 30)], "all": [*range(60)]}
+    parts: dict[str, Any] = {"windows": [table] * 9} if in_windows else table
+    shown = strict(fit_reply({"columns": names, **parts, "notes": []}, cap))
+    assert len(shown["columns"]) == 61 if "columns" in shown else "does not fit" in str(shown)
+    for each in shown.get("windows", [shown]):
+        assert all(row[1:] == [*range(60)] for row in each.get("rows", ()))
+        assert each.get("all", [*range(60)]) == [*range(60)]
 
 
 def test_lists_that_are_not_along_time_keep_their_beginning() -> None:

@@ -294,7 +294,7 @@ def test_what_is_no_time_is_told() -> None:
     assert "is after the year 2262" in refusal("recap", start=0, end="2300-01-01")
     assert "has 21 times, more than 20" in refusal("get_position_at", timestamps=[1] * 21)
     assert "timestamps was [1, true]" in refusal("get_position_at", timestamps=[1, True])
-    assert "expected a list of Unix seconds" in refusal("get_position_at", timestamps={"a": 1})
+    assert "expected a list (Up to 20 times)" in refusal("get_position_at", timestamps={"a": 1})
 
 
 def test_the_condition_type_must_be_a_known_one() -> None:

@@ -4,13 +4,20 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.reply import POSE_KEYS, JsonObject, Scope, render, rounded
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.reply import (
+    POSE_KEYS,
+    TENTHS_OF_S,
+    JsonObject,
+    Scope,
+    keys,
+    render,
+    rounded,
+)
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import before
 from ros2_memory.insights.recap import found_events, recap
 from ros2_memory.insights.sightings import find_matches
-from ros2_memory.serving.page.span import event_shown
+from ros2_memory.serving.page.span import EVENT, SUMMARY
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -23,6 +30,7 @@ MOST_SEEN: Final = 60
 MOST_SIGHTINGS: Final = 30
 _CHANGES_S: Final = 10.0
 _IN_VIEW: Final = " in view"
+_CHANGE: Final = keys("text", TENTHS_OF_S("before_s", "before"))
 
 
 def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
@@ -47,10 +55,7 @@ def moment_shown(memory: Memory, call: Call, at_s: float) -> JsonObject:
         "frame": None if preceding.robot is None else preceding.robot.frame_id,
         "speed": None if preceding.speed_mps is None else rounded(preceding.speed_mps, 2),
         "state": dict(preceding.state),
-        "changes": [
-            {"text": change.text, "before_s": round(unix_from_ns(change.before), 1)}
-            for change in changes
-        ],
+        "changes": [_CHANGE.render(change, Scope()) for change in changes],
         "seen": _seen(around),
         "notes": [*dict.fromkeys([*preceding.notes, *around.notes])],
     }
@@ -66,14 +71,13 @@ def stretch_shown(memory: Memory, call: Call, start_s: float, end_s: float) -> J
     summary = recap(
         memory, call, TimeRange(start_s, end_s), most_events=MOST_SEEN, with_changes=False
     )
-    others = [event_shown(event) for event in summary.events if event.kind != "thing"]
+    others = [event for event in summary.events if event.kind != "thing"]
     return {
         "start": start_s,
         "end": end_s,
-        "distance_m": None if summary.distance_m is None else rounded(summary.distance_m, 1),
-        "stood_s": None if summary.stood is None else round(unix_from_ns(summary.stood), 1),
+        **SUMMARY.render(summary, Scope()),
         "seen": _seen(summary),
-        "events": [*others],
+        "events": [EVENT.render(event, Scope()) for event in others],
         "notes": [*summary.notes],
     }
 
@@ -84,7 +88,7 @@ def _seen(summary: Recap) -> list[JsonValue]:
     for event in summary.events:
         label = event.text.removesuffix(_IN_VIEW)
         if event.kind == "thing" and label not in rows:
-            rows[label] = {**event_shown(event), "label": label}
+            rows[label] = {**EVENT.render(event, Scope()), "label": label}
     return [*rows.values()]
 
 

@@ -23,7 +23,23 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Place, Polygon
-from ros2_memory.core.reply import JsonObject, degrees, moment, render, rounded
+from ros2_memory.core.reply import (
+    INSIDE,
+    PAIRS,
+    PLAIN,
+    TENTHS_OF_S,
+    JsonObject,
+    Scope,
+    degrees,
+    digits,
+    keys,
+    moment,
+    objects,
+    render,
+    rounded,
+    unit,
+    vector,
+)
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
     NS_PER_MS,
@@ -53,7 +69,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.fill import Progress
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
-    from ros2_memory.results import DataTimeRange, Event, Thing
+    from ros2_memory.results import DataTimeRange
     from ros2_memory.serving.dispatch import QuestionLog
 
 MOST_POINTS: Final = 2_000
@@ -76,6 +92,46 @@ _CELLS_ACROSS: Final = 400
 _MOST_CELLS: Final = 8_000
 _NEWEST_BAGS: Final = 3
 _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
+
+
+def _unix_s(at: Ns) -> float:
+    """Returns Unix seconds to the millisecond: a pixel of the page is more."""
+    return round(unix_from_ns(at), 3)
+
+
+_TIME: Final = unit(_unix_s)
+_XY: Final = vector("xy", 2)
+EVENT: Final = keys(
+    "kind",
+    _TIME("t", "start"),
+    "text",
+    _TIME("end").if_known,
+    PLAIN("goes_on").if_any,
+    _XY.spread("point").if_known,
+    INSIDE("places"),
+)
+SUMMARY: Final = keys(digits(1)("distance_m"), TENTHS_OF_S("stood_s"))
+"""Of a recap: what a stretch of time has, too."""
+_ALL_EVENTS: Final = keys(
+    objects(EVENT)("events"), PLAIN("throughout"), digits(2)("max_speed"), PAIRS("counts")
+)
+_MOMENT: Final = keys(
+    _TIME("start", "moment.request.start"),
+    _TIME("end", "moment.request.end"),
+    PLAIN("label", "moment.request.label"),
+)
+_THING: Final = keys(
+    "label",
+    _XY.spread("place"),
+    PLAIN("frame", "frame_id"),
+    _TIME("first"),
+    _TIME("last"),
+    PLAIN("times", "count"),
+    INSIDE("inside"),
+    PLAIN("moves").if_any,
+    digits(2)("score", "best").if_known,
+    PLAIN("state", "still_there.state").if_known,
+)
 
 
 class Shown(NamedTuple):
@@ -262,11 +318,6 @@ def _version(snapshot: Snapshot, filling: Progress | None, questions: int) -> st
     return "-".join(map(str, counts))
 
 
-def _unix_s(at: Ns) -> float:
-    """Returns Unix seconds to the millisecond: a pixel of the page is more."""
-    return round(unix_from_ns(at), 3)
-
-
 def _start_s(window: TimeWindow) -> float:
     """Returns the begin to the millisecond: asked from there, a span holds all that it did."""
     return (window.start + START_SLACK_NS) // NS_PER_MS / 1000
@@ -444,30 +495,8 @@ def _events(memory: Memory, call: Call, window: TimeWindow) -> Shown:
     summary = recap(
         memory, call, TimeRange.over(window), most_events=MOST_EVENTS, with_changes=False
     )
-    shown: JsonObject = {
-        "events": [event_shown(event) for event in summary.events],
-        "events_since": _start_s(window),
-        "throughout": [*summary.throughout],
-        "distance_m": None if summary.distance_m is None else rounded(summary.distance_m, 1),
-        "max_speed": None if summary.max_speed is None else rounded(summary.max_speed, 2),
-        "stood_s": None if summary.stood is None else round(unix_from_ns(summary.stood), 1),
-        "counts": dict(summary.counts),
-    }
-    return Shown(shown, summary.notes)
-
-
-def event_shown(event: Event) -> JsonObject:
-    """Returns an event as the page takes it."""
-    shown: JsonObject = {"kind": event.kind, "t": _unix_s(event.start), "text": event.text}
-    if event.end is not None:
-        shown["end"] = _unix_s(event.end)
-    if event.goes_on:
-        shown["goes_on"] = True
-    if event.point is not None:
-        shown["x"], shown["y"] = (rounded(coordinate, 2) for coordinate in event.point)
-    if event.places:
-        shown["in"] = event.places[0]
-    return shown
+    shown = {**SUMMARY.render(summary, Scope()), **_ALL_EVENTS.render(summary, Scope())}
+    return Shown({**shown, "events_since": _start_s(window)}, summary.notes)
 
 
 def _moments(memory: Memory, call: Call) -> Shown:
@@ -475,19 +504,7 @@ def _moments(memory: Memory, call: Call) -> Shown:
         stored = list_moments(memory, call).moments
     except EpisodicError as error:
         return Shown({"moments": []}, (str(error),))
-    requests = [saved.moment.request for saved in stored]
-    return Shown(
-        {
-            "moments": [
-                {
-                    "start": _unix_s(request.start),
-                    "end": _unix_s(request.end),
-                    "label": request.label,
-                }
-                for request in requests
-            ]
-        }
-    )
+    return Shown({"moments": [_MOMENT.render(saved, Scope()) for saved in stored]})
 
 
 def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
@@ -502,31 +519,5 @@ def _things(memory: Memory, call: Call, window: TimeWindow) -> Shown:
         )
     except (NoDataError, InvalidArgumentsError) as error:
         return Shown({"things": []}, (str(error),))
-    return Shown(
-        {
-            "things": [_thing_row(thing) for thing in answer.things],
-            "things_total": answer.total,
-        },
-        answer.notes,
-    )
-
-
-def _thing_row(thing: Thing) -> JsonObject:
-    shown: JsonObject = {
-        "label": thing.label,
-        "x": rounded(thing.place[0], 2),
-        "y": rounded(thing.place[1], 2),
-        "frame": thing.frame_id,
-        "first": _unix_s(thing.first),
-        "last": _unix_s(thing.last),
-        "times": thing.count,
-    }
-    if thing.inside:
-        shown["in"] = thing.inside[0]
-    if thing.moves:
-        shown["moves"] = True
-    if thing.best is not None:
-        shown["score"] = rounded(thing.best, 2)
-    if thing.still_there is not None:
-        shown["state"] = thing.still_there.state
-    return shown
+    things: list[JsonValue] = [_THING.render(thing, Scope()) for thing in answer.things]
+    return Shown({"things": things, "things_total": answer.total}, answer.notes)
