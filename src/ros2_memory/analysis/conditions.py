@@ -105,11 +105,6 @@ class Contains:
         return isinstance(meant, int | float) and not isinstance(meant, bool)
 
     @property
-    def is_on_texts(self) -> bool:
-        """Whether no boolean matches."""
-        return self.boolean is None
-
-    @property
     def is_one_word(self) -> bool:
         """Whether it is a row of letters that is found wherever a text has it, and no number."""
         return not self.whole and (self.folded or "").isalpha()
@@ -458,8 +453,7 @@ def _parse_test(condition_type: str, value: JsonValue, tolerance_m: float) -> Te
         raise InvalidArgumentsError(f"the value is NaN, which nothing is equal to; {example}")
     if condition_type == "equals":
         return Equals(value)
-    is_whole = {"contains": False, "contains_word": True}
-    test = Contains(value, whole=is_whole[condition_type])
+    test = Contains(value, whole=condition_type == "contains_word")
     if isinstance(value, str) and not (test.folded or "").strip():
         raise InvalidArgumentsError(f"'{condition_type}' takes a text that is not blank; {example}")
     return test
@@ -621,11 +615,7 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
         return _refusal_for_position(value)
-    return (
-        _refusal_for_summary(condition, targets)
-        or _refusal_for_number(condition, targets)
-        or _refusal_for_kind(condition, targets)
-    )
+    return _refusal_for_summary(condition, targets) or _refusal_for_kind(condition, targets)
 
 
 def _refusal_for_position(value: JsonValue) -> str:
@@ -650,44 +640,31 @@ def _refusal_for_summary(condition: Condition, targets: Sequence[JsonValue]) -> 
     return f"field {field!r} is only summarised, and its numbers are not searched: ask about {keys}"
 
 
-def _refusal_for_number(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
-    """Returns why `contains` finds a number in none of these; None where it may."""
-    test = condition.test
-    if not isinstance(test, Contains) or not test.is_number:
-        return None
-    if condition.field is not None and any(
-        True for target in targets for _ in leaves(target, in_objects=False)
-    ):
-        return None
-    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
-    if str in kinds or not kinds & {int, float}:
-        return None
-    return (
-        "the values hold numbers and no text, and contains finds a number only as the value of a "
-        "field or as an element of its list: name that in field, or ask with equals"
-    )
-
-
 def _refusal_for_kind(condition: Condition, targets: Sequence[JsonValue]) -> str | None:
     """Returns why all of these are of another kind than what is looked for; None where one is."""
-    test = condition.test
+    test, field = condition.test, condition.field
+    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
+    met: set[type] = {str}
+    given = ""
     if isinstance(test, Beyond):
         met, given = {int, float}, f"{'above' if test.above else 'below'} compares numbers"
-    elif isinstance(test, NearPosition) or (isinstance(test, Contains) and not condition.field):
-        return None
-    else:
-        value = test.value if isinstance(test, Equals) else test.needle
-        if _plain_text(test) is not None:
-            met, kind = {str}, "text"
-        elif isinstance(test, Equals) and not isinstance(value, str):
-            met, kind = {bool, int, float}, "boolean" if isinstance(value, bool) else "number"
-        else:
+    elif isinstance(test, Contains) and test.is_number:
+        are_elements = (leaves(target, in_objects=False) for target in targets if field)
+        if str in kinds or not kinds & {int, float} or any(True for _ in chain(*are_elements)):
             return None
-        given = f"{abbreviate(value)} is a {kind}"
-    kinds = {type(leaf) for target in targets for leaf in leaves(target)}
-    if not kinds or kinds & met or any(map(_has_unknown_part, targets)):
+        return (
+            "the values hold numbers and no text, and contains finds a number only as the value "
+            "of a field or as an element of its list: name that in field, or ask with equals"
+        )
+    elif isinstance(test, Equals) and not isinstance(test.value, str):
+        met = {bool, int, float}
+        kind = "boolean" if isinstance(test.value, bool) else "number"
+        given = f"{abbreviate(test.value)} is a {kind}"
+    elif (text := _plain_text(test)) is not None and (field or isinstance(test, Equals)):
+        given = f"{abbreviate(text)} is a text"
+    if not given or not kinds or kinds & met or any(map(_has_unknown_part, targets)):
         return None
-    where = "the values" if condition.field is None else f"the values of field {condition.field!r}"
+    where = "the values" if field is None else f"the values of field {field!r}"
     name, wanted = ("texts", "a text") if str in kinds else ("numbers", "a number")
     if kinds == {bool}:
         name, wanted = "booleans", "true or false"

@@ -15,12 +15,13 @@ What counts as once:
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, Literal
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_errors, has_events
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
-from ros2_memory.analysis.topic_events import Change, KnownState, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import listed
@@ -38,7 +39,7 @@ from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Sequence
 
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
@@ -278,30 +279,28 @@ def _flag_held(
     """
     start, end = binned.counted.asked()
     events = joined_events([part.without_sights() for part in parts])
-    spans: list[tuple[Ns, Ns, bool]]
-    if events is None:
-        spans = [(start, end, False)] if before else []
-    else:
+    states = [] if before is None else [(start, before)]
+    if events is not None:
         flags, toggles = events.of_kind(FLAG)
         meant = [flag for flag in flags if condition.field in {None, flag.name}]
         if len(meant) != 1:
             return None
-        last = held_until(binned.view, topic, events.last, max(events.last, end))
-        spans = [*_spans_of_flag(meant[0], toggles, last, wanted=wanted)]
-        if before is not None:
-            spans = _with_time_before(spans, meant[0], start, before=before, wanted=wanted)
+        [flag] = meant
+        states.append((flag.at, bool(flag.first) is wanted))
+        states += [
+            (toggle.time, bool(toggle.value) is wanted)
+            for toggle in toggles
+            if toggle.name == flag.name
+        ]
+        end = held_until(binned.view, topic, events.last, max(events.last, end))
+    changed = [next(same) for _, same in groupby(states, lambda state: state[1])]
     gaps = _gaps_for_topic(binned, topic)
-    return [part for span in sorted(spans) for part in _without_gaps(*span, gaps)]
-
-
-def _with_time_before(
-    spans: list[tuple[Ns, Ns, bool]], flag: KnownState, start: Ns, *, before: bool, wanted: bool
-) -> list[tuple[Ns, Ns, bool]]:
-    """Returns when a boolean held from the begin of a window on, at which `before` is known."""
-    if flag.first != wanted:
-        return [(start, flag.at, False), *spans] if before else spans
-    [(since, stop, _), *later] = spans
-    return [(start, stop, False) if before else (since, stop, True), *later]
+    return [
+        part
+        for nth, ((since, held), (stop, _)) in enumerate(pairwise([*changed, (end, False)]))
+        if held
+        for part in _without_gaps(since, stop, nth > 0, gaps)
+    ]
 
 
 def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool | None:
@@ -312,20 +311,6 @@ def _met_before(binned: BinnedWindow, topic: str, condition: Condition) -> bool 
     held = held_at(binned.view, topic, binned.counted.asked()[0])
     value = None if held is None else binned.view.value(held)
     return None if value is None else condition.matches(value)
-
-
-def _spans_of_flag(
-    flag: KnownState, toggles: Sequence[Change], last: Ns, *, wanted: bool
-) -> Iterator[tuple[Ns, Ns, bool]]:
-    """Yields when a boolean had a value, and whether it is known that it toggled to it then."""
-    since, is_begun, value = flag.at, False, bool(flag.first)
-    for toggle in toggles:
-        if toggle.name == flag.name:
-            if value is wanted:
-                yield since, toggle.time, is_begun
-            since, is_begun, value = toggle.time, True, bool(toggle.value)
-    if value is wanted:
-        yield since, last, is_begun
 
 
 def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:

@@ -146,10 +146,7 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
-    named = [
-        f"{', '.join(topic_frames)} ({topic})" for topic, topic_frames in frames if topic_frames
-    ]
+    named = [f"{', '.join(frames)} ({topic})" for topic, frames in _frames(view, topics)]
     if not named:
         return ()
     within = f"within {condition.test.tolerance_m:g} m"
@@ -166,9 +163,9 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
-    frames = {frame for topic in topics[:_MOST_FRAMES] for frame in _frames_of_newest(view, topic)}
+    others = {frame for _, frames in _frames(view, topics) for frame in frames} - {target}
     try:
-        return any(frame != target and connects(view, (target, frame)) for frame in sorted(frames))
+        return any(connects(view, (target, frame)) for frame in sorted(others))
     except QueryTimeoutError:
         return True
 
@@ -181,13 +178,18 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     """
     test = condition.test
     asked = test.frame_id if isinstance(test, NearPosition) else None
-    for topic in topics[:_MOST_FRAMES] if asked else ():
-        frames = _frames_of_newest(view, topic)
-        if frames and (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
+    for topic, frames in _frames(view, topics) if asked else ():
+        if (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
                 f"the frame of each message, which is {', '.join(frames)} on {topic}; {_ELSEWHERE}"
             )
+
+
+def _frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Returns the first topics that have positions, and the frames of these."""
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    return [(topic, of_topic) for topic, of_topic in frames if of_topic]
 
 
 def _frames_of_newest(view: View, topic: str) -> list[str]:

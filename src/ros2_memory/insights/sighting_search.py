@@ -360,18 +360,17 @@ def find_runs(
                 runs_by_topic[block.topic].add(counted)
                 reached = block.first if len(runs_by_topic) == 1 else block.last
                 if enough is not None and _has_enough(runs_by_topic, enough, reached):
-                    runs = _newest_first(runs_by_topic)
-                    search.note_untested(replace(scope.window, start=runs[enough - 1].first))
-                    return SearchedRuns(runs, reached)
+                    break
+            else:
+                continue
+            break
     except QueryTimeoutError:
         runs = [run for topic_runs in runs_by_topic.values() for run in topic_runs.cut()]
         if not runs:
             raise
         parts = [*_parts_in(view, runs, scope, latched)]
         return SearchedRuns(sorted(parts, key=_by_last), reached, is_over=True)
-    runs = _newest_first(runs_by_topic)
-    if latched:
-        runs = sorted(_parts_in(view, runs, scope, latched), key=_by_last)
+    runs = sorted(_parts_in(view, _newest_first(runs_by_topic), scope, latched), key=_by_last)
     if enough is not None and len(runs) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_untested(replace(scope.window, start=runs[enough - 1].first))
