@@ -149,9 +149,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     trees: dict[str, Mapping[str, str]] = {}
     for path, bags in _recordings_to_compare(view):
         try:
-            parents = (
-                parents_by_path[path] if path in parents_by_path else _static_parents(view, bags)
-            )
+            parents = parents_by_path.get(path) or _static_parents(view, bags)
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
@@ -410,15 +408,14 @@ def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spa
 
 
 def note_robots_near(view: View, stored: StoredMessage) -> None:
-    """Notes recordings with messages of their own around the time of a message.
+    """Notes recordings with messages of their own around the time of a message; see `note_robots`.
 
-    A single recording is of one robot; see `note_robots`.
+    Or that one has this time twice.
     """
-    topic = stored.topic
-    if len(view.timeline.recordings(topic)) > 1:
-        near = TimeWindow.around(stored.time, _NEAR_NS)
-        if any(_overlapping_pairs(view, topic, near)):
-            note_robots(view, topic, TimeWindow.around(stored.time, _SLOW_NS))
+    topic, at = stored.topic, stored.time
+    pairs = _overlapping_pairs(view, topic, TimeWindow.around(at, _NEAR_NS))
+    if any(chain(pairs, _times_recorded_twice(view, TimeWindow(at, at + 1)))):
+        note_robots(view, topic, TimeWindow.around(at, _SLOW_NS))
 
 
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:

@@ -483,8 +483,10 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
 def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     of_body = [edge for (_, child), edge in edges.items() if child == body.child]
-    times = np.concatenate([edge.log_times for edge in of_body] or [np.zeros(0, np.int64)])
-    stamps = np.concatenate([edge.stamps for edge in of_body] or [np.zeros(0, np.int64)])
+    if not of_body:
+        return NOWHERE
+    times = np.concatenate([edge.log_times for edge in of_body])
+    stamps = np.concatenate([edge.stamps for edge in of_body])
     order = np.argsort(times, kind="stable")
     order = order[_positions_in(times[order], span)]
     in_target = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])

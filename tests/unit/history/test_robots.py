@@ -228,6 +228,9 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
         whole = asked(known, tmp_path, "trajectory_summary", start=begin, end=begin + 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])
+        for at, is_twice in ((50, True), (150, False)):
+            there = asked(known, tmp_path, "get_position_at", timestamp=begin + at)
+            assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
         assert len(whole["waypoints"]) == 4
 
 
