@@ -8,7 +8,6 @@ parent here and another one there.
 from __future__ import annotations
 
 from collections import defaultdict
-from functools import partial
 from itertools import chain, combinations, islice, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -20,7 +19,7 @@ from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, Q
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
-from ros2_memory.core.text import listed
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
@@ -150,9 +149,7 @@ def contradicting_frames(memory: Memory, call: Call) -> tuple[Contradiction, ...
     trees: dict[str, Mapping[str, str]] = {}
     for path, bags in _recordings_to_compare(view):
         try:
-            parents = (
-                parents_by_path[path] if path in parents_by_path else _static_parents(view, bags)
-            )
+            parents = parents_by_path.get(path) or _static_parents(view, bags)
         except QueryTimeoutError:
             break
         if not any(bag.state is BagState.ACTIVE for bag in bags):
@@ -281,6 +278,11 @@ class ParallelRecordings(NamedTuple):
     bags: frozenset[str] = frozenset()
     """Of the other one, the files of which messages are beside those of the first; none: all."""
 
+    @property
+    def is_twice(self) -> bool:
+        """Whether it is one recording, which has a time twice."""
+        return self.first == self.other
+
     def described(self, topic: str) -> str:
         """Returns what a clock made, as a sentence without a full stop."""
         span = f"from {unix_text(self.span.start)} to {unix_text(self.span.stop - 1)}"
@@ -303,20 +305,19 @@ def require_one_robot(view: View, topic: str, window: TimeWindow) -> None:
     Raises:
         NoDataError: recordings hold messages of their own on the topic at the same time.
     """
-    beside = parallel_recordings(view, topic, window)
-    names = _recording_names([pair for pair in beside if not pair.by_clock])
+    beside = parallel_or_twice(view, topic, window)
     # Transforms are of all recordings at once, so a path by them is not that of one there.
-    if topic in view.limits.tf_topics:
-        names = _recording_names(beside)
+    by_transforms = topic in view.limits.tf_topics
+    names = _recording_names([pair for pair in beside if by_transforms or not pair.by_clock])
     if names:
         raise NoDataError(
             NoDataReason.MIXED,
-            f"{len(names)} recordings have different messages on {topic} at the same time, as "
-            f"from several robots: {listed(names)}; one path over them would be wrong: ask about "
-            "a time with one of them, or set data.recording to one",
+            f"{counted(len(names), 'recording has', 'recordings have')} different messages on "
+            f"{topic} at the same time, as from several robots: {listed(names)}; one path over "
+            "them would be wrong: ask about a time with one of them, or set data.recording to one",
         )
-    for pair in [*beside, *_times_recorded_twice(view, window)]:
-        before = "files from before" if pair.first == pair.other else pair.first.name
+    for pair in beside:
+        before = "files from before" if pair.is_twice else pair.first.name
         view.notes.add(f"{pair.described(topic)}: the path there is that of {before}")
 
 
@@ -326,18 +327,17 @@ def note_robots(view: View, topic: str, window: TimeWindow) -> Spans:
     And the times that one holds twice. Returns these times, without those that two recordings share
     by a clock which was set back.
     """
-    beside = parallel_recordings(view, topic, window)
+    beside = parallel_or_twice(view, topic, window)
     names = _recording_names([pair for pair in beside if not pair.by_clock])
     if names:
         view.notes.add(
             f"{len(names)} recordings have different messages on {topic} at the same time, as "
             f"from several robots, and the answer does not separate them: {listed(names)}"
         )
-    recordings = view.timeline.recordings(topic)
-    twice = [pair for pair in _times_recorded_twice(view, window) if pair.first in recordings]
-    for pair in [*(pair for pair in beside if pair.by_clock), *twice]:
-        view.notes.add(f"{pair.described(topic)}: the answer does not separate the two")
-    spans = [*(pair.span for pair in beside if not pair.by_clock), *(pair.span for pair in twice)]
+    for pair in beside:
+        if pair.by_clock:
+            view.notes.add(f"{pair.described(topic)}: the answer does not separate the two")
+    spans = [pair.span for pair in beside if pair.is_twice or not pair.by_clock]
     return united((span.start, span.stop) for span in spans)
 
 
@@ -347,7 +347,9 @@ def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:
 
 def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
     """Returns all that would make a path by a topic go to and fro between two times of a robot."""
-    return [*parallel_recordings(view, topic, window), *_times_recorded_twice(view, window)]
+    holding = view.timeline.recordings(topic)
+    twice = (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
+    return [*parallel_recordings(view, topic, window), *twice]
 
 
 def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
@@ -406,22 +408,20 @@ def note_robots_on(view: View, topics: Sequence[str], window: TimeWindow) -> Spa
 
 
 def note_robots_near(view: View, stored: StoredMessage) -> None:
-    """Notes recordings with messages of their own around the time of a message.
+    """Notes recordings with messages of their own around the time of a message; see `note_robots`.
 
-    A single recording is of one robot; see `note_robots`.
+    Or that one has this time twice.
     """
-    topic = stored.topic
-    if len(view.timeline.recordings(topic)) > 1:
-        near = TimeWindow.around(stored.time, _NEAR_NS)
-        if any(_overlapping_pairs(view, topic, near)):
-            note_robots(view, topic, TimeWindow.around(stored.time, _SLOW_NS))
+    topic, at = stored.topic, stored.time
+    pairs = _overlapping_pairs(view, topic, TimeWindow.around(at, _NEAR_NS))
+    if any(chain(pairs, _times_recorded_twice(view, TimeWindow(at, at + 1)))):
+        note_robots(view, topic, TimeWindow.around(at, _SLOW_NS))
 
 
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
     steps = _steps_back(view)
-    made_here = partial(view.memo.of, _MADE, partial(_made_in, view.bag_dir))
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
@@ -434,7 +434,8 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
-                by_clock = is_edge or is_step or made_here().issuperset((other, path))
+                own = view.memo.of(_MADE, lambda: _made_in(view.bag_dir))
+                by_clock = is_edge or is_step or own.issuperset((other, path))
                 yield ParallelRecordings(other, path, span, by_clock)
         open_spans.append((first, last, path))
 

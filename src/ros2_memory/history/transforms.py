@@ -638,10 +638,6 @@ def _messages_in(view: View, rows: Rows, session: Session) -> Iterator[StoredMes
     return (stored for stored in messages_of(view, rows) if has(session, stored))
 
 
-def _edges_by_columns(rows: Rows) -> Edges | None:
-    return edges_in(rows.table, rows.times, rows.index)
-
-
 def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
     """Returns the transforms of a session in some rows, by their columns, else by their messages.
 
@@ -653,7 +649,7 @@ def edges_of_rows(view: View, rows: Rows, session: Session) -> Edges:
         return {}
     if sessions.holds_carried(rows.recording):
         return edges_of(decoded_transforms(view, _messages_in(view, rows, session)))
-    tables = of_columns(view, rows, _edges_by_columns)
+    tables = of_columns(view, rows, lambda part: edges_in(part.table, part.times, part.index))
     if tables is not None and len(tables) == 1:
         return tables[0]
     if tables is not None:

@@ -77,7 +77,5 @@ def _fixes(view: View, messages: Iterable[StoredMessage]) -> Iterator[tuple[Ns, 
     for stored in messages:
         message = view.bags.decode(stored)
         fix = None if message is None else extractor.geodetic(message, stored.type)
-        if fix is None or not fix.has_fix:
-            continue
-        if math.isfinite(fix.latitude) and math.isfinite(fix.longitude):
+        if fix is not None and fix.has_fix and math.isfinite(fix.latitude + fix.longitude):
             yield stored.time, fix

@@ -451,15 +451,11 @@ NOWHERE: Final = Placed(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zero
 
 def _in_time_order(parts: Sequence[Placed]) -> Placed:
     """Returns the poses of several tables, in order of time."""
-    times = np.concatenate([part.times for part in parts])
+    columns = zip(*(part[:4] for part in parts), strict=True)
+    times, x, y, heading = map(np.concatenate, columns)
     order = np.argsort(times, kind="stable")
-    return Placed(
-        times[order],
-        np.concatenate([part.x for part in parts])[order],
-        np.concatenate([part.y for part in parts])[order],
-        np.concatenate([part.heading for part in parts])[order],
-        sum(part.left_out for part in parts),
-    )
+    left_out = sum(part.left_out for part in parts)
+    return Placed(times[order], x[order], y[order], heading[order], left_out)
 
 
 def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
@@ -487,10 +483,12 @@ def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed
 def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) -> Placed:
     """Returns the robot's body in the target of frames, whenever its transform was received."""
     of_body = [edge for (_, child), edge in edges.items() if child == body.child]
-    times = np.concatenate([edge.log_times for edge in of_body] or [np.zeros(0, np.int64)])
-    stamps = np.concatenate([edge.stamps for edge in of_body] or [np.zeros(0, np.int64)])
+    if not of_body:
+        return NOWHERE
+    times = np.concatenate([edge.log_times for edge in of_body])
+    stamps = np.concatenate([edge.stamps for edge in of_body])
     order = np.argsort(times, kind="stable")
-    order = order[(times[order] >= span.start) & (times[order] < span.stop)]
+    order = order[_positions_in(times[order], span)]
     in_target = frames.poses(body.child, (stamps if frames.clock == "stamp" else times)[order])
     if in_target is None:
         return NOWHERE

@@ -86,8 +86,7 @@ def visits(
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
-    named_frame = None if place is None else place.frame_id
-    asked_frame = frame_id if named_frame is None else named_frame
+    asked_frame = (place and place.frame_id) or frame_id
     placement = map_placement(view, topic, asked_frame)
     now = memory.now(wall, view.snapshot.latest, call)
     if place is None:

@@ -228,6 +228,9 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
         whole = asked(known, tmp_path, "trajectory_summary", start=begin, end=begin + 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])
+        for at, is_twice in ((50, True), (150, False)):
+            there = asked(known, tmp_path, "get_position_at", timestamp=begin + at)
+            assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
         assert len(whole["waypoints"]) == 4
 
 
@@ -311,3 +314,17 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         visits = asked(memory, tmp_path, "visits", x=35.0, y=0.0, radius_m=1.0)
         assert visits["unknown_s"] == pytest.approx(30, abs=2.1)
         assert any("run has the time from" in note for note in visits["notes"])
+
+
+def test_a_path_by_transforms_over_a_clock_that_was_set_back_is_not_known(tmp_path: Path) -> None:
+    for number in range(4):
+        moves = []
+        for second in range(20 * number, 20 * number + 20):
+            at = T0 + (second - 30 * (number > 1)) * NS_PER_S
+            moves.append(tf(at, transform(at, "odom", "base_link", (second / 5, 0.0, 0.0))))
+        write_mcap(tmp_path / "run" / f"run_{number}.mcap", moves)
+    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    refused = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 60)
+    assert (refused["reason"], refused["detail"][:11]) == ("mixed", "1 recording")
+    after = asked(memory, tmp_path, "trajectory_summary", start=begin + 41, end=begin + 60)
+    assert after["distance_m"] == pytest.approx(1.6, abs=0.1)

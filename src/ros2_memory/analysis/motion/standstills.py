@@ -238,9 +238,9 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
     links = slots.links()
     if not links.any():
         return NO_BLOCKS
-    is_first = np.r_[links, False] & ~np.r_[False, links]
-    is_last = np.r_[False, links] & ~np.r_[links, False]
-    firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(is_last)
+    before, after = np.r_[False, links], np.r_[links, False]
+    is_first = after & ~before
+    firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(before & ~after)
     before, after = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
     is_long = slots.lasts[after] - slots.firsts[before] >= SHORTEST_NS
     is_inner = np.zeros(len(slots), np.bool_)
