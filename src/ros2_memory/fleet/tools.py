@@ -194,8 +194,7 @@ class _FleetQuestion:
         names = named.split(",") if isinstance(named, str) else [named]
         robots = self.fleet.allowed(call)
         if named is not None:
-            found = (self.fleet.named(name, call) for name in names)
-            robots = [*dict.fromkeys(found)]
+            robots = [*dict.fromkeys([self.fleet.named(name, call) for name in names])]
         tool, given = self.tool.name, self.given
         is_table = tool in TABLE_FOR_ALL and given.get("by") is not None
         is_of_all = (tool in ANSWER_FOR_ALL or is_table) and given.get("between") is None

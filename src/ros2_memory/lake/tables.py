@@ -208,9 +208,9 @@ def _is(kind: type[ex.BooleanExpression], column: str, value: object) -> ex.Bool
     return cast("Callable[[str, object], ex.BooleanExpression]", kind)(column, value)
 
 
-def of_days(days: Iterable[tuple[str, date]]) -> ex.BooleanExpression:
-    """Returns the condition on rows of some days, each of a robot."""
-    return _any_of(map(_of_day, days))
+def of_robots(robots: Collection[str], day: date) -> ex.BooleanExpression:
+    """Returns the condition on rows of one day of some robots."""
+    return ex.And(_is(ex.In, "robot", robots), _is(ex.EqualTo, "day", day.isoformat()))
 
 
 def of_ids(robot: str, ids: Collection[str]) -> ex.BooleanExpression:
@@ -231,16 +231,12 @@ def of_bags(bags: Iterable[tuple[str, date, str]]) -> ex.BooleanExpression:
     ids: dict[tuple[str, date], set[str]] = {}
     for robot, day, bag_id in bags:
         ids.setdefault((robot, day), set()).add(bag_id)
-    return _any_of(ex.And(_of_day(day), of_ids(day[0], bag_ids)) for day, bag_ids in ids.items())
-
-
-def _of_day(day: tuple[str, date]) -> ex.BooleanExpression:
-    return ex.And(_is(ex.EqualTo, "robot", day[0]), _is(ex.EqualTo, "day", day[1].isoformat()))
-
-
-def _any_of(conditions: Iterable[ex.BooleanExpression]) -> ex.BooleanExpression:
+    days = [
+        ex.And(of_robots([robot], day), of_ids(robot, bag_ids))
+        for (robot, day), bag_ids in ids.items()
+    ]
     # At once: one after the other they are nested, and years of days deeper than Python allows.
-    return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *conditions)
+    return ex.Or(ex.AlwaysFalse(), ex.AlwaysFalse(), *days)
 
 
 def overlapping(

@@ -27,7 +27,7 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.files import Partitions
 from ros2_memory.lake.rows import bag_id_of
-from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_days, of_ids, overlapping
+from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
@@ -49,47 +49,54 @@ FEW_FILES: Final = 3
 """A day of a robot with more files in a table is put together."""
 _MOST_BYTES: Final = 128 << 20
 """Of files that are put together at once: their rows are in memory meanwhile."""
-_MOST_DAYS: Final = 200
-"""In one condition, which is compared with each file."""
+_MOST_ROBOTS: Final = 200
+"""In one condition: with more names Iceberg rules no file out by them."""
 
 
 def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: None) -> int:
     """Puts each closed day of each robot into one file; returns how many were.
 
     A day is closed a day after its end. The rows stay the same. One transaction replaces the files
-    of many days, since each writes the table's list of versions again.
+    of many robots, since each writes the table's list of versions again.
+
+    Each day is a condition of its own: a list of days is compared with every file.
 
     Raises:
         LakeError: the lake cannot be read or written.
     """
+    closed = day_of(now - _DAY_NS)
     done = 0
     for name, table in TABLES.items():
-        for days in _to_compact(lake.current(name), closed=day_of(now - _DAY_NS)):
+        for day, robots in _to_compact(lake.current(name), closed):
             alive()
-            condition = of_days(days)
+            condition = of_robots(robots, day)
             lake.replace(name, condition, table.sorted(lake.rows(name, condition)))
-            done += len(days)
+            done += len(robots)
     if done:
         log.info("days_compacted", days=done)
     return done
 
 
-def _to_compact(table: IcebergTable, closed: date) -> Iterator[list[tuple[str, date]]]:
-    """Yields what to put together of the days before `closed`: some days, each of a robot."""
-    together: list[tuple[str, date]] = []
-    total = 0
-    for robot, days in Partitions().look(table).items():
-        for day, files in days.items():
-            size = sum(file.size for file in files)
-            if day >= closed or len(files) <= FEW_FILES or size > _MOST_BYTES:
-                continue
-            if total + size > _MOST_BYTES or len(together) == _MOST_DAYS:
-                yield together
-                together, total = [], 0
-            together.append((robot, day))
-            total += size
-    if together:
-        yield together
+def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[str]]]:
+    """Yields what to put together of the days before `closed`: a day, and some of its robots."""
+    sizes = sorted(
+        (day, robot, sum(file.size for file in files))
+        for robot, days in Partitions().look(table).items()
+        for day, files in days.items()
+        if day < closed and len(files) > FEW_FILES
+    )
+    robots: list[str] = []
+    of_day, total = closed, 0
+    for day, robot, size in sizes:
+        is_full = total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS
+        if robots and (day != of_day or is_full):
+            yield of_day, robots
+            robots, total = [], 0
+        if size <= _MOST_BYTES:
+            robots.append(robot)
+            of_day, total = day, total + size
+    if robots:
+        yield of_day, robots
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
@@ -125,8 +132,8 @@ def expire(lake: LakeTables, until: Ns) -> int:
 
 def _drop_versions(table: IcebergTable, until: Ns) -> None:
     """Drops the versions of up to a time, but those that a branch or a tag names."""
-    versions = table.metadata.snapshots
-    old = {each.snapshot_id for each in versions if each.timestamp_ms * NS_PER_MS <= until}
+    times = {version.snapshot_id: version.timestamp_ms for version in table.metadata.snapshots}
+    old = {version for version, time_ms in times.items() if time_ms * NS_PER_MS <= until}
     old -= {ref.snapshot_id for ref in table.metadata.refs.values()}
     if old:
         table.maintenance.expire_snapshots().by_ids([*old]).commit()

@@ -293,8 +293,8 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) > 0
         files = Counter(task.file.partition[0] for task in messages.refresh().scan().plan_files())
         assert files == dict.fromkeys(robots, 1)
-        # What was deleted, and what was written instead.
-        assert len(messages.snapshots()) == versions + 2
+        # Of each day what was deleted, and what was written instead.
+        assert len(messages.snapshots()) == versions + 4
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values
