@@ -37,7 +37,7 @@ class Message(NamedTuple):
 
 def no_sights() -> Sights:
     """Returns the sights where no detector published."""
-    return Sights((), (), tuple(np.zeros((0, len(columns)), np.int64) for columns in TABLES))
+    return Sights((), (), *(np.zeros((0, len(columns)), np.int64) for columns in TABLES))
 
 
 def sights_of_messages(messages: Sequence[Message]) -> Sights:

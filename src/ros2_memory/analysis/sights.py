@@ -13,9 +13,10 @@ a thing was missed before or after it was last seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from itertools import combinations, groupby
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -159,6 +160,8 @@ AHEAD_MM: Final = 2_000
 """Things are about so far away: so much do errors of heading weigh."""
 TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
+_NAMES: Final = ("spots", "looks", "hits", "scores", "beside", "unplaced", "fixes")
+_ONLY_ESTIMATED: Final = ("looks", "hits", "beside", "fixes")
 
 
 class DetectorMessages(NamedTuple):
@@ -190,62 +193,39 @@ class Sights:
 
     From `sights_of` it is the slice of the clock; `columns.sights.joined` numbers those of all from
     0 to `slices`.
+
+    Attributes:
+        spots: where labels were seen (`Spot`).
+        looks: from where detectors published (`Look`).
+        hits: how often a spot was seen in a look (`Hit`).
+        scores: of spots (`Score`).
+        beside: which other labels were beside a spot in the same message (`Beside`).
+        unplaced: detections without a place (`Unplaced`).
+        fixes: where odometry was in the map (`Fix`).
     """
 
     topics: tuple[str, ...]
     labels: tuple[str, ...]
-    tables: tuple[Ints, ...]
-    slices: int = 0
-
-    def only(self, *kinds: type[IntEnum]) -> Sights:
-        """Returns these sights with the rows of some tables alone."""
-        tables = tuple(
-            table if kind in kinds else table[:0].copy()
-            for kind, table in zip(TABLES, self.tables, strict=True)
-        )
-        return replace(self, tables=tables)
-
-    def with_scores_from(self, lowest: int) -> Sights:
-        """Returns these sights without the scores in lower bins."""
-        at = TABLES.index(Score)
-        scores = self.tables[at]
-        kept = scores[scores[:, Score.BIN] >= lowest]
-        return replace(self, tables=(*self.tables[:at], kept, *self.tables[at + 1 :]))
+    spots: Ints
+    looks: Ints
+    hits: Ints
+    scores: Ints
+    beside: Ints
+    unplaced: Ints
+    fixes: Ints
+    slices: int = field(default=0, kw_only=True)
 
     @property
-    def spots(self) -> Ints:
-        """Where labels were seen (`Spot`)."""
-        return self.tables[0]
+    def tables(self) -> tuple[Ints, ...]:
+        """All of them, as `TABLES` has their columns."""
+        tables: tuple[Ints, ...] = attrgetter(*_NAMES)(self)
+        return tables
 
-    @property
-    def looks(self) -> Ints:
-        """From where detectors published (`Look`)."""
-        return self.tables[1]
-
-    @property
-    def hits(self) -> Ints:
-        """How often a spot was seen in a look (`Hit`)."""
-        return self.tables[2]
-
-    @property
-    def scores(self) -> Ints:
-        """The scores of spots (`Score`)."""
-        return self.tables[3]
-
-    @property
-    def beside(self) -> Ints:
-        """Which other labels were beside a spot in the same message (`Beside`)."""
-        return self.tables[4]
-
-    @property
-    def unplaced(self) -> Ints:
-        """Detections without a place (`Unplaced`)."""
-        return self.tables[5]
-
-    @property
-    def fixes(self) -> Ints:
-        """Where odometry was in the map (`Fix`)."""
-        return self.tables[6]
+    def seen(self, lowest: int) -> Sights:
+        """Returns what answers show of these sights: of scores no lower bins."""
+        scores = self.scores[self.scores[:, Score.BIN] >= lowest]
+        none = {name: getattr(self, name)[:0].copy() for name in _ONLY_ESTIMATED}
+        return replace(self, scores=scores, **none)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -287,7 +267,7 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
         _unplaced(lost, seen.times),
         np.zeros((0, len(Fix)), np.int64),
     )
-    return Sights((topic,), labels, tables)
+    return Sights((topic,), labels, *tables)
 
 
 def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
@@ -302,7 +282,7 @@ def fixes_of(times: Ints, poses: Floats, sigma_m: Floats) -> Sights:
     x, y, yaw = poses.T
     columns = (times // SLICE_NS, _rounded(times), _mm(x), _mm(y), _decideg(yaw), said)
     none = (np.zeros((0, len(kind)), np.int64) for kind in TABLES[:-1])
-    return Sights((), (), (*none, np.stack(columns, axis=1)))
+    return Sights((), (), *(*none, np.stack(columns, axis=1)))
 
 
 def _looks(seen: DetectorMessages, slices: Ints) -> tuple[Ints, Ints]:

@@ -112,7 +112,7 @@ def joined(
         unplaced[_order(unplaced[:, 0], unplaced[:, 1], unplaced[:, 2])],
         _distinct_fixes(fixes, session[unpacked.part[_FIXES]]),
     )
-    return Sights(topics, labels, tables, len(slices)), slices[:, 1]
+    return Sights(topics, labels, *tables, slices=len(slices)), slices[:, 1]
 
 
 def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:

@@ -321,7 +321,7 @@ def estimate(
         instance.labels = named(spellings(sights, observed.counts, rows), labels, names)
     instances.sort(key=lambda thing: (thing.label, thing.stays[0].first, thing.stays[0].x))
     result = Estimate(
-        sights=sights.only(Spot, Score, Unplaced).with_scores_from(_lowest_bin(min_score)),
+        sights=sights.seen(_lowest_bin(min_score)),
         instances=instances,
         movers=movers,
         counts=observed.counts,

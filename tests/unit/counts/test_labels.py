@@ -159,7 +159,8 @@ def test_json_objects_with_a_list_of_detections_in_texts_are_counted(tmp_path: P
     [
         ('[{"label": "cup"}]', 1),
         ('{"seen": [{"label": "cup"}]}', 1),
-        ('{"seen": [{"in": {"label": "cup"}}]}', 0),
+        ('{"seen": [{"in": {"label": "cup"}}]}', 1),
+        ('{"seen": [{"in": {"in": {"in": {"label": "cup"}}}}]}', 0),
         ("a cup", 0),
     ],
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -120,6 +122,6 @@ def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidenc
 
 
 def _sights(looks: list[tuple[int, ...]], bags: int) -> Sights:
-    tables = list(no_sights().tables)
-    tables[1] = np.array(looks, np.int64).reshape(-1, len(Look))
-    return Sights(("/detections",), ("cup",), tuple(tables), bags)
+    none = no_sights()
+    rows = np.array(looks, np.int64).reshape(-1, len(Look))
+    return replace(none, topics=("/detections",), labels=("cup",), looks=rows, slices=bags)
