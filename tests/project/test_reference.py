@@ -112,7 +112,7 @@ def outer_keys(text: str) -> list[str]:
 
 @pytest.mark.parametrize("name", sorted(REPLIES))
 def test_the_keys_that_a_reply_is_said_to_have_are_declared(name: str) -> None:
-    declared = SPREAD | {key.name for key in cast("type[Declared]", REPLIES[name]).reply.all}
+    declared = SPREAD | {key.name for key in cast("type[Declared]", REPLIES[name]).reply.keys}
     [description] = [tool.description for tool in TOOLS if tool.name == name]
     said = outer_keys(description.partition("Reply: ")[2])
     assert said

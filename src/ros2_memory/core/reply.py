@@ -183,7 +183,7 @@ def _getter(source: Source) -> Callable[[object], object]:
     return get
 
 
-def _always(_value: object, _owner: object) -> bool:
+def _always(_: object) -> bool:
     return True
 
 
@@ -195,7 +195,8 @@ class Key:
         name: in JSON.
         unit: of its values.
         get: the value, from the result.
-        is_shown: whether there is such a key, of its value and the result.
+        applies: whether the result may have such a key.
+        is_shown: whether there is one, of its value.
         most: of a list so many are shown: the first, or the last of them if that is negative. Of
             more, a key tells the number (`<name>_<counted>`), and of the last a note.
         merging: how the key of several robots becomes one.
@@ -206,7 +207,8 @@ class Key:
     name: str
     unit: Unit
     get: Callable[[object], object]
-    is_shown: Callable[[object, object], bool] = _always
+    applies: Callable[[object], bool] = _always
+    is_shown: Callable[[object], bool] = _always
     most: int = 0
     counted: str = "count"
     merging: Merging = ""
@@ -216,17 +218,22 @@ class Key:
     @property
     def if_known(self) -> Key:
         """The key, left out where its value is None."""
-        return replace(self, is_shown=lambda value, _: value is not None)
+        return replace(self, is_shown=lambda value: value is not None)
 
     @property
     def if_any(self) -> Key:
         """The key, left out where its value is None, empty, zero or false."""
-        return replace(self, is_shown=lambda value, _: bool(value))
+        return replace(self, is_shown=bool)
 
     def when(self, attribute: str) -> Key:
         """Returns the key, left out where an attribute is None, empty, zero or false."""
         get = _getter(attribute)
-        return replace(self, is_shown=lambda _, owner: bool(get(owner)))
+        return replace(self, applies=lambda owner: bool(get(owner)))
+
+    def unless(self, attribute: str) -> Key:
+        """Returns the key, left out where an attribute is anything else."""
+        get = _getter(attribute)
+        return replace(self, applies=lambda owner: not get(owner))
 
     @property
     def in_short(self) -> Key:
@@ -254,8 +261,10 @@ class Key:
 
     def add_to(self, reply: JsonObject, owner: object, scope: Scope) -> None:
         """Adds the key to a reply, if it is shown."""
+        if not self.applies(owner):
+            return
         value = self.get(owner)
-        if not self.is_shown(value, owner):
+        if not self.is_shown(value):
             return
         total = 0
         if self.most and isinstance(value, tuple):
@@ -286,20 +295,10 @@ class Keys:
     Attributes:
         keys: all of them.
         span: the oldest time and the newest, which decide whether it has local times.
-        other: gets an attribute, and the keys that take the place of these where it is true.
     """
 
     keys: tuple[Key, ...]
     span: Callable[[object], object] | None = None
-    other: tuple[Callable[[object], object], Keys] | None = None
-
-    @property
-    def all(self) -> tuple[Key, ...]:
-        """These keys, and those that may take their place."""
-        if self.other is None:
-            return self.keys
-        _, other_keys = self.other
-        return (*self.keys, *other_keys.keys)
 
     @property
     def short(self) -> Keys:
@@ -308,10 +307,6 @@ class Keys:
 
     def render(self, owner: object, scope: Scope) -> JsonObject:
         """Returns an object with these keys."""
-        if self.other is not None:
-            takes_others, other_keys = self.other
-            if takes_others(owner):
-                return other_keys.render(owner, scope)
         if self.span is not None:
             first, last = cast("tuple[Ns | None, Ns | None]", self.span(owner))
             now = getattr(owner, "now", scope.now)
@@ -339,18 +334,10 @@ def keys(*declared: str | Key, span: tuple[Source, Source] | None = None) -> Key
 
 @dataclass_transform(frozen_default=True)
 def result(
-    *declared: str | Key,
-    span: tuple[Source, Source] | None = None,
-    where: tuple[Source, Keys] | None = None,
+    *declared: str | Key, span: tuple[Source, Source] | None = None
 ) -> Callable[[type[T]], type[T]]:
-    """Returns what makes a class an immutable dataclass with these keys.
-
-    `where` is an attribute, and the keys that take the place of these where it is true.
-    """
+    """Returns what makes a class an immutable dataclass with these keys."""
     form = keys(*declared, span=span)
-    if where is not None:
-        attribute, other_keys = where
-        form = replace(form, other=(_getter(attribute), other_keys))
 
     def declare(cls: type[T]) -> type[T]:
         whole = dataclass(frozen=True, slots=True)(cls)

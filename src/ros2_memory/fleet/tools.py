@@ -94,9 +94,9 @@ TOPICS: Final = "topics"
 MERGED_ROWS: Final[Mapping[str, Sequence[Key]]] = {
     "find_last_match": (PLAIN(MATCHES).along("timestamp"),),
     "list_recorded_topics": (PLAIN(TOPICS).along("last_ts"),),
-    "find_matches": Sightings.reply.all,
-    "find_things": results.Things.reply.all,
-    "visits": results.Visits.reply.all,
+    "find_matches": Sightings.reply.keys,
+    "find_things": results.Things.reply.keys,
+    "visits": results.Visits.reply.keys,
 }
 """The tools whose rows are merged, and the keys of their replies, which declare how."""
 

@@ -341,23 +341,15 @@ class PlaceVisits:
     PLAIN("y").if_known,
     PLAIN("radius_m").if_known,
     PLAIN("there_now").if_known.merged("who"),
-    OBJECTS("visits").along("departed"),
-    TOTAL("total", "total", "all_counted").merged("added"),
+    OBJECTS("places").if_known.along("last_exit"),
+    OBJECTS("visits").unless("is_of_places").along("departed"),
+    TOTAL("total", "total", "all_counted").unless("is_of_places").merged("added"),
     PLAIN("entries").if_known.merged("added"),
     PLAIN("exits").if_known.merged("added"),
-    MINUTES("minutes", "duration").merged("added"),
+    MINUTES("minutes", "duration").unless("is_of_places").merged("added"),
     SECONDS("unknown_s").if_any.merged("added"),
     PLAIN("more").if_any,
     span=("oldest", "now"),
-    where=(
-        "is_of_places",
-        keys(
-            NAME("frame_id"),
-            OBJECTS("places").along("last_exit"),
-            SECONDS("unknown_s").if_any.merged("added"),
-            span=("oldest", "now"),
-        ),
-    ),
 )
 class Visits(AnswerWithNotes):
     """Visits to a place (m) of a frame, newest first; `more`: there are older ones.
@@ -395,7 +387,7 @@ class Visits(AnswerWithNotes):
     @property
     def there_now(self) -> bool | None:
         """Whether the robot is still there; None where the window ends before that is known."""
-        if not self.reaches_now:
+        if not self.reaches_now or self.is_of_places:
             return None
         return any(visit.departed is None for visit in self.visits)
 

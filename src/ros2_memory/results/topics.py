@@ -120,20 +120,11 @@ def _last_time(answer: TopicRange) -> Ns | None:
     "total",
     objects(keys(TIME("timestamp", "time"), LOCAL("local", "time", "time"), MESSAGE("value")))(
         "samples"
-    ),
+    ).unless("fields"),
+    PLAIN("fields", "columns").when("fields"),
+    PLAIN("rows").when("fields"),
+    by_name(OBJECT)("extremes", "extremes_by_field").if_any,
     span=(_first_time, _last_time),
-    where=(
-        "fields",
-        keys(
-            "topic",
-            "type",
-            "total",
-            PLAIN("fields", "columns"),
-            PLAIN("rows"),
-            by_name(OBJECT)("extremes", "extremes_by_field").if_any,
-            span=(_first_time, _last_time),
-        ),
-    ),
 )
 class TopicRange(AnswerWithNotes):
     """Samples of a window, evenly spaced over all `total` messages in it, with the first and last.
@@ -335,30 +326,17 @@ class Sighting:
         return not self.begun
 
 
-_SEARCHED: Final = (
+@result(
+    PLAIN("topic").if_any,
+    OBJECTS("sightings").unless("of_texts").along("last_seen"),
+    OBJECTS("episodes").when("of_texts").along("end"),
     TOTAL("total", "counted").merged("added"),
     SECONDS("unknown_s").if_any.merged("added"),
     TIME("searched_from", "start").merged("earliest"),
     TIME("searched_to", "end").merged("newest"),
     LOCAL("local", "start", "end"),
     PLAIN("more").if_any,
-)
-
-
-@result(
-    PLAIN("topic").if_any,
-    OBJECTS("sightings").along("last_seen"),
-    *_SEARCHED,
     span=("oldest", "now"),
-    where=(
-        "of_texts",
-        keys(
-            "topic",
-            OBJECTS("episodes").along("end"),
-            *_SEARCHED,
-            span=("oldest", "now"),
-        ),
-    ),
 )
 class Sightings(AnswerWithNotes):
     """Sightings in the requested order; `more`: there are others. `start` and `end` were searched.
