@@ -7,6 +7,7 @@ wait for the libraries of all of them.
 import signal
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
@@ -181,7 +182,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Signals end it as Ctrl-C does, so that files are closed.
     before = {number: signal.signal(number, signal.default_int_handler) for number in _SIGNALS}
     if isinstance(sys.stdout, TextIOWrapper):  # names and texts that its encoding has not
-        sys.stdout.reconfigure(errors="backslashreplace")
+        with suppress(OSError):  # of a pipe that was a file before
+            sys.stdout.reconfigure(errors="backslashreplace")
     try:
         # An application with a callback is a group.
         group = cast("TyperGroup", get_command(app))

@@ -83,17 +83,13 @@ def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Ite
     A key of a group that only takes over another key's value names that one as its source.
     """
     print_line(f"# files are those of {source.folder}")
+    chosen = {group: source.choice(group) for group in groups}
+    set_values = chosen | {key: (value, source(key)) for key, value in values.items()}
     rows: list[tuple[str, str, str]] = []
-    for group in groups:
-        option, who = source.choice(group)
-        rows.append((group, who, option or "null"))
-    for key, value in values.items():
-        rows.append((key, source(key), value if isinstance(value, str) else json.dumps(value)))
-    shown: list[tuple[str, str, str]] = []
-    for key, who, text in rows:
+    for key, (value, who) in set_values.items():
         file, link, named_key = who.partition(", as ")
         set_by = f"as {named_key}" if link else file.replace(f"in {source.folder}/", "")
-        shown.append((key, set_by, text))
-    key_width, source_width = (max(len(row[column]) for row in shown) for column in (0, 1))
-    for key, who, text in shown:
+        rows.append((key, set_by, value if isinstance(value, str) else json.dumps(value)))
+    key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))
+    for key, who, text in rows:
         print_line(f"{key:<{key_width}}  {who:<{source_width}}  {text}")

@@ -144,7 +144,7 @@ def _findings_of(
             for finding in check(what):
                 yield finding._replace(about=finding.about or about)
         except OSError as problem:
-            yield error(reason_of(problem), _READ, about=about)
+            yield error(reason_of(problem), f"{_READ}; else look after the disk", about=about)
 
 
 def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
@@ -205,23 +205,19 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     bag_dir, limits = robot.settings.recording.bag_dir.absolute(), robot.settings.retention
     existing = next(path for path in (bag_dir, *bag_dir.parents) if path.is_dir())
     mount = next(path for path in (existing, *existing.parents) if os.path.ismount(path))
-    try:
-        free = shutil.disk_usage(existing).free / GB
-    except OSError as problem:
-        yield error(f"{existing} cannot be measured: {problem}", "look after the disk")
+    free = shutil.disk_usage(existing).free / GB
+    heartbeat = robot.memory.index.heartbeat()
+    budget = budget_of(robot.memory, robot.snapshot, heartbeat, robot.now)
+    used = budget.used / GB
+    seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
+    if free < limits.min_free_gb:
+        do = f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
+        yield error(seen, f"{do}other files on this disk")
+    elif free - limits.min_free_gb < limits.max_total_gb - used:
+        do = "the disk is full before the budget is: lower retention.max_total_gb to "
+        yield warning(seen, f"{do}{max(free - limits.min_free_gb + used, 0):.1f}, or make room")
     else:
-        heartbeat = robot.memory.index.heartbeat()
-        budget = budget_of(robot.memory, robot.snapshot, heartbeat, robot.now)
-        used = budget.used / GB
-        seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
-        if free < limits.min_free_gb:
-            do = f"recording pauses below retention.min_free_gb={limits.min_free_gb:g}; delete "
-            yield error(seen, f"{do}other files on this disk")
-        elif free - limits.min_free_gb < limits.max_total_gb - used:
-            do = "the disk is full before the budget is: lower retention.max_total_gb to "
-            yield warning(seen, f"{do}{max(free - limits.min_free_gb + used, 0):.1f}, or make room")
-        else:
-            yield ok(seen)
+        yield ok(seen)
     if leaving := describe_leaving(robot.memory.index.bag_dir):
         yield warning(leaving, "memory.keep=true keeps it")
     if limits.max_total_gb < SMALL_BUDGET_GB:

@@ -2,7 +2,6 @@
 
 import json
 import re
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import chain
@@ -23,7 +22,7 @@ from ros2_memory.cli.output import (
     stdout_console,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import NoDataError, RecorderError
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
@@ -36,7 +35,6 @@ from ros2_memory.insights.status import budget_of, nothing_here
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import Budget, TopicRow
-from ros2_memory.tools.replies import Replies
 
 _TOLD_TWICE: Final = frozenset(
     {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics", "budget"}
@@ -58,30 +56,27 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     latched topics and logs have none.
     """
     memory = bags.memory()
-    topic_rows: Sequence[TopicRow] = ()
-    rows: list[JsonObject] = []
-    try:
-        topic_rows = list_recorded_topics(memory, Call())
-        snapshot, latching = memory.index.snapshot(), memory.limits.latching
-        rows = [_row_with_rate(row, snapshot, latching) for row in topic_rows]
-        text = json.dumps(rows)
-    except NoDataError as error:
-        text = Replies(memory.index.bag_dir, sys.maxsize).error(error).text
+    topic_rows = list_recorded_topics(memory, Call())
+    snapshot, latching = memory.index.snapshot(), memory.limits.latching
+    rows = [_row_with_rate(row, snapshot, latching) for row in topic_rows]
     if as_json:
-        print_line(text)
+        print_json(rows)
     elif rows:
         without = [{key: row[key] for key in row if key != "notes"} for row in rows]
         print_reply(stdout_console(), [*without])
         if notes := _notes_of(topic_rows):
             print_reply(stdout_console(), {"notes": notes})
-    elif text != "[]":
-        print_reply(stdout_console(), json.loads(text))
     else:
-        print_line(f"nothing is recorded in {memory.index.bag_dir}")
-        snapshot = memory.index.snapshot()
-        for aside in (*snapshot.damaged, *snapshot.unread):
-            print_line(f"  {aside.path.name}: {aside.reason}")
+        _print_nothing(memory)
     return not rows
+
+
+def _print_nothing(memory: Memory) -> None:
+    """Prints that nothing here is recorded, or can be read, and why."""
+    snapshot = memory.index.snapshot()
+    print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
+    for aside in (*snapshot.damaged, *snapshot.unread):
+        print_line(f"  {aside.path.name}: {aside.reason}")
 
 
 def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> JsonObject:
@@ -180,7 +175,7 @@ def _show(memory: Memory, report: JsonObject) -> None:
     snapshot = memory.index.snapshot()
     aside = (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any((snapshot.bags, *aside)):
-        print_line(f"{memory.index.bag_dir}: {snapshot.problem or nothing_here(snapshot)}")
+        _print_nothing(memory)
         return
     status, ranged, recorded, *lists = report.values()
     report_shown = {
@@ -307,7 +302,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     if as_json:
         print_json([*rows, *empty])
     elif not rows:
-        print_line(f"{root}: {snapshot.problem or nothing_here(snapshot)}")
+        _print_nothing(memory)
     else:
         read = [row for row in rows if "start" in row]
         left_out = {"end"}  # there is the length

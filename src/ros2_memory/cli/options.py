@@ -189,7 +189,7 @@ def settings_to_look(
     if bag_dir is not None and not _is_recorded_now(bag_dir):
         is_chosen = is_deployment_chosen(given)
         if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in given):
-            deployed, _ = load_for(None, None)
+            deployed, _ = load_for(None, given)
             is_chosen = bag_dir.absolute() == deployed.recording.bag_dir.absolute()
         if not is_chosen:
             given = [*LOOKING, *given]

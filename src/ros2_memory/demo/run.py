@@ -310,6 +310,7 @@ def run_demo(
         ConfigError: the options cannot be followed.
         EpisodicError: the server or the recording did not last.
         KeyboardInterrupt: it was interrupted before all answers were there.
+        OSError: the folder cannot be made or written.
     """
     if not SHORTEST_S <= duration_s <= LONGEST_S:
         raise ConfigError(
@@ -352,10 +353,7 @@ def _made(bag_dir: Path | None, stack: ExitStack) -> Path:
     if bag_dir is None:
         temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
         return Path(stack.enter_context(temporary))
-    try:
-        bag_dir.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--bag-dir {bag_dir} cannot be made: {error}") from error
+    bag_dir.mkdir(parents=True, exist_ok=True)
     return bag_dir.resolve()
 
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 
 from ros2_memory import cli
 from ros2_memory.cli.ask import with_times
-from ros2_memory.cli.options import parse_end, parse_time
+from ros2_memory.cli.options import LOOKING, parse_end, parse_time, settings_to_look
 from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
@@ -273,6 +273,15 @@ class TestRecordings:
         # Without the bag that had some of it, and what has a part in common with that.
         with closing(sqlite3.connect(store)) as base:
             assert base.execute("SELECT count(*) FROM bag").fetchone() == (0,)
+
+
+def test_a_path_elsewhere_is_looked_at_whatever_the_environment_deploys(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
+    monkeypatch.setenv("MEMORY_BAG_DIR", str(folder / "a"))
+    assert settings_to_look(None, [str(folder)]) == (folder, [*LOOKING])
+    assert settings_to_look(None, [str(folder / "a")]) == (folder / "a", [])
 
 
 def test_of_a_folder_without_a_recording_nobody_is_said_to_have_made_all(
