@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
-from ros2_memory.core.text import shortened
+from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S
 
 if TYPE_CHECKING:
@@ -56,8 +56,6 @@ _MANY_PAIRS: Final = 200
 """So many are compared sooner as arrays."""
 MAX_LABELS: Final = 512
 """Of more in a slice one more is kept, which shows that others are left out."""
-MAX_LABEL_CHARS: Final = 256
-"""A longer one is cut, and ends with an ellipsis."""
 _MAX_COMPARED: Final = 128
 """Of more detections of a message that lie so near in x, not all are compared."""
 _MAX_AWAY_M: Final = 1e8

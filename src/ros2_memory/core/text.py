@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import JsonValue
 
+MAX_LABEL_CHARS: Final = 256
+"""A longer label of a detection is cut, and ends with an ellipsis."""
 MAX_NAMED: Final = 3
 """How many names a sentence lists before it counts the rest."""
 _MAX_NAME_CHARS: Final = 160

@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import re
 import stat
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import RECORDING_FILES, bag_kind
 from ros2_memory.core import directories
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
     from pathlib import Path
 
 REPAIR_SUFFIX: Final = ".repair"
@@ -27,6 +28,22 @@ _JOURNAL: Final = re.compile(rf".+\.db3({'|'.join(_JOURNALS)})", re.IGNORECASE)
 def repair_name(name: str) -> str:
     """Returns the name of a bag file while it is being repaired, which the index ignores."""
     return f".{name}{REPAIR_SUFFIX}"
+
+
+@contextmanager
+def beside(path: Path) -> Iterator[Path]:
+    """Yields a name beside a bag for its new content; nothing has that name after the block.
+
+    Raises:
+        OSError: what an interrupted block left under that name cannot be deleted.
+    """
+    new = path.with_name(repair_name(path.name))
+    new.unlink(missing_ok=True)
+    try:
+        yield new
+    finally:
+        with suppress(OSError):
+            new.unlink(missing_ok=True)
 
 
 def left_by_repair(name: str) -> bool:

@@ -53,10 +53,9 @@ from ros2_memory.core.model import COMPRESSED, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.file_state import reason_unread
-from ros2_memory.retention.delete import repair_name
+from ros2_memory.retention.delete import beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
-    beside,
     left_in,
     open_files,
     opened_folder,

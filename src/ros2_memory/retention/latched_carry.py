@@ -44,8 +44,8 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.retention.delete import beside
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import beside
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:

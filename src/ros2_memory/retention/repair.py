@@ -20,7 +20,7 @@ from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
-from ros2_memory.retention.delete import repair_name
+from ros2_memory.retention.delete import beside
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
@@ -125,22 +125,6 @@ def opened_folder(root: Path, path: Path) -> Iterator[Path]:
     """
     with directories.opened(root, path.parent) as folder:
         yield Path(f"/proc/self/fd/{folder}", path.name)
-
-
-@contextmanager
-def beside(path: Path) -> Iterator[Path]:
-    """Yields a name beside a bag for its new content; nothing has that name after the block.
-
-    Raises:
-        OSError: what an interrupted block left under that name cannot be deleted.
-    """
-    new = path.with_name(repair_name(path.name))
-    new.unlink(missing_ok=True)
-    try:
-        yield new
-    finally:
-        with suppress(OSError):
-            new.unlink(missing_ok=True)
 
 
 def give_attributes(new: Path, before: os.stat_result, mtime_ns: Ns) -> None:

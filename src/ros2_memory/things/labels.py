@@ -11,8 +11,7 @@ import unicodedata
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.sights import MAX_LABEL_CHARS
-from ros2_memory.core.text import shortened
+from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping

@@ -53,8 +53,8 @@ from ros2_memory.recorder.memory.thinning import (
     rounded,
     shown_by,
 )
+from ros2_memory.retention.delete import beside
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import beside
 from ros2_memory.storage.base import or_errors
 
 if TYPE_CHECKING:
