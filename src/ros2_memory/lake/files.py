@@ -21,6 +21,7 @@ from pyiceberg.manifest import ManifestContent, ManifestFile
 from pyiceberg.transforms import IdentityTransform
 
 from ros2_memory.core.errors import RefusedError
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.tables import NAMESPACE, TABLES
 from ros2_memory.storage.cache import ByteLru
 
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
 
-    from ros2_memory.lake.engine import DuckdbEngine
 
 _EPOCH: Final = date(1970, 1, 1)
 _LAST: Final = "\U0010ffff"
@@ -52,22 +52,6 @@ class LakeFile(NamedTuple):
     last: str = _LAST
 
 
-@dataclass(frozen=True, slots=True)
-class DataFiles:
-    """Some data files of one table.
-
-    Attributes:
-        schema: all columns of the table; a file may be older, and lack some.
-        locations: of the Parquet files, as URIs; files that are local have `file`.
-        store: the properties by which pyiceberg opens them, where they are not local.
-    """
-
-    schema: pa.Schema
-    locations: tuple[str, ...]
-    store: Mapping[str, str] = field(repr=False)
-
-
-Parameters: TypeAlias = "Mapping[str, str | int | float | Sequence[str]]"
 Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
 """The files of one robot in one table by day, in order of the days."""
 
@@ -140,7 +124,7 @@ class Lake:
     """
 
     catalog: IcebergCatalog
-    engine: DuckdbEngine
+    engine: LakeEngine
     translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext()
     messages: ByteLru[bytes] = field(default_factory=lambda: ByteLru(_MESSAGE_BYTES), init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
@@ -177,7 +161,7 @@ class Lake:
     def select(
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
     ) -> pa.Table:
-        """Returns the rows of a select (see `DuckdbEngine`) over some files of a table."""
+        """Returns the rows of a select (see `LakeEngine`) over some files of a table."""
         with self._looking():
             table = self._loaded_table(name)
         store = {} if table is None else dict(table.io.properties)

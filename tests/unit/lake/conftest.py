@@ -6,11 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
 
 
 @pytest.fixture(scope="session")
-def engine() -> Iterator[DuckdbEngine]:
+def engine() -> Iterator[LakeEngine]:
     engine = DuckdbEngine(memory_mb=256, threads=1)
     yield engine
     engine.close()

@@ -13,8 +13,7 @@ from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.engine import DuckdbEngine
-from ros2_memory.lake.files import DataFiles, Parameters
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.tables import day_of
 from tests.support.bags import detections, text, write_mcap
 from tests.support.fleets import SEEN, START_S
@@ -23,10 +22,10 @@ from tests.support.lakes import lake_robot, robot_bags, ship
 DAY_S = 86_400
 
 
-class WatchedEngine(DuckdbEngine):
+class WatchedEngine(LakeEngine):
     """Keeps which files were read."""
 
-    def __init__(self, engine: DuckdbEngine) -> None:
+    def __init__(self, engine: LakeEngine) -> None:
         self._engine = engine
         self.read: set[str] = set()
 
@@ -45,7 +44,7 @@ class WatchedEngine(DuckdbEngine):
 class Shipping:
     """A robot whose bags are shipped a few at a time."""
 
-    def __init__(self, folder: Path, engine: DuckdbEngine) -> None:
+    def __init__(self, folder: Path, engine: LakeEngine) -> None:
         self._folder = folder
         self.engine = WatchedEngine(engine)
         self._passes = 0
@@ -65,7 +64,7 @@ class Shipping:
 
 
 @pytest.fixture
-def shipping(tmp_path: Path, engine: DuckdbEngine) -> Shipping:
+def shipping(tmp_path: Path, engine: LakeEngine) -> Shipping:
     return Shipping(tmp_path, engine)
 
 
@@ -145,7 +144,7 @@ def test_days_that_are_looked_at_late_show_nothing_about_the_robots_clock(
 
 
 def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_robot(
-    tmp_path: Path, engine: DuckdbEngine
+    tmp_path: Path, engine: LakeEngine
 ) -> None:
     bags = tmp_path / "bags"
     for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):

@@ -12,7 +12,7 @@ from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
@@ -26,7 +26,7 @@ DAYS = 7
 
 
 @pytest.fixture(scope="module")
-def memory(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+def memory(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.

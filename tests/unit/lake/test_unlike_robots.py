@@ -15,7 +15,7 @@ from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.shipper import Shipped
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
@@ -52,7 +52,7 @@ class World(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def world(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def world(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
     of_robots = [robot_bags(name, write(folder / name)) for name, write in ROBOTS.items()]
     shipped = ship(lake, of_robots, messages=MESSAGES, most_bags=100)

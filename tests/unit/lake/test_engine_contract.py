@@ -1,4 +1,4 @@
-"""What the engine of a lake promises: columns that files lack, texts that are no SQL."""
+"""What `lake/engines/base.py` promises of a `LakeEngine`, checked with every adapter."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.lake.engine import DuckdbEngine
-from ros2_memory.lake.files import DataFiles, Parameters
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.tables import TABLES, Row
 
 DAY = date(2026, 11, 20)
@@ -25,7 +24,7 @@ Select = Callable[..., pa.Table]
 
 
 @pytest.fixture(scope="module")
-def select(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Select:
+def select(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Select:
     """Runs a select over all files of `sightings`: of three robots, each with two days."""
     folder, table = tmp_path_factory.mktemp("lake"), TABLES["sightings"]
     locations: list[str] = []
@@ -78,7 +77,7 @@ def test_a_text_is_never_sql(select: Select) -> None:
 
 
 def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
-    tmp_path: Path, engine: DuckdbEngine
+    tmp_path: Path, engine: LakeEngine
 ) -> None:
     row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
     whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])

@@ -1,8 +1,8 @@
-"""DuckDB, inside of this process: it reads the data files of a lake, and loads no extension."""
+"""DuckDB, inside of this process: the default engine. It loads no extension."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import duckdb
 import pyarrow as pa
@@ -11,9 +11,7 @@ from pyiceberg.io.pyarrow import PyArrowFileIO
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
-
-if TYPE_CHECKING:
-    from ros2_memory.lake.files import DataFiles, Parameters
+from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
@@ -28,10 +26,8 @@ _LOCAL: Final = (
 log = get_logger(__name__)
 
 
-class DuckdbEngine:
+class DuckdbEngine(LakeEngine):
     """Reads local files itself, within its limits, and those of a store through Arrow.
-
-    Thread-safe. It is given the data files that a question is about, and knows no catalogue.
 
     Args:
         memory_mb: how much memory it may use.
@@ -45,14 +41,7 @@ class DuckdbEngine:
         self._connection = duckdb.connect(config={**settings})
 
     def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
-        """Returns the rows of one select over some files of a table, which alone it knows.
-
-        A column that a file lacks is null there, and the table may have no file at all. `$name` is
-        the parameter of that name, whose text is never SQL; a list is for `IN $name`.
-
-        Raises:
-            RefusedError: a file cannot be read; the log has why.
-        """
+        """Runs the select in a cursor of its own, which alone knows the table."""
         bound: dict[str, object] = {**parameters}
         try:
             with self._connection.cursor() as cursor:
