@@ -39,7 +39,7 @@ Stored = tuple[int, int, str, int]
 def write_recordings(root: Path, draw: random.Random, *, stamped: bool = True) -> list[Stored]:
     """Recordings one after the other, each of which begins with messages received again.
 
-    Where they are not stamped, all were published at 0, as some bridges have it.
+    Where they are not stamped, all were published at 0, as some bridges have it: when is unknown.
     """
     stored: list[Stored] = []
     published: list[tuple[int, str]] = []
@@ -60,7 +60,7 @@ def write_recordings(root: Path, draw: random.Random, *, stamped: bool = True) -
             messages.append((at + S, was, said))
         at = max(at, *(each[0] for each in messages))
         for log_time, was, said in sorted(messages):
-            stored.append((log_time, was, said, number))
+            stored.append((log_time, was or log_time, said, number))
         write_splits(root / f"rec{number}", sorted(messages), start, at)
         at += draw.choice([5, 60, 400]) * S
     return stored

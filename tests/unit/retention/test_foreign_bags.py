@@ -363,7 +363,7 @@ class TestReports:
         cli.main(["doctor", "--json"])
         found = json.loads(capsys.readouterr().out)["findings"]
         [disk] = [each["seen"] for each in found if each["about"] == "disk"]
-        assert "bags that this recorder did not make take" in disk
+        assert "bags that the recorder did not make take" in disk
         assert "ros2-memory adopt DIR" in disk
         cli.main(["info", "--json"])
         reported = json.loads(capsys.readouterr().out)["memory_status"]["budget"]
