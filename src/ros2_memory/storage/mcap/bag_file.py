@@ -8,6 +8,7 @@ messages themselves where the indexes of a file are missing or wrong (see `mcap.
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -57,6 +58,7 @@ from ros2_memory.storage.mcap.chunk import (
     Column,
     Pairs,
     declarations_of,
+    in_file_order,
     index_groups,
     joined,
     pairs_in,
@@ -67,6 +69,7 @@ from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     DoubtError,
     McapIndex,
+    chunk_columns,
     chunk_data,
     index_from_summary,
 )
@@ -86,6 +89,8 @@ from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed, uncompressed
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
+
+    from ros2_memory.storage.base import IntArray
 
 
 _LARGE_BYTES: Final = 8 << 20
@@ -414,24 +419,26 @@ class McapBags:
             _ContradictedError: the message indexes do not agree with the records.
         """
         columns: list[Column] = []
-        missing: set[int] = set()
+        missing: list[int] = []
         for channel in chunk.channels.intersection(wanted):
             column = self._indexes.get((file.key, chunk.offset, channel))
             if isinstance(column, Column):
                 columns.append(column)
             else:
-                missing.add(channel)
+                missing.append(channel)
         if not missing:
             return columns
-        if data is None and chunk.index_places is None:
-            data = self._chunk_data(file, chunk)
-        try:
-            pairs = _pairs(file, chunk, missing, data or b"")
-            if data is not None:
-                require_indexed(pairs, data, pairs.offsets)
-            read = pairs.columns(missing)
-        except (UnreadableError, ValueError, IndexError) as error:
-            raise _ContradictedError(reason_of(error), chunk) from error
+        if chunk.index_places is None:
+            data = self._chunk_data(file, chunk) if data is None else data
+            read = walk_chunk(data).pairs.columns(missing)
+        else:
+            try:
+                read = chunk_columns(file, chunk, missing)
+                for channel, fresh in read.items():
+                    if data is not None:
+                        require_indexed(fresh.of_channel(channel), data, fresh.places)
+            except (UnreadableError, ValueError, IndexError, struct.error) as error:
+                raise _ContradictedError(reason_of(error), chunk) from error
         for channel, fresh in read.items():
             if data is not None:
                 self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
@@ -455,15 +462,20 @@ class McapBags:
                 raise _ContradictedError(str(error)) from error
             del data  # before the next is read
 
-    def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> list[Column]:
-        """Returns all messages of a chunk, compared with its records.
+    def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> IntArray:
+        """Returns where a chunk's messages begin in its records, ascending, compared with these.
 
         Raises:
             _ContradictedError: the indexes do not agree with the records.
         """
-        columns = self._chunk_columns(file, chunk, chunk.channels, data)
+        try:
+            pairs = _pairs(file, chunk, chunk.channels, data)
+            require_indexed(pairs, data, pairs.offsets)
+            places = in_file_order(pairs.offsets)
+        except (UnreadableError, ValueError, IndexError) as error:
+            raise _ContradictedError(reason_of(error), chunk) from error
         self._indexes.put((file.key, chunk.offset, _COMPARED), _YES, _YES.memory_bytes)
-        return columns
+        return places
 
     def _readable_data(self, file: OpenFile, chunk: Chunk) -> bytes | None:
         """Returns the records of a chunk; None if they cannot be read."""
@@ -495,9 +507,9 @@ class McapBags:
                 data = self._readable_data(file, chunk)
                 if data is None:
                     continue
-                columns = self._compared(file, chunk, data)
+                places = self._compared(file, chunk, data)
                 if index.declared is not None:
-                    _require_declared(index.declared, data, columns)
+                    _require_declared(index.declared, data, places)
                 del data  # before the next is read
         except _ContradictedError as error:
             return self._distrust(file, error)
@@ -536,13 +548,13 @@ def _pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes) -
     return pairs_in(chunks, indexes, wanted)
 
 
-def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Column]) -> None:
+def _require_declared(declared: Declarations, data: bytes, places: IntArray) -> None:
     """Compares what a summary section declares with what a chunk declares and holds.
 
     Args:
         declared: the schemas and channels of the summary section.
         data: the decompressed records of the chunk, which its checksum protects.
-        columns: all messages of the chunk, compared with these records already.
+        places: where its messages begin in these, ascending.
 
     Raises:
         _ContradictedError: the chunk declares a channel otherwise, or holds more messages.
@@ -550,7 +562,7 @@ def _require_declared(declared: Declarations, data: bytes, columns: Sequence[Col
     try:
         with as_unreadable():
             agrees = all(
-                declared.agrees(*declaration) for declaration in declarations_of(data, columns)
+                declared.agrees(*declaration) for declaration in declarations_of(data, places)
             )
     except UnreadableError as error:
         raise _ContradictedError(reason_of(error)) from error

@@ -25,6 +25,7 @@ from ros2_memory.storage.mcap.chunk import (
     Pairs,
     chunk_head,
     decompressed_chunk,
+    in_file_order,
     index_groups,
     pairs_in,
     require_indexed,
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.file_io import OpenFile
 
 MAX_GROUP_CHUNKS: Final = 4096
-_TWICE: Final = "damaged: a message index holds a message twice"
-
 _UINT32: Final = np.dtype("<u4")
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
 _CHUNK_STEP: Final = 6
@@ -174,9 +173,7 @@ def batches_of(
     stops = at + RECORD.size + heads["length"]
     if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
-    in_file = np.sort(at)
-    if (in_file[1:] == in_file[:-1]).any():
-        raise UnreadableError(_TWICE)
+    in_file_order(at)
     order = _in_window(pairs, window)
     at, numbers = at[order], pairs.channels[order]
     steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]

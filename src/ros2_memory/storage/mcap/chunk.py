@@ -87,6 +87,10 @@ class Column(NamedTuple):
                 raise UnreadableError("damaged: a message index holds a message twice")
         return cls(times, places)
 
+    def of_channel(self, channel: int) -> Pairs:
+        """Returns the same as messages of a channel, in one chunk."""
+        return Pairs(np.array(channel), self.times, self.places, _ZERO)
+
     def between(self, start: int, stop: int) -> Column:
         """Returns the part with log times in `[start, stop)`."""
         times = self.times
@@ -299,12 +303,24 @@ def require_indexed(
     return heads
 
 
-def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, bytes]]:
+def in_file_order(places: IntArray) -> IntArray:
+    """Returns where messages begin, ascending.
+
+    Raises:
+        UnreadableError: two of them begin at the same place.
+    """
+    ordered = np.sort(places)
+    if (ordered[1:] == ordered[:-1]).any():
+        raise UnreadableError("damaged: a message index holds a message twice")
+    return ordered
+
+
+def declarations_of(data: bytes, places: IntArray) -> list[tuple[int, bytes]]:
     """Returns the schema and channel records of a chunk; walks only the bytes between messages.
 
     Args:
         data: the decompressed records of the chunk.
-        columns: all of its messages, compared with these records already.
+        places: where all of its messages begin in these, ascending.
 
     Returns:
         The opcode and the body of each.
@@ -312,7 +328,6 @@ def declarations_of(data: bytes, columns: Sequence[Column]) -> list[tuple[int, b
     Raises:
         UnreadableError: there are other messages between them, or too many declarations.
     """
-    places = np.sort(np.concatenate([column.places for column in columns] or [_EMPTY]))
     size = len(data)
     lengths = gathered(data, _HEAD, places)["length"]
     if ((lengths < 0) | (lengths > size)).any():

@@ -55,7 +55,7 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from mcap.records import Statistics
 
@@ -66,6 +66,8 @@ _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
 _INDEX_OFFSET: Final = struct.Struct("<HQ")
 _INDEX_LENGTH: Final = struct.Struct("<Q")
+_INDEX_HEAD: Final = struct.Struct("<BQHI")
+"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _new_tuple: Final = tuple.__new__
 _NONE: Final = np.empty(0, np.int64)
 _MAX_CACHED_BYTES: Final = 128 << 10
@@ -239,6 +241,27 @@ class McapIndex(NamedTuple):
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
         loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
         return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
+
+
+def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
+    """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
+
+    Of a few channels, as a question needs them, it takes a fifth of what `pairs_in` does. All
+    indexes of the file were found right together (`index_from_summary`).
+
+    Raises:
+        UnreadableError, ValueError, struct.error: they have changed.
+    """
+    base = chunk.offset + chunk.length
+    region = file.read(base, chunk.index_length)
+    columns: dict[int, Column] = {}
+    for number, offset in _INDEX_OFFSET.iter_unpack(chunk.index_places or b""):
+        if number in wanted:
+            _, _, _, size = _INDEX_HEAD.unpack_from(region, offset - base)
+            at = offset - base + _INDEX_HEAD.size
+            pairs = np.frombuffer(region, "<i8", size // 8, at).reshape(-1, 2)
+            columns[number] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+    return columns
 
 
 class Contents:
