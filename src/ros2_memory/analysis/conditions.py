@@ -342,7 +342,7 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
 def summarising(field: str | None, value: JsonValue) -> list[Condition]:
     """Returns what messages meet that only summarise an array at or below a field.
 
-    Which arrays these are is told by one value.
+    The arrays are found in one value.
     """
     paths = [*_dot_paths(value, "")]
     if field:

@@ -253,7 +253,7 @@ class _Group:
         """Returns the tables, each of all its parts.
 
         The messages of each topic's last log time are left to the next group, unless they are many:
-        which one of them is meant is told by its number among those of one table.
+        messages of one log time are numbered within a table.
         """
         self._buffer = b""
         tables, room = [], GROUP_BYTES // 4

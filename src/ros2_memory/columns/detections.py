@@ -98,7 +98,7 @@ class StampedDetections(NamedTuple):
 class Point(NamedTuple):
     """Numbers that may be the place of an object: x, y and z (m).
 
-    `frames` name its frame, the outermost first: of what is in the object around the point.
+    `frames` are the texts beside it that may name its frame, the outermost first.
     """
 
     axes: tuple[Leaf, ...]

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
-    """Returns what `history.held_values.HeldValues` says of a field of each row, as JSON text.
+    """Returns a field of each row as JSON text, as `history.held_values.HeldValues` has it.
 
     None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
     number: then the messages have to be read.

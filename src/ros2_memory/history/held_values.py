@@ -247,7 +247,7 @@ class HeldValues:
                 yield _Run(word, stored.time, stored.time)
 
     def _said(self, message: object, type_name: str) -> JsonValue:
-        """Returns what a message says: of what has one part alone, that; but no array's size."""
+        """Returns the value of a message, of an object with one key that; but no array's size."""
         extractor, field = self._view.extractor, self._field
         value = (
             extractor.exact(message, type_name)

@@ -39,7 +39,7 @@ def open_regular(path: Path) -> int:
 
 
 class FileKey(NamedTuple):
-    """Identifies the content of a file: whatever is written into it changes its ctime."""
+    """Identifies the content of a file: each write into it changes its ctime."""
 
     path: str
     size: int

@@ -246,8 +246,8 @@ class McapIndex(NamedTuple):
 def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
     """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
 
-    Of a few channels, as a question needs them, it takes a fifth of what `pairs_in` does. All
-    indexes of the file were found right together (`index_from_summary`).
+    `pairs_in` checks all indexes of the chunk, which makes a cold point query a fifth slower. Here
+    they are believed: all indexes of the file were found right together (`index_from_summary`).
 
     Raises:
         UnreadableError, ValueError, struct.error: they have changed.
