@@ -58,8 +58,6 @@ class IndexManager:
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
         setting: the one that names the bag directory, for sentences.
         large: the turn to hold much of a bag, for which no scan waits.
-        packs: whether summaries are packed: who deletes bags looks at few of them, and who answers
-            looks at all.
 
     Attributes:
         bag_dir: the bag directory.
@@ -80,7 +78,6 @@ class IndexManager:
         only: str | None = None,
         setting: str = BAG_DIR_SETTING,
         large: LargeReads | None = None,
-        packs: bool = False,
     ) -> None:
         self._large = large or LargeReads()
         self._setting = setting
@@ -89,7 +86,6 @@ class IndexManager:
         self.bag_dir = bag_dir
         self._known = known
         self._include_active = include_active
-        self._packs = packs
         self._reader = reader
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
@@ -159,7 +155,6 @@ class IndexManager:
             self._reader,
             known=self._known,
             only=self._only,
-            packs=self._packs,
             setting=self._setting,
         )
 
