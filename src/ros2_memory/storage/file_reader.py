@@ -66,39 +66,29 @@ class _Walk:
         self._position = _HEADER_BYTES
 
     def message(self, definition: Definition) -> None:
-        self._count()
+        self._count(1)
         if not definition.fields:
             self._advance(1, 1)
         for field in definition.fields:
-            if field.length is None:
-                self._one(field.kind)
-            else:
-                length = self._length() if field.length == SEQUENCE else field.length
-                self._elements(field.kind, length)
+            count = 1 if field.length is None else field.length
+            self._pass(field.kind, self._length() if count == SEQUENCE else count)
 
-    def _elements(self, kind: str | Definition, count: int) -> None:
+    def _pass(self, kind: str | Definition, count: int) -> None:
         """Goes past some elements: at once where all have one size."""
-        if isinstance(kind, str) and kind in _SIZES:
-            if count:  # without elements there is no padding either
-                self._advance(_SIZES[kind], _SIZES[kind] * count)
-            return
-        if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
-            # Each is an object: none of them needs to be read.
-            self.objects += count
-            raise _StoppedError
-        for _ in range(count):
-            self._one(kind)
-
-    def _one(self, kind: str | Definition) -> None:
         if isinstance(kind, Definition):
-            self.message(kind)
+            # Each is an object: of too many none needs to be read.
+            if self.objects + count > MAX_OBJECTS:
+                self._count(count)
+            for _ in range(count):
+                self.message(kind)
         elif kind == "string":
-            self._count()
-            self._advance(1, self._length())
-        elif kind in _SIZES:
-            self._advance(_SIZES[kind], _SIZES[kind])
-        else:
-            raise _StoppedError
+            for _ in range(count):
+                self._count(1)
+                self._advance(1, self._length())
+        elif count:  # without elements there is no padding either
+            if kind not in _SIZES:
+                raise _StoppedError
+            self._advance(_SIZES[kind], _SIZES[kind] * count)
 
     def _length(self) -> int:
         at = self._advance(4, 4)
@@ -113,8 +103,8 @@ class _Walk:
             raise _StoppedError
         return at
 
-    def _count(self) -> None:
-        self.objects += 1
+    def _count(self, objects: int) -> None:
+        self.objects += objects
         if self.objects > MAX_OBJECTS:
             raise _StoppedError
 
