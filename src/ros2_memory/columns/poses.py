@@ -12,9 +12,10 @@ import numpy as np
 
 from ros2_memory.analysis.poses import FrameCodes, Poses
 from ros2_memory.columns.plan import fields_at
-from ros2_memory.columns.shown import ByType, UnknownShapeError
+from ros2_memory.columns.shown import ByType
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.values import UnknownShapeError
 from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.extract import (
     FRAME,

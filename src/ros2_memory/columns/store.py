@@ -32,7 +32,6 @@ from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
     UNMERGED,
-    DecodedBags,
     Layouts,
     LongBag,
     ReadBag,
@@ -304,36 +303,28 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped, whole FROM part"
+                "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, whole FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
                 " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(numbers) for _, _, _, _, numbers, *_ in rows]
+            bags = [json.loads(numbers) for numbers, *_ in rows]
             all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
             bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [
                 PartHead(
                     self.offset + number,
                     self.offset + topic_number,
-                    first,
-                    last,
+                    *span_ns,
                     numbers,
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for (
-                    number,
-                    topic_number,
-                    first,
-                    last,
-                    _,
-                    messages,
-                    dropped,
-                    whole,
-                ), numbers in zip(rows, bags_of_parts, strict=True)
+                for (_, number, topic_number, *span_ns, messages, dropped, whole), numbers in zip(
+                    rows, bags_of_parts, strict=True
+                )
             ]
 
         return self.read(ask, [])
@@ -469,18 +460,17 @@ class ColumnStore(Database):
             return True
         return self.write(write)
 
-    def put(self, decoded: DecodedBags, *, whole: bool) -> Written:
+    def put(self, bags: Sequence[ReadBag], *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
         One that is in whole parts stays as it is: another program has stored it. One that changed
         meanwhile is left out.
 
         Args:
-            decoded: the bags.
+            bags: with their tables.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
         written = Written(0, ())
-        bags = decoded.bags
 
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
@@ -491,11 +481,11 @@ class ColumnStore(Database):
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = [nth for nth, bag in enumerate(bags) if stored.get(bag.key, -1) < bag.hashed]
-            new = decoded.chosen([nth for nth in missing if bags[nth].is_current()])
-            delete_bags(connection, [bag.key.path for bag in new.bags])
+            missing = [bag for bag in bags if stored.get(bag.key, -1) < bag.hashed]
+            new = [bag for bag in missing if bag.is_current()]
+            delete_bags(connection, [bag.key.path for bag in new])
             parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
-            done = len(bags) - len(missing) + len(new.bags)
+            done = len(bags) - len(missing) + len(new)
             written = Written(done, tuple(self.offset + part for part in parts))
 
         return written if self.write(write) else Written(0, ())

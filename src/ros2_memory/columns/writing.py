@@ -44,38 +44,14 @@ class ReadBag(NamedTuple):
         bag: the bag, for its times.
         hashed: whether tables have the hashes of all its payloads.
         is_current: whether the bag may be stored, asked once nobody else can write.
+        tables: with all of its messages, unless these follow.
     """
 
     key: BagKey
     bag: BagFile
     hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
-
-
-class BagRows(NamedTuple):
-    """A table of one of some bags, which is named by its place among these."""
-
-    table: Table
-    bag: int
-
-
-class DecodedBags(NamedTuple):
-    """Bags of one recording, and tables with all of their messages."""
-
-    bags: list[ReadBag]
-    tables: list[BagRows]
-
-    def add(self, bag: ReadBag, tables: Sequence[Table]) -> None:
-        """Adds a bag."""
-        self.tables.extend(BagRows(table, len(self.bags)) for table in tables)
-        self.bags.append(bag)
-
-    def chosen(self, places: Sequence[int]) -> DecodedBags:
-        """Returns some of the bags, by their places among these."""
-        new = DecodedBags([], [])
-        for place in places:
-            new.add(self.bags[place], [table for table, bag in self.tables if bag == place])
-        return new
+    tables: Sequence[Table] = ()
 
 
 class LongBag:
@@ -112,13 +88,12 @@ class LongBag:
         if not self._may_go_on(connection):
             return
         self._lacks_definitions |= lacks_definitions(tables)
-        packed: dict[int, list[PackedPart]] = defaultdict(list)
+        parts: list[int] = []
         for table in tables:
             topic, layout = topic_of(connection, table, self._layouts)
             for rows in _in_parts(table) if len(table) else ():
-                numbers = np.full(len(rows), self._number, np.int64)
-                packed[topic].append(pack_rows(layout, rows, numbers))
-        parts = insert_parts(connection, packed, whole=True)
+                part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
+                parts.append(_insert_part(connection, topic, part, whole=True))
         share = round(self._share * sum(len(table) for table in tables))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
 
@@ -173,16 +148,12 @@ def thin_parts(
         (json.dumps(parts),),
     ):
         sizes[topic][part] = size
-    left = max(sum(sum(by_part.values()) for by_part in sizes.values()) + spare, at_least)
-    dropped = 0
+    of_topic = {topic: sum(by_part.values()) for topic, by_part in sizes.items()}
+    left, dropped = max(sum(of_topic.values()) + spare, at_least), 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
-        left -= sum(sizes[topic].values())
-        if left < 0:
-            dropped += sum(
-                size
-                for part, size in sizes[topic].items()
-                if _drop_columns(connection, topic, part)
-            )
+        left -= of_topic[topic]
+        for part, size in sizes[topic].items() if left < 0 else ():
+            dropped += size * _drop_columns(connection, topic, part)
     return dropped
 
 
@@ -220,7 +191,7 @@ def _in_parts(table: Table) -> Iterator[Table]:
 
 
 def lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether a table has no columns: with other definitions it may have some."""
+    """Returns whether some table has no columns: with other definitions it may have some."""
     return any("" in table.left_out for table in tables)
 
 
@@ -230,8 +201,8 @@ def _messages_of(bag: BagFile) -> int:
 
 def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
     """Inserts a bag; returns its number."""
-    key, bag, hashed, _ = to_store
-    summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
+    key, bag, hashed, *_ = to_store
+    summary = _number_of(connection, "summary", topics=bag.summary.schema.to_json())
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
         " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -242,35 +213,22 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
 
 def insert_bags(
     connection: sqlite3.Connection,
-    decoded: DecodedBags,
+    bags: Sequence[ReadBag],
     definitions: str,
     layouts: Layouts,
     *,
     whole: bool,
 ) -> list[int]:
     """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
-    lacking = {bag for table, bag in decoded.tables if lacks_definitions([table])}
-    numbers = [
-        insert_bag(connection, to_store, definitions if place in lacking else "")
-        for place, to_store in enumerate(decoded.bags)
-    ]
-    tables: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
+    rows: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
-    for table, bag in decoded.tables:
-        topic, layout_of[topic] = topic_of(connection, table, layouts)
-        tables[topic].append((table, np.full(len(table), numbers[bag])))
-    packed = {
-        topic: [packed_part(layout_of[topic], of_topic)] for topic, of_topic in tables.items()
-    }
-    return insert_parts(connection, packed, whole=whole)
-
-
-def insert_parts(
-    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
-) -> list[int]:
-    """Inserts parts, by the numbers of their topics; returns their ids."""
-    numbered = [(topic, part) for topic, of_topic in parts.items() for part in of_topic]
-    return [_insert_part(connection, topic, part, whole=whole) for topic, part in numbered]
+    for bag in bags:
+        number = insert_bag(connection, bag, definitions if lacks_definitions(bag.tables) else "")
+        for table in bag.tables:
+            topic, layout_of[topic] = topic_of(connection, table, layouts)
+            rows[topic].append((table, np.full(len(table), number)))
+    parts = ((topic, packed_part(layout_of[topic], of_topic)) for topic, of_topic in rows.items())
+    return [_insert_part(connection, topic, part, whole=whole) for topic, part in parts]
 
 
 def _insert_part(
@@ -287,35 +245,28 @@ def _insert_part(
         # Numbers that are rounded to one take no bytes, but are no constant.
         if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
             first = part.first_of.get(packed.data, path)
-            is_first = first == path
-            columns.append(
-                (number, path, None if is_first else first, packed.data if is_first else None)
-            )
+            own = (None, packed.data) if first == path else (first, None)
+            columns.append((number, path, *own))
     connection.executemany("INSERT INTO part_column VALUES (?, ?, ?, ?)", columns)
+    marks = ", ".join("?" * 10)
     connection.executemany(
-        "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        f"INSERT INTO zone VALUES ({marks})",
         [
-            (
-                topic,
-                path,
-                number,
-                packed.codec,
-                packed.count,
-                packed.error,
-                _storable(packed.zone.least),
-                _storable(packed.zone.greatest),
-                packed.zone.nulls,
-                packed.zone.words,
-            )
+            (topic, path, number, packed.codec, packed.count, packed.error, *_stored(packed.zone))
             for path, packed in part.columns.items()
         ],
     )
     return number
 
 
-def _storable(bound: int | float | None) -> float | str | None:  # noqa: PYI041 - unlike
-    """Returns the bound of a zone as SQLite can store it: of a uint64 above its integers a text."""
-    return str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
+def _stored(zone: Zone) -> tuple[float | str | None, ...]:
+    """Returns a zone as SQLite can store it: bounds of a uint64 above its integers as texts."""
+    least, greatest, nulls, words = zone
+    bounds = (
+        str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
+        for bound in (least, greatest)
+    )
+    return (*bounds, nulls, words)
 
 
 def zone_of(
@@ -348,29 +299,21 @@ class Layouts:
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
     """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
     channel, (layout, described) = table.channel, layouts.of(table)
-    schema = channel.schema
-    definition = _number_of(
-        connection,
-        "definition",
-        {"type": schema.name, "encoding": schema.encoding, "text": schema.text},
-    )
+    name, encoding, text = channel.schema
+    definition = _number_of(connection, "definition", type=name, encoding=encoding, text=text)
     topic = _number_of(
         connection,
         "topic",
-        {
-            "name": channel.topic,
-            "encoding": channel.encoding,
-            "latched": channel.latched,
-            "definition": definition,
-            "layout": described,
-        },
+        name=channel.topic,
+        encoding=channel.encoding,
+        latched=channel.latched,
+        definition=definition,
+        layout=described,
     )
     return topic, layout
 
 
-def _number_of(
-    connection: sqlite3.Connection, table: str, values: Mapping[str, str | bytes | int]
-) -> int:
+def _number_of(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:
     """Returns the id of the row with these values, which is inserted if it is new."""
     given = tuple(values.values())
     where = " AND ".join(f"{name} = ?" for name in values)
@@ -384,16 +327,12 @@ def _number_of(
 
 def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     """Deletes bags, and the parts that have rows of none that is left."""
-    numbers = [
-        row[0]
-        for row in connection.execute(
-            "SELECT id FROM bag WHERE path IN (SELECT value FROM json_each(?))",
-            (json.dumps(paths),),
-        )
-    ]
-    if not numbers:
+    deleted = connection.execute(
+        "DELETE FROM bag WHERE path IN (SELECT value FROM json_each(?)) RETURNING id",
+        (json.dumps(paths),),
+    ).fetchall()
+    if not deleted:
         return
-    connection.executemany("DELETE FROM bag WHERE id = ?", [(number,) for number in numbers])
     # A part goes with the last of its bags.
     gone = connection.execute(
         "SELECT id, topic FROM part WHERE NOT EXISTS"
