@@ -21,8 +21,6 @@ from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.storage.base import RELATCHED_NS, IntArray
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from ros2_memory.core.timebase import Ns
@@ -46,11 +44,6 @@ class Identities(NamedTuple):
     def rows(self, positions: IntArray) -> Identities:
         """Returns some of them."""
         return Identities(*(column[positions] for column in self))
-
-
-def joined_identities(parts: Sequence[Identities]) -> Identities:
-    """Returns all messages of several parts, in this order."""
-    return Identities(*map(np.concatenate, zip(*parts, strict=True)))
 
 
 def copies_among(messages: Identities) -> NDArray[np.bool_]:
@@ -102,11 +95,11 @@ def relatched_among(messages: Identities) -> NDArray[np.bool_]:
 
 def _shared_by_recordings(messages: Identities) -> IntArray:
     """Returns the rows whose publish time and payload several recordings have."""
+    if not messages.log_times.size:
+        return np.zeros(0, np.int64)
     order = np.lexsort((messages.recordings, messages.hashes, messages.publish_times))
     ordered = messages.rows(order)
     is_same = (np.diff(ordered.publish_times) == 0) & (np.diff(ordered.hashes) == 0)
-    group = np.concatenate(([0], np.cumsum(~is_same))) if order.size else order
+    group = np.append(0, np.cumsum(~is_same))
     is_elsewhere = is_same & (np.diff(ordered.recordings) != 0)
-    is_shared = np.zeros(int(group[-1]) + 1 if order.size else 0, np.bool_)
-    is_shared[group[1:][is_elsewhere]] = True
-    return order[is_shared[group]] if order.size else order
+    return order[np.isin(group, group[1:][is_elsewhere])]

@@ -8,7 +8,6 @@ have to be read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -65,12 +64,17 @@ class Detections(NamedTuple):
         message = np.searchsorted(rows, self.rows)
         is_among = message < rows.size
         is_among[is_among] = rows[message[is_among]] == self.rows[is_among]
+        return self._replace(rows=message).taken(is_among)
+
+    def taken(self, which: Ints | Mask) -> Detections:
+        """Returns some of them."""
+        rows, labels, scores, places, frames = self
         return Detections(
-            message[is_among],
-            Texts(self.labels.codes[is_among], self.labels.words),
-            self.scores[is_among],
-            self.places[is_among],
-            Texts(self.frames.codes[is_among], self.frames.words),
+            rows[which],
+            Texts(labels.codes[which], labels.words),
+            scores[which],
+            places[which],
+            Texts(frames.codes[which], frames.words),
         )
 
 
@@ -98,8 +102,7 @@ class Point(NamedTuple):
     frames: tuple[Leaf, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Labels:
+class Labels(NamedTuple):
     """Objects that may be detections: what names them, and what else there is where nothing does.
 
     Attributes:
@@ -118,15 +121,13 @@ class Labels:
     is_best: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
+class Words(NamedTuple):
     """A list of labels."""
 
     leaf: Leaf
 
 
-@dataclass(frozen=True, slots=True)
-class Json:
+class Json(NamedTuple):
     """A text that may be JSON, and how deep detections are looked for in it."""
 
     leaf: Leaf
@@ -386,14 +387,9 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
     positions = np.repeat(np.arange(len(texts)), counts)
     rows = _owners_at(values, source.leaf.level, positions, ROWS)
-    outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
-    yield Detections(
-        rows,
-        Texts(parsed.labels.codes[nth], parsed.labels.words),
-        parsed.scores[nth],
-        parsed.places[nth],
-        or_else(Texts(parsed.frames.codes[nth], parsed.frames.words), outer_frames),
-    )
+    found = parsed.taken(nth)._replace(rows=rows)
+    frames = _frames_at(values, source.leaf.level, positions, source.frames)
+    yield found._replace(frames=or_else(found.frames, frames))
 
 
 def _best_hypotheses(named: NamedScores, owners: Ints) -> Ints:

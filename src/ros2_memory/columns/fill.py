@@ -176,15 +176,14 @@ class Filling:
         pending: list[ReadBag] = []
         done = held = 0
         for bag in sorted(batch.bags, key=in_time):
-            tables: Sequence[Table] = ()
             read = self._read(bag, hashed=self._is_shared(bag, timeline))
             if isinstance(read, ReadBag):
                 pending.append(read)
-                tables = read.tables
+                held += sum(table.memory_bytes for table in read.tables)
             else:
                 done += read
+            del read  # and its tables, before the next is read
             self._large.release()
-            held += sum(table.memory_bytes for table in tables)
             if held > _MOST_HELD:
                 done += self._put(pending, whole=batch.whole)
                 pending, held = [], 0

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
+from ros2_memory.columns.copies import Identities, copies_among, relatched_among
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
@@ -136,7 +136,7 @@ class Scan:
         self._shared = [
             span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
         ]
-        self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
+        self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._relatched: dict[object, IntArray] = {}
@@ -203,26 +203,22 @@ class Scan:
         self, *, newest_first: bool, among: TimeWindow | None
     ) -> tuple[Sequence[_Source], set[int]]:
         """Returns the sources that are asked for, in their order; and the parts without a match."""
+        request = self._request
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window = self._request.window
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
-        sources = [s for s in sources if window.overlaps(s.first, s.last)]
-        ruled_out = self._ruled_out(sources)
-        if not self._request.may_not_match:
+        sources = [s for s in sources if request.window.overlaps(s.first, s.last)]
+        ruled_out: set[int] = set()
+        if request.may_match is not None:
+            heads = [source.part for source in sources if source.part is not None]
+            wanted = self._scanner.matching(heads, request.may_match)
+            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+        if not request.may_not_match:
             sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
-        if (within := self._request.within) is not None:
-            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
+        if request.within is not None:
+            sources = [s for s in sources if overlaps_any(request.within, s.first, s.last)]
         return sources, ruled_out
-
-    def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
-        """Returns the numbers of the parts that have no wanted row, by their zones."""
-        if self._request.may_match is None:
-            return set()
-        heads = [source.part for source in sources if source.part is not None]
-        wanted = self._scanner.matching(heads, self._request.may_match)
-        return {head.number for head, may in zip(heads, wanted, strict=True) if not may}
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
         """Returns the stretches of the clock that the window consists of, the newest first.
@@ -358,11 +354,8 @@ class Scan:
             if self._coverage is None:
                 return sources
             before, now = self._coverage.state, store.state()
-            if (failures, before.part, before.deletion) == (
-                store.failures,
-                now.part,
-                now.deletion,
-            ):
+            is_same = (before.part, before.deletion) == (now.part, now.deletion)
+            if is_same and store.failures == failures:
                 return sources
         self._coverage = None
         return [*self._sources_of(reach)]
@@ -409,21 +402,19 @@ class Scan:
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         return self._units_of_bag(source.bag)
 
-    def _units_of_bag(self, bag: BagFile) -> list[Unit]:
+    def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
         """Returns the tables of a bag, which is decoded unless it was one of the last."""
-        units = self._decoded.get(bag.file)
-        if units is None:
+        if bag.file not in self._decoded:
             hashed = bool(self._shared) or self._request.relatches
-            tables = _without_columns_if_large(
-                self._request.decode(bag, self._request.topic, hashed)
-            )
-            units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
+            tables = self._request.decode(bag, self._request.topic, hashed)
+            held = _without_columns_if_large(tables)
+            units = [BagUnit(bag, table, nth) for nth, table in enumerate(held) if len(table)]
             self._decoded[bag.file] = units
             while len(self._decoded) > _MOST_DECODED or (
                 len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
             ):
                 self._decoded.popitem(last=False)
-        return units
+        return self._decoded[bag.file]
 
     def _decoded_bytes(self) -> int:
         return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
@@ -431,11 +422,8 @@ class Scan:
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""
         window = self._request.window
-        is_counted = unit.counting()
-        if not window.covers(unit.first, unit.last):
-            times = unit.times()
-            is_inside = (times >= window.start) & (times < window.stop)
-            is_counted = is_inside if is_counted is None else is_counted & is_inside
+        is_covered = window.covers(unit.first, unit.last)
+        is_counted = unit.counting() if is_covered else _in_window(unit, window)
         repeated = self._repeated(unit)
         if repeated.size:
             is_counted = np.ones(len(unit.table), np.bool_) if is_counted is None else is_counted
@@ -476,20 +464,29 @@ class Scan:
 
     def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
         """Finds the copies in a part of a shared span."""
+
+        def are_copies(messages: Identities) -> Mask:
+            times = messages.log_times
+            return copies_among(messages) & (times >= part.start) & (times < part.stop)
+
         around = part.widened(2 * COPY_HORIZON_NS).intersect(span)
-        units = [*self._units_in(around)]
-        if len({unit.first_bag.recording for unit in units}) < 2:
-            return
-        rows = [self._rows_in(unit, around) for unit in units]
-        messages = self._messages(units, rows)
-        copies = copies_among(messages)
-        copies &= (messages.log_times >= part.start) & (messages.log_times < part.stop)
-        begin = 0
-        for unit, unit_rows in zip(units, rows, strict=True):
-            of_unit = unit_rows[copies[begin : begin + unit_rows.size]]
-            begin += unit_rows.size
-            if of_unit.size:
-                self._copies[unit.key].append(of_unit)
+        for unit, rows in self._judged(around, are_copies):
+            self._copies[unit.key].append(rows)
+
+    def _judged(
+        self, window: TimeWindow, judge: Callable[[Identities], Mask]
+    ) -> Iterator[tuple[Unit, IntArray]]:
+        """Yields the units of several recordings, with those rows in a window that are judged so.
+
+        `judge` is given all of their messages in the window.
+        """
+        units = [*self._units_in(window)]
+        if len({unit.first_bag.recording for unit in units}) > 1:
+            rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
+            judged = judge(self._messages(units, rows))
+            for unit, unit_rows in zip(units, rows, strict=True):
+                yield unit, unit_rows[judged[: unit_rows.size]]
+                judged = judged[unit_rows.size :]
 
     def _received_again(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that were received before, as late messages of a latch."""
@@ -506,21 +503,11 @@ class Scan:
         if since < self._relatched_since:
             # As much again before it: late messages come many at once, of about the same age.
             self._relatched_since = max(since - (unit.last - since), MIN_NS)
-            self._find_relatched(TimeWindow(self._relatched_since, MAX_NS))
+            window = TimeWindow(self._relatched_since, MAX_NS)
+            for late, rows in self._judged(window, relatched_among):
+                if late.table.channel.latched:
+                    self._relatched[late.key] = rows
         return self._relatched.get(unit.key, none)
-
-    def _find_relatched(self, window: TimeWindow) -> None:
-        units = [*self._units_in(window)]
-        rows = [self._rows_in(unit, window) for unit in units]
-        messages = self._messages(units, rows)
-        latched = np.repeat(
-            [unit.table.channel.latched for unit in units], [unit_rows.size for unit_rows in rows]
-        )
-        is_relatched = relatched_among(messages) & latched
-        begin = 0
-        for unit, unit_rows in zip(units, rows, strict=True):
-            self._relatched[unit.key] = unit_rows[is_relatched[begin : begin + unit_rows.size]]
-            begin += unit_rows.size
 
     @cached_property
     def _delays(self) -> dict[int, tuple[float, float]]:
@@ -548,28 +535,19 @@ class Scan:
         for source in self._sources_in(window):
             yield from self._units(source)
 
-    def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
-        times, is_counted = unit.times(), unit.counting()
-        is_inside = (times >= window.start) & (times < window.stop)
-        return np.flatnonzero(is_inside if is_counted is None else is_inside & is_counted)
-
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
         # By their names: of messages of one time that counts which lies in the first recording.
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
-        numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, unit_rows in zip(units, rows, strict=True):
-            recording = numbers[unit.first_bag.recording]
+            recording = recordings.index(unit.first_bag.recording)
             published, hashes = self._identities(unit, unit_rows)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
-            parts.append(
-                Identities(
-                    unit.times()[unit_rows], published, hashes, np.full(unit_rows.size, recording)
-                )
-            )
-        return joined_identities(parts)
+            of_recording = np.full(unit_rows.size, recording)
+            parts.append(Identities(unit.times()[unit_rows], published, hashes, of_recording))
+        return Identities(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _identities(self, unit: Unit, positions: IntArray) -> tuple[IntArray, IntArray]:
         """Returns publish times and hashes of some rows of a unit.
@@ -596,6 +574,13 @@ class Scan:
                     published[rows] = table.publish_times[same]
                     hashes[rows] = table.payload_hashes[same]
         return published[positions], hashes[positions]
+
+
+def _in_window(unit: Unit, window: TimeWindow) -> Mask:
+    """Returns which rows of a unit are in a window, and of bags that count."""
+    times, is_counted = unit.times(), unit.counting()
+    is_inside: Mask = (times >= window.start) & (times < window.stop)
+    return is_inside if is_counted is None else is_inside & is_counted
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -59,8 +59,7 @@ _MOST_DAMAGED: Final = 10_000
 """Files whose damage is remembered."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Heads:
+class _Heads(NamedTuple):
     """The parts of a topic, in order of their first log times.
 
     Attributes:

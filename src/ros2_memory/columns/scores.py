@@ -8,7 +8,6 @@ and more would have to be looked at then, the limits say that they do not know.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -49,8 +48,7 @@ class NamedScores(NamedTuple):
         return np.array([bool(word.strip()) for word in self.name.words], np.bool_)[self.name.codes]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scored:
+class Scored(NamedTuple):
     """An object that may be a detection: what names it, in order, and what its score is.
 
     Attributes:
@@ -179,7 +177,7 @@ def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
         inner = without_low(node.element, least, depth - 1) if has_objects else node.element
         return Listing(node.level, inner)
     if isinstance(node, Leaf) and node.kind is Kind.TEXT:
-        return replace(node, json_depth=depth)
+        return node._replace(json_depth=depth)
     return _object_without_low(node, least, depth) if is_object(node) else node
 
 
@@ -193,10 +191,10 @@ def _object_without_low(node: Object, least: float, depth: int) -> Node:
         level = several.level.parent or several.level
         best = _best_limit(level, several, least, _may_have_more(others, depth))
         kept = Narrowed(_hypothesis_limit(best, several, least), results.element)
-        shown = replace(node, fields={**fields, "results": Listing(results.level, kept)})
+        shown = node._replace(fields={**fields, "results": Listing(results.level, kept)})
         return Narrowed(best, shown)
     inner = {name: without_low(child, least, depth - 1) for name, child in fields.items()}
-    return replace(node, fields=inner)
+    return node._replace(fields=inner)
 
 
 def hypotheses(fields: Mapping[str, Node]) -> Scored | None:

@@ -85,8 +85,7 @@ def unknown(size: int) -> TruthValues:
     return TruthValues(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Limit:
+class Limit(NamedTuple):
     """For which rows or elements of a level something stands in the value.
 
     Attributes:
@@ -152,8 +151,7 @@ class Place(NamedTuple):
         return Place(Level(self.level, self.path), "", self.kind, None, self.depth + 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Object:
+class Object(NamedTuple):
     """A message that is shown field by field, or an object that the conversions make.
 
     Attributes:
@@ -170,31 +168,27 @@ class Object:
     is_summary: bool = False
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Listing:
+class Listing(NamedTuple):
     """A list of the elements of a level."""
 
     level: Level
     element: Node
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Items:
+class Items(NamedTuple):
     """A list of so many for all rows."""
 
     items: tuple[Leaf, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Narrowed:
+class Narrowed(NamedTuple):
     """A node that stands in the value of some rows or elements alone, and null in the others."""
 
     limit: Limit
     node: Node
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class Choice(NamedTuple):
     """An array of numbers (`array`), which is shown as one of these, whichever holds for a row."""
 
     cases: tuple[Node, ...]

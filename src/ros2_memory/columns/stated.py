@@ -7,7 +7,8 @@ of a goal, which has no columns) the messages are named that have to be read.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from functools import partial
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -50,12 +51,15 @@ from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShap
 from ros2_memory.columns.walk import entries_of_codes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats, Ints, Mask
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
+
+
+_NO_ROWS: Final = np.empty(0, np.int64)
 
 
 class FromColumns(NamedTuple):
@@ -88,13 +92,13 @@ class StatedColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._plans = ByType(extractor, _Plan.of)
+        self._readers = ByType(extractor, _reader_of)
 
     def of(self, table: Table) -> FromColumns | None:
         """Returns what the messages of a table state; None where they all have to be read."""
-        plan = self._plans.of(table)
+        read = self._readers.of(table)
         try:
-            return None if plan is None else plan.read(table)
+            return None if read is None else read(Values(table))
         except UnknownShapeError:
             return None
 
@@ -107,65 +111,29 @@ class _Entry(NamedTuple):
     text: Leaf
 
 
-class _Plan(NamedTuple):
-    """What is looked for in the messages of a type."""
+def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
+    """Returns what reads from tables what messages of a type state.
 
-    type: str
-    labels: tuple[Source, ...] = ()
-    flags: tuple[tuple[str, Leaf], ...] = ()
-    entry: _Entry | None = None
-    numbers: tuple[Leaf, ...] = ()
-
-    @classmethod
-    def of(cls, shape: Shape) -> _Plan:
-        """Returns what is looked for in the value of a type.
-
-        Raises:
-            UnknownShapeError: it depends on the message.
-        """
-        value, type_name = shape.value, shape.type
-        if type_name == GOALS:
-            return cls(type_name, numbers=tuple(_goal_leaves(value)))
-        if has_errors(type_name):
-            return cls(type_name, entry=_entry_leaves(value, type_name))
-        numbers: tuple[Leaf, ...] = ()
-        if type_name in VELOCITIES:
-            numbers = tuple(_command_leaves(value))
-        elif type_name == BATTERY:
-            numbers = tuple(_charge_leaves(value))
-        if not has_events(type_name):
-            return cls(type_name, numbers=numbers)
-        flags = tuple(_flag_leaves(value, ""))
-        if len(flags) > MOST[FLAG]:
-            raise UnknownShapeError("more booleans than are tracked")
-        return cls(type_name, tuple(sources_in(value)), flags, numbers=numbers)
-
-    def read(self, table: Table) -> FromColumns:
-        """Returns what the messages of a table state.
-
-        Raises:
-            UnknownShapeError: they have to be read.
-        """
-        values, nothing = Values(table), np.empty(0, np.int64)
-        if self.type == GOALS:
-            stated = Stated(table.log_times)
-            return FromColumns(stated, nothing, _alike_goals(values, self.numbers))
-        if self.entry:
-            facts = _entry_facts(values, self.entry, self.type)
-            return FromColumns(Stated(table.log_times, facts), nothing)
-        labels = joined_facts(
-            [facts for source in self.labels for facts in _label_facts(values, source)]
-        )
-        if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
-            raise UnknownShapeError("more labels than are tracked")
-        numbers, to_read = NOTHING, nothing
-        if self.numbers:
-            facts_of = _charge_facts if self.type == BATTERY else _command_facts
-            numbers, to_read = facts_of(values, self.numbers)
-        flags = [_flag_facts(values, path, leaf) for path, leaf in self.flags]
-        return FromColumns(
-            Stated(table.log_times, joined_facts([labels, *flags, numbers])), to_read
-        )
+    Raises:
+        UnknownShapeError: that depends on the message.
+    """
+    value, type_name = shape.value, shape.type
+    if type_name == GOALS:
+        return partial(_goals, [*_goal_leaves(value)])
+    if has_errors(type_name):
+        return partial(_entries, _entry_leaves(value, type_name), type_name)
+    numbers: Callable[[Values], tuple[Facts, Ints]] | None = None
+    commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
+    leaf = _child(value, "percentage")
+    if commands:
+        numbers = partial(_command_facts, commands)
+    elif type_name == BATTERY and isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
+        numbers = partial(_charge_facts, leaf)
+    flags = [*_flag_leaves(value, "")] if has_events(type_name) else []
+    if len(flags) > MOST[FLAG]:
+        raise UnknownShapeError("more booleans than are tracked")
+    sources = [*sources_in(value)] if has_events(type_name) else []
+    return partial(_states, sources, flags, numbers)
 
 
 # What a type has
@@ -200,12 +168,6 @@ def _child(node: Node | None, name: str) -> Node | None:
     return node.fields.get(name) if is_object(node) else None
 
 
-def _charge_leaves(value: Node) -> Iterator[Leaf]:
-    leaf = _child(value, "percentage")
-    if isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
-        yield leaf
-
-
 def _command_leaves(value: Node) -> Iterator[Leaf]:
     """Yields the floats of a command."""
     for _, leaf, limits in leaves_below(Spot(value)):
@@ -233,13 +195,41 @@ def _goal_leaves(value: Node) -> Iterator[Leaf]:
 # What a table holds
 
 
-def _label_facts(values: Values, source: Source) -> Iterator[Facts]:
-    """Yields the labels at one place of the messages, with their scores."""
-    for detections in found_in(values, source, places=False):
-        words = [Word(LABEL, label) for label in detections.labels.words]
-        yield Facts(
-            detections.rows, detections.labels.codes.astype(np.int64), detections.scores, words
-        )
+def _goals(leaves: Sequence[Leaf], values: Values) -> FromColumns:
+    return FromColumns(Stated(values.table.log_times), _NO_ROWS, _alike_goals(values, leaves))
+
+
+def _entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
+    return FromColumns(
+        Stated(values.table.log_times, _entry_facts(values, entry, type_name)), _NO_ROWS
+    )
+
+
+def _states(
+    sources: Sequence[Source],
+    flags: Sequence[tuple[str, Leaf]],
+    numbers: Callable[[Values], tuple[Facts, Ints]] | None,
+    values: Values,
+) -> FromColumns:
+    """Returns what messages state by labels with their scores, booleans and numbers."""
+    found = [part for source in sources for part in found_in(values, source, places=False)]
+    labels = joined_facts(
+        [
+            Facts(
+                part.rows,
+                part.labels.codes.astype(np.int64),
+                part.scores,
+                [Word(LABEL, label) for label in part.labels.words],
+            )
+            for part in found
+        ]
+    )
+    if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
+        raise UnknownShapeError("more labels than are tracked")
+    of_numbers, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
+    of_flags = [_flag_facts(values, path, leaf) for path, leaf in flags]
+    facts = joined_facts([labels, *of_flags, of_numbers])
+    return FromColumns(Stated(values.table.log_times, facts), unsure)
 
 
 def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
@@ -286,16 +276,16 @@ def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") 
     return state_of(value, type_name).facts
 
 
-def _charge_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, Ints]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
-    charges, error = values.floats(leaves[0])
+    charges, error = values.floats(leaf)
     low, levels, high = (charge_levels(charges + off) for off in (-error, 0, error))
     settled = np.flatnonzero((levels >= 0) & (low == high))
     charge = _facts_of(CHARGE, settled, levels[settled])
     return charge, np.flatnonzero(low != high)
 
 
-def _command_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, Ints]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
     surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:

@@ -316,15 +316,23 @@ class ColumnStore(Database):
                 PartHead(
                     self.offset + number,
                     self.offset + topic_number,
-                    *span_ns,
+                    first,
+                    last,
                     numbers,
                     messages,
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for (_, number, topic_number, *span_ns, messages, dropped, whole), numbers in zip(
-                    rows, bags_of_parts, strict=True
-                )
+                for numbers, (
+                    _,
+                    number,
+                    topic_number,
+                    first,
+                    last,
+                    messages,
+                    dropped,
+                    whole,
+                ) in zip(bags_of_parts, rows, strict=True)
             ]
 
         return self.read(ask, [])

@@ -10,7 +10,6 @@ What is known without unpacking a column (its zone) is looked at first.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -179,8 +178,7 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
     return tests
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _LeafTest:
+class _LeafTest(NamedTuple):
     """`contains`, `equals`, `above` or `below`, on one leaf of a value.
 
     Attributes:
@@ -402,8 +400,7 @@ def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
     return is_equal
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlaceTest:
+class _PlaceTest(NamedTuple):
     """`near_position`, on one position of a value: the leaves of its x, y and perhaps z."""
 
     test: NearPosition

@@ -9,7 +9,6 @@ to be read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
@@ -80,8 +79,7 @@ class Conversion(Enum):
 _ANGLES: Final = {Conversion.ROLL: 0, Conversion.PITCH: 1, Conversion.YAW: 2}
 
 
-@dataclass(frozen=True, slots=True)
-class Level:
+class Level(NamedTuple):
     """Where values lie: in the rows of a table (no parent), or in the elements of a sequence.
 
     `name` is the sequence's dot-path in the parent.
@@ -102,8 +100,7 @@ class Level:
 ROWS: Final = Level(None, "")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Leaf:
+class Leaf(NamedTuple):
     """A number, a boolean or a text of each row or element of a level.
 
     Attributes:
@@ -334,7 +331,7 @@ def _with_long_arrays(numbers: Zone | Zones, lengths: Zone | Zones) -> Zone | Zo
     are_long = lengths.reaches(MAX_NUMBERS, above=True)
     if isinstance(numbers, Zones):
         low = np.where(are_long, -math.inf, numbers.low)
-        return replace(numbers, low=low, high=np.where(are_long, math.inf, numbers.high))
+        return numbers._replace(low=low, high=np.where(are_long, math.inf, numbers.high))
     return None if are_long else numbers
 
 

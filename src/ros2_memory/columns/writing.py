@@ -259,14 +259,14 @@ def _insert_part(
     return number
 
 
-def _stored(zone: Zone) -> tuple[float | str | None, ...]:
+def _stored(zone: Zone) -> tuple[int | float | str | None, ...]:
     """Returns a zone as SQLite can store it: bounds of a uint64 above its integers as texts."""
-    least, greatest, nulls, words = zone
-    bounds = (
+    bounds: list[int | float | None] = [zone.least, zone.greatest]
+    stored = (
         str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
-        for bound in (least, greatest)
+        for bound in bounds
     )
-    return (*bounds, nulls, words)
+    return (*stored, zone.nulls, zone.words)
 
 
 def zone_of(
@@ -299,8 +299,10 @@ class Layouts:
 def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> tuple[int, Layout]:
     """Returns the number of a table's topic, which is inserted if it is new, and its layout."""
     channel, (layout, described) = table.channel, layouts.of(table)
-    name, encoding, text = channel.schema
-    definition = _number_of(connection, "definition", type=name, encoding=encoding, text=text)
+    schema = channel.schema
+    definition = _number_of(
+        connection, "definition", type=schema.name, encoding=schema.encoding, text=schema.text
+    )
     topic = _number_of(
         connection,
         "topic",

@@ -17,7 +17,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.store import ColumnStore
 from ros2_memory.columns.table import Column, Table
 from ros2_memory.columns.units import GoneError
-from ros2_memory.columns.writing import BagRows, DecodedBags, ReadBag
+from ros2_memory.columns.writing import ReadBag
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import (
     battery,
@@ -153,8 +153,7 @@ def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
     times = bag.start + np.arange(3)
     channel = Channel("/kinds", "cdr", Schema("a_msgs/msg/Kinds"))
     table = Table(channel, times, times, np.arange(3), numbers)
-    to_store = ReadBag(world.filling._key(bag), bag)
-    stored = DecodedBags([to_store], [BagRows(table, 0)])
+    stored = [ReadBag(world.filling._key(bag), bag, tables=[table])]
     assert world.store.put(stored, whole=True).bags == 1
     timeline = world.memory.index.snapshot().timeline
     scanner = Scanner(world.store, tmp_path)
