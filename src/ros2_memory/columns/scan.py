@@ -561,10 +561,9 @@ class Scan:
         if not unknown.size:
             return published[positions], hashes[positions]
         published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
-        bags = unit.bags()
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._request.decode(bags[number], self._request.topic, True):
+            for table in self._request.decode(unit.bag_of(number), self._request.topic, True):
                 if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
                     continue
                 # A part has ten minutes of a long bag.

@@ -362,12 +362,13 @@ class Scanner:
         return Unit(
             head.number,
             table,
-            (head.first, head.last),
-            load=integers,
-            counting=counting - offset,
-            bag_of=bag_of,
-            part=head.number if head.is_whole else None,
-            all_count=counting.size == head.bags.size,
+            head.first,
+            head.last,
+            integers,
+            counting - offset,
+            bag_of,
+            head.number if head.is_whole else None,
+            counting.size == head.bags.size,
         )
 
     def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:

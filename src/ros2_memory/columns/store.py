@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.fragments import FragmentKey
-    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.table import Table, Zone
 
 FILE: Final = "columns.sqlite"
 CATALOGUE: Final = "catalogue.sqlite"
@@ -225,22 +225,20 @@ class ColumnStore(Database):
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
         condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
-        rows = self._rows(
-            list[tuple[int, int, str, int, Ns, Ns, Ns, Ns]](),
+        return self._asked(
+            lambda rows: {
+                key[0]: StoredBag(BagKey(*key), row, bool(hashed)) for row, hashed, *key in rows
+            },
+            {},
             f"SELECT id, hashed, {_KEY} FROM bag WHERE definitions IN ('', ?) {condition}",
-            self._definitions,
-            *(() if paths is None else (json.dumps(paths),)),
+            *(self._definitions, *(() if paths is None else (json.dumps(paths),))),
         )
-        stored = (StoredBag(BagKey._make(key), row, bool(hashed)) for row, hashed, *key in rows)
-        return {bag.key.path: bag for bag in stored}
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
-
-        def ask(connection: sqlite3.Connection) -> frozenset[int]:
-            return frozenset(self.offset + row[0] for row in connection.execute(UNMERGED))
-
-        return self.read(ask, frozenset())
+        return self._asked(
+            lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), UNMERGED
+        )
 
     def dropped(self) -> dict[str, Ns]:
         """Returns the topics of which columns were dropped, with the log time (ns) of the first."""
@@ -248,21 +246,21 @@ class ColumnStore(Database):
             "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
             " WHERE dropped <> '' GROUP BY name ORDER BY name"
         )
-        return dict(self._rows(list[tuple[str, Ns]](), query))
+        return self._asked(dict, {}, query)
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""
-        rows = self._rows(list[tuple[Ns | None]](), "SELECT min(first_ns) FROM bag")
-        return rows[0][0] if rows else None
+        query, none = "SELECT min(first_ns) FROM bag", list[tuple[Ns | None]]()
+        return next((first for (first,) in self._asked(list, none, query)), None)
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
         query = f"SELECT {_KEY} FROM bag WHERE first_ns < ?"
-        return [*map(BagKey._make, self._rows(list[tuple[str | int, ...]](), query, before))]
+        return self._asked(lambda rows: [*map(BagKey._make, rows)], [], query, before)
 
     def paths(self) -> list[str]:
         """Returns the paths of all bags, also of those that are stored in part."""
-        return [path for (path,) in self._rows(list[tuple[str]](), "SELECT path FROM bag")]
+        return self._asked(lambda rows: [path for (path,) in rows], [], "SELECT path FROM bag")
 
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
@@ -339,33 +337,27 @@ class ColumnStore(Database):
 
     def zones(self, topic: int, path: str, after: int = 0) -> Zones:
         """Returns the zones of a column in all parts of a topic that are newer than a part."""
-
-        def ask(connection: sqlite3.Connection) -> Zones:
-            rows = connection.execute(
-                "SELECT part, least, greatest, nulls, words FROM zone"
-                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
-                (topic - self.offset, path, max(after - self.offset, 0)),
-            ).fetchall()
-            parts = [self.offset + part for part, *_ in rows]
-            return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
-
-        return self.read(ask, Zones.of([], []))
+        found: list[tuple[int, Zone]] = self._asked(
+            lambda rows: [(self.offset + part, zone_of(*zone)) for part, *zone in rows],
+            [],
+            "SELECT part, least, greatest, nulls, words FROM zone"
+            " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
+            *(topic - self.offset, path, max(after - self.offset, 0)),
+        )
+        return Zones.of([part for part, _ in found], [zone for _, zone in found])
 
     def packed(self, topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
         """Returns what is known of a column in some parts of a topic, without its values."""
-
-        def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
-            rows = connection.execute(
-                "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
-                " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
-                (topic - self.offset, path, self._ids(parts)),
-            )
-            return {
+        return self._asked(
+            lambda rows: {
                 part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
                 for part, codec, count, error, *zone in rows
-            }
-
-        return self.read(ask, {})
+            },
+            {},
+            "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
+            " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
+            *(topic - self.offset, path, self._ids(parts)),
+        )
 
     def part_data(self, parts: Sequence[int], path: str, most_bytes: int) -> dict[int, bytes]:
         """Returns the compressed bytes of a column by part, in the order of `parts`.
@@ -399,17 +391,18 @@ class ColumnStore(Database):
 
         They are of the same settings, the newest first.
         """
-        key_parts, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
-        query = (
+        key_parts = self._ids(key.parts)
+        return self._asked(
+            lambda rows: [
+                (key._replace(start=start, parts=self._numbers_of(parts)), data)
+                for start, parts, data in rows
+                if start < key.start or parts == key_parts
+            ],
+            [],
             "SELECT start_ns, parts, data FROM fragment"
-            " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC"
+            " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC",
+            *(kind, key.settings, max(key.start - also_before, MIN_NS), key.start),
         )
-        since = max(key.start - also_before, MIN_NS)
-        return [
-            (key._replace(start=start, parts=self._numbers_of(parts)), data)
-            for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
-            if start < key.start or parts == key_parts
-        ]
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
         """Returns where slices begin whose fragments all depend on other settings, newest first.
@@ -424,15 +417,17 @@ class ColumnStore(Database):
             " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
             " ORDER BY start_ns DESC"
         )
-        return [start for (start,) in self._rows(list[tuple[Ns]](), query, reading)]
+        return self._asked(lambda rows: [start for (start,) in rows], [], query, reading)
 
     def listings(self) -> dict[str, str]:
         """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
-        return dict(self._rows(list[tuple[str, str]](), "SELECT folder, listed FROM listing"))
+        return self._asked(dict, {}, "SELECT folder, listed FROM listing")
 
-    def _rows(self, none: list[T], query: str, *given: str | int) -> list[T]:
-        """Returns the rows of a query; `none` where the file cannot be read."""
-        return self.read(lambda connection: connection.execute(query, given).fetchall(), none)
+    def _asked(
+        self, make: Callable[[sqlite3.Cursor], T], unknown: T, query: str, *given: str | int
+    ) -> T:
+        """Returns what is made of the rows of a query; `unknown` where the file cannot be read."""
+        return self.read(lambda connection: make(connection.execute(query, given)), unknown)
 
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])
