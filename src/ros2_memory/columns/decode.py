@@ -128,12 +128,13 @@ def decoded(
         kinds = _Kinds(reader, hashed, columns)
         kinds.look_at(channels, path, window)
         alone = reader.times_alone(path)
-        bare = {channel.topic for channel in channels}
-        for channel in channels:
-            kind = kinds.of(channel)
-            # Copies of messages without a payload are recognised by their publish times.
-            if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
-                bare.discard(channel.topic)
+        kind_of = [(channel.topic, kinds.of(channel)) for channel in channels]
+        # Copies of messages without a payload are recognised by their publish times.
+        bare = {channel.topic for channel in channels} - {
+            topic
+            for topic, kind in kind_of
+            if kind.plan is not None or (kind.is_hashed and topic not in alone)
+        }
         wanted = {channel.topic for channel in channels}
         group = _Group(reader, skip_undecodable)
         for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
@@ -168,20 +169,16 @@ class _Kinds:
 
     def look_at(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
         """Finds the topics of a large file that have large messages, by the newest of each."""
-        size = 0
-        if not self.columns:
+        try:
+            is_large = self.columns and path.stat().st_size > LARGE_FILE_BYTES
+        except OSError:
             return
-        with suppress(OSError):
-            size = path.stat().st_size
-        if size <= LARGE_FILE_BYTES:
-            return
-        for channel in channels:
-            if self._plan(channel, self.reader.definition(channel))[0] is None:
-                continue
-            with suppress(BagError):
-                newest = self.reader.newest(path, channel.topic, window)
-                if newest is not None and len(newest.payload) > BULKY_BYTES:
-                    self._bulky.add(channel.topic)
+        for channel in channels if is_large else ():
+            if self._plan(channel, self.reader.definition(channel))[0] is not None:
+                with suppress(BagError):
+                    newest = self.reader.newest(path, channel.topic, window)
+                    if newest is not None and len(newest.payload) > BULKY_BYTES:
+                        self._bulky.add(channel.topic)
 
     def of(self, channel: Channel) -> _Kind:
         """Returns the kind of a channel."""
@@ -247,19 +244,13 @@ class _Group:
         channel = batch.channel
         parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
         for piece in _pieces_of(batch):
-            self._append_alike(
-                parts, _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
-            )
-
-    def _append_alike(self, parts: list[Table], table: Table) -> None:
-        """Adds a table to those of its topic, of which all have columns or none has."""
-        if "" in table.left_out and parts and "" not in parts[0].left_out:
-            parts[:] = [
-                replace(part, columns={}, elements={}, left_out=table.left_out) for part in parts
-            ]
-        elif parts and "" in parts[0].left_out:
-            table = replace(table, columns={}, elements={}, left_out=parts[0].left_out)
-        parts.append(table)
+            table = _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
+            # Of one topic all have columns, or none has.
+            if parts and ("" in table.left_out) != ("" in parts[0].left_out):
+                reason = table.left_out.get("") or parts[0].left_out[""]
+                parts[:] = [part.without_columns(reason) for part in parts]
+                table = table.without_columns(reason)
+            parts.append(table)
 
     def tables(self, following: _Group | None = None) -> list[Table]:
         """Returns the tables, each of all its parts.
@@ -324,7 +315,7 @@ def _decoded_batch(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) 
     try:
         return joined([*_one_by_one(reader, kind.plan, batch, table, skip=skip)])
     except UndecodableError as error:
-        return replace(table, left_out={"": f"some cannot be decoded: {error.reason}"})
+        return table.without_columns(f"some cannot be decoded: {error.reason}")
 
 
 def _with_columns(table: Table, level: LevelColumns) -> Table:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from ros2_memory.columns.layout import columns_in
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
 from ros2_memory.columns.table import Table, Zone, joined
@@ -96,11 +97,7 @@ def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> Pac
 
 
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
-    """Returns the rows of a table, each with the number of its bag, as a part.
-
-    Raises:
-        ValueError: the table has other columns than the layout.
-    """
+    """Returns the rows of a table of a layout, each with the number of its bag, as a part."""
     common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
     packed: dict[str, Packed] = {}
     if table.payload_hashes is not None:
@@ -112,7 +109,7 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
             published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
             packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
     steps = (kind.step for kind in layout.slots.values())
-    columns = [*common.values(), *layout.columns_of(table)]
+    columns = [*common.values(), *(column for _, column in columns_in(table))]
     packs = map(pack, columns, chain(repeat(EXACT, len(common)), steps))
     packed.update(zip((*common, *layout.slots), packs, strict=True))
     return PackedPart(

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -597,9 +597,6 @@ def _without_columns_if_large(tables: Iterable[Table]) -> list[Table]:
         size += table.memory_bytes
         held.append(table)
         if size > _MOST_BYTES:
-            left_out = {"": _TOO_LARGE}
-            held = [
-                replace(earlier, columns={}, elements={}, left_out=left_out) for earlier in held
-            ]
+            held = [earlier.without_columns(_TOO_LARGE) for earlier in held]
         del table
     return held
