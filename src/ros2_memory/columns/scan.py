@@ -101,6 +101,11 @@ class _Source(NamedTuple):
     part: PartHead | None
     bag: BagFile | None = None
 
+    @property
+    def number(self) -> int | None:
+        """The number of the part; None of a bag."""
+        return None if self.part is None else self.part.number
+
 
 class Stretch(NamedTuple):
     """A stretch of the clock in a scan. No rows that begin in it overlap those of another one.
@@ -184,11 +189,10 @@ class Scan:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                self._together = [s.part for s in sources[nth:ahead] if s.part is not None]
+                self._together = _heads(sources[nth:ahead])
             self._request.check(source.last if newest_first else source.first)
-            may_match = source.part is None or source.part.number not in ruled_out
             waiting += [
-                Rows(unit, partial(self._counting, unit), may_match=may_match)
+                Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
                 for unit in self._units(source)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
@@ -211,11 +215,11 @@ class Scan:
         sources = [s for s in sources if request.window.overlaps(s.first, s.last)]
         ruled_out: set[int] = set()
         if request.may_match is not None:
-            heads = [source.part for source in sources if source.part is not None]
+            heads = _heads(sources)
             wanted = self._scanner.matching(heads, request.may_match)
             ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
         if not request.may_not_match:
-            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
+            sources = [source for source in sources if source.number not in ruled_out]
         if request.within is not None:
             sources = [s for s in sources if overlaps_any(request.within, s.first, s.last)]
         return sources, ruled_out
@@ -266,31 +270,27 @@ class Scan:
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
-        bag = self._first_bag(self._heads[part])
+        bag = self._first_bag(self._head_of[part])
         if bag is None:
             raise GoneError
         return bag.recording
 
     @cached_property
     def _numbers(self) -> IntArray:
-        return np.array(
-            [0 if source.part is None else source.part.number for source in self._sources]
-        )
+        return np.array([source.number or 0 for source in self._sources])
 
     @cached_property
-    def _heads(self) -> dict[int, PartHead]:
-        return {source.part.number: source.part for source in self._sources if source.part}
+    def _head_of(self) -> dict[int, PartHead]:
+        return {head.number: head for head in _heads(self._sources)}
 
     @cached_property
     def _others(self) -> IntArray:
         """How many of the first sources are not whole parts of which all rows count."""
-        parts = [source.part for source in self._sources]
-        is_whole = np.array([part is not None and part.is_whole for part in parts], np.bool_)
-        heads = [part for part in parts if part is not None]
-        if self._coverage is not None and heads:
-            counting = self._coverage.counts([head.bags for head in heads])
-            all_count = counting == [head.bags.size for head in heads]
-            is_whole[[part is not None for part in parts]] &= all_count
+        is_whole = np.array([bool(s.part and s.part.is_whole) for s in self._sources], np.bool_)
+        bags = [head.bags for head in _heads(self._sources)]
+        if self._coverage is not None and bags:
+            all_count = self._coverage.counts(bags) == [*map(len, bags)]
+            is_whole[self._numbers > 0] &= all_count
         is_whole &= self._lasts - self._firsts < STRETCH_NS
         return np.concatenate([[0], np.cumsum(~is_whole)])
 
@@ -329,10 +329,8 @@ class Scan:
         spans = [TimeWindow(*span) for span in self._shared]
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         for source in self._sources:
-            part = None if source.part is None else source.part.number
-            if id(source) not in shared and not (
-                self._request.relatches and self._may_be_late(part)
-            ):
+            may_be_late = self._request.relatches and self._may_be_late(source.number)
+            if not may_be_late and id(source) not in shared:
                 continue
             self._request.check(source.first)
             for unit in self._units(source):
@@ -437,9 +435,7 @@ class Scan:
         spans: list[tuple[Ns, Ns]] = []
         for start, stop in self._shared:
             published = sorted(
-                (-math.inf, math.inf)
-                if source.part is None
-                else self._published[source.part.number]
+                self._published.get(source.number, (-math.inf, math.inf))
                 for source in self._sources_in(TimeWindow(start, stop))
             )
             if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
@@ -510,20 +506,20 @@ class Scan:
         return self._relatched.get(unit.key, none)
 
     @cached_property
-    def _delays(self) -> dict[int, tuple[float, float]]:
+    def _delays(self) -> dict[int | None, tuple[float, float]]:
         return self._bounds(DELAY)
 
     @cached_property
-    def _published(self) -> dict[int, tuple[float, float]]:
+    def _published(self) -> dict[int | None, tuple[float, float]]:
         return self._bounds(PUBLISH_TIME)
 
-    def _bounds(self, path: str) -> dict[int, tuple[float, float]]:
-        heads = [source.part for source in self._sources if source.part is not None]
-        return self._scanner.bounds(heads, path)
+    def _bounds(self, path: str) -> dict[int | None, tuple[float, float]]:
+        bounds = self._scanner.bounds(_heads(self._sources), path)
+        return {number: span for number, span in bounds.items()}  # noqa: C416 - also of None
 
     def _may_be_late(self, part: int | None) -> bool:
-        """Returns whether a part may have messages that were received long after."""
-        return part is None or self._delays[part][1] > RELATCHED_NS
+        """Returns whether a part, or a bag, may have messages that were received long after."""
+        return self._delays.get(part, (0.0, math.inf))[1] > RELATCHED_NS
 
     def _sources_in(self, window: TimeWindow) -> list[_Source]:
         # They are in the order of their first times, and reach beyond the next ones.
@@ -580,6 +576,10 @@ def _in_window(unit: Unit, window: TimeWindow) -> Mask:
     times, is_counted = unit.times(), unit.counting()
     is_inside: Mask = (times >= window.start) & (times < window.stop)
     return is_inside if is_counted is None else is_inside & is_counted
+
+
+def _heads(sources: Iterable[_Source]) -> list[PartHead]:
+    return [source.part for source in sources if source.part is not None]
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
