@@ -155,23 +155,23 @@ class Covering:
     def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
         has_changed = self._latest is None or self._latest[1].state != state
         remembered = {
-            nth: covered
-            for nth, segment in enumerate(timeline.segments)
+            id(segment): covered
+            for segment in timeline.segments
             if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
             and not (has_changed and covered.missing)
         }
-        to_look_up = [nth for nth in range(len(timeline.segments)) if nth not in remembered]
+        unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
         stored: Mapping[str, StoredBag] = {}
-        root = str(self._bag_dir)
-        if len(to_look_up) > _FEW:
+        if len(unknown) > _FEW:
             stored = self.store.bags()
-        elif to_look_up:
-            bags = chain.from_iterable(timeline.segments[nth].bags for nth in to_look_up)
+        elif unknown:
+            root = str(self._bag_dir)
+            bags = chain.from_iterable(segment.bags for segment in unknown)
             stored = self.store.bags([relative(bag.file, root) for bag in bags])
         return [
-            remembered[nth] if nth in remembered else self._covered_segment(segment, stored)
-            for nth, segment in enumerate(timeline.segments)
+            remembered.get(id(segment)) or self._covered_segment(segment, stored)
+            for segment in timeline.segments
         ]
 
     def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:

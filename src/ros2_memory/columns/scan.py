@@ -16,10 +16,17 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.copies import Identities, copies_among, relatched_among
 from ros2_memory.columns.fragments import FragmentKey
-from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
-from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
+from ros2_memory.columns.units import (
+    BagUnit,
+    GoneError,
+    Identities,
+    Rows,
+    Unit,
+    copies_among,
+    relatched_among,
+)
+from ros2_memory.columns.writing import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns

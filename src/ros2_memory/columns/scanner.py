@@ -17,10 +17,10 @@ from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
-from ros2_memory.columns.parts import LOG_TIME
 from ros2_memory.columns.stored import StoredTable, lazy_columns
 from ros2_memory.columns.table import Column, Table, Zone, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
+from ros2_memory.columns.writing import LOG_TIME
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads

@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.fragments import FragmentKey
-    from ros2_memory.columns.table import Table, Zone
+    from ros2_memory.columns.table import Table
 
 FILE: Final = "columns.sqlite"
 CATALOGUE: Final = "catalogue.sqlite"
@@ -337,27 +337,33 @@ class ColumnStore(Database):
 
     def zones(self, topic: int, path: str, after: int = 0) -> Zones:
         """Returns the zones of a column in all parts of a topic that are newer than a part."""
-        found: list[tuple[int, Zone]] = self._asked(
-            lambda rows: [(self.offset + part, zone_of(*zone)) for part, *zone in rows],
-            [],
-            "SELECT part, least, greatest, nulls, words FROM zone"
-            " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
-            *(topic - self.offset, path, max(after - self.offset, 0)),
-        )
-        return Zones.of([part for part, _ in found], [zone for _, zone in found])
+
+        def ask(connection: sqlite3.Connection) -> Zones:
+            rows = connection.execute(
+                "SELECT part, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part > ? ORDER BY part",
+                (topic - self.offset, path, max(after - self.offset, 0)),
+            ).fetchall()
+            parts = [self.offset + part for part, *_ in rows]
+            return Zones.of(parts, [zone_of(*zone) for _, *zone in rows])
+
+        return self.read(ask, Zones.of([], []))
 
     def packed(self, topic: int, path: str, parts: Sequence[int]) -> dict[int, Packed]:
         """Returns what is known of a column in some parts of a topic, without its values."""
-        return self._asked(
-            lambda rows: {
+
+        def ask(connection: sqlite3.Connection) -> dict[int, Packed]:
+            rows = connection.execute(
+                "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
+                " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
+                (topic - self.offset, path, self._ids(parts)),
+            )
+            return {
                 part + self.offset: Packed(intern(codec), count, error, zone_of(*zone), b"")
                 for part, codec, count, error, *zone in rows
-            },
-            {},
-            "SELECT part, codec, count, error, least, greatest, nulls, words FROM zone"
-            " WHERE topic = ? AND path = ? AND part IN (SELECT value FROM json_each(?))",
-            *(topic - self.offset, path, self._ids(parts)),
-        )
+            }
+
+        return self.read(ask, {})
 
     def part_data(self, parts: Sequence[int], path: str, most_bytes: int) -> dict[int, bytes]:
         """Returns the compressed bytes of a column by part, in the order of `parts`.
@@ -498,24 +504,17 @@ class ColumnStore(Database):
 
         Only if it was stored with as many messages of each topic as it has now.
         """
-        kept = False
 
-        def write(connection: sqlite3.Connection) -> None:
-            nonlocal kept
+        def write(connection: sqlite3.Connection) -> bool:
             cursor = connection.execute(
                 "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
                 " AND mtime_ns = ?4 AND counts = ?5"
                 " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
-                (
-                    key.sidecar_ns,
-                    *key[:3],
-                    bag.summary.packed,
-                    bag.summary.schema.to_json(),
-                ),
+                (key.sidecar_ns, *key[:3], bag.summary.packed, bag.summary.schema.to_json()),
             )
-            kept = cursor.rowcount > 0
+            return cursor.rowcount > 0
 
-        return self.write(write) and kept
+        return self.write(write)
 
     def put_long(
         self, to_store: ReadBag, groups: Iterable[Sequence[Table]], *, budget: int
@@ -531,14 +530,12 @@ class ColumnStore(Database):
             budget: how many bytes the parts may take.
         """
         long = LongBag(to_store, self._definitions, budget)
-        if not (self.write(long.begin) and long.goes_on):
+        if not self.write(long.begin):
             return False
         is_whole = False
         try:
-            for tables in groups:
-                if not (self.write(partial(long.add, tables=tables)) and long.goes_on):
-                    return False
-            is_whole = self.write(long.end) and long.goes_on
+            goes_on = all(self.write(partial(long.add, tables=tables)) for tables in groups)
+            is_whole = goes_on and self.write(long.end)
         finally:
             if not is_whole:
                 self.write(long.delete_half)

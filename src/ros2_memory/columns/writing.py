@@ -1,23 +1,27 @@
-"""What is written into the tables of a store: bags, their topics and their parts."""
+"""Parts, and what else is written into the tables of a store: bags and topics.
+
+A part is the rows of one topic in some bags of a recording, column by column. Beside the columns of
+the topic's layout it has `#log_time`, `#bag` (the number of each row's bag) and, where copies of a
+message of some bag may lie in other recordings, `#payload_hash`, `#delay` (how much later a message
+was received than published) and the zone of `#publish_time`. In rows of its other bags the hash is
+`UNHASHED` and the delay 0. The owners of the elements of a sequence lie under its path and `#`.
+"""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import (
-    ALWAYS,
-    DROPPED,
-    ZONE_ALONE,
-    PackedPart,
-    pack_rows,
-    packed_part,
-)
-from ros2_memory.columns.table import Table, Zone
+from ros2_memory.columns.layout import Layout, columns_in
+from ros2_memory.columns.pack import Packed, compressed, pack
+from ros2_memory.columns.steps import EXACT
+from ros2_memory.columns.table import Table, Zone, joined
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -34,6 +38,106 @@ UNMERGED: Final = "SELECT value FROM part, json_each(part.bags) WHERE NOT whole"
 """Selects the bags whose parts are not those of whole ten minutes."""
 _MOST_INTEGER: Final = 2**63 - 1
 _MOST_LAYOUTS: Final = 4_096
+
+LOG_TIME: Final = "#log_time"
+PUBLISH_TIME: Final = "#publish_time"
+PAYLOAD_HASH: Final = "#payload_hash"
+BAG: Final = "#bag"
+DELAY: Final = "#delay"
+ZONE_ALONE: Final = "zone"
+"""The codec of a column of which there is never more than the zone."""
+DROPPED: Final = "dropped"
+"""The codec of a column of which only the zone is stored: its topic is beyond its share."""
+ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
+UNHASHED: Final = -1
+"""In place of the hash of a payload that was not hashed."""
+
+
+@dataclass(frozen=True)
+class PackedPart:
+    """A part as it is stored.
+
+    Attributes:
+        first: the earliest log time (ns), inclusive.
+        last: the latest, inclusive.
+        messages: how many rows.
+        bags: the numbers of the bags that its rows are of, ascending.
+        columns: by their paths, packed; the data is compressed.
+    """
+
+    first: Ns
+    last: Ns
+    messages: int
+    bags: tuple[int, ...]
+    columns: Mapping[str, Packed]
+
+    @cached_property
+    def first_of(self) -> dict[bytes, str]:
+        """By data, the path of the first column that has it: it is stored once."""
+        paths = reversed([*self.columns.items()])
+        return {packed.data: path for path, packed in paths if packed.data}
+
+    @property
+    def size(self) -> int:
+        """How many bytes its data takes."""
+        return sum(map(len, self.first_of))
+
+
+def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> PackedPart:
+    """Returns the rows of some bags as one part.
+
+    Args:
+        layout: of the topic, type and definition that all these tables are of.
+        tables: each with the number of the bag of each row, of which it has one at least.
+    """
+    if len(tables) == 1:
+        return pack_rows(layout, *tables[0])
+    stops = np.cumsum([len(table) for table, _ in tables])
+    # The place of a row becomes its number among all rows: so its bag is known once sorted.
+    is_hashed = any(table.payload_hashes is not None for table, _ in tables)
+    numbered = [
+        replace(
+            table,
+            places=np.arange(stop - len(table), stop),
+            payload_hashes=_hashes(table) if is_hashed else None,
+        )
+        for (table, _), stop in zip(tables, stops.tolist(), strict=True)
+    ]
+    whole = joined(numbered)
+    return pack_rows(layout, whole, np.concatenate([bags for _, bags in tables])[whole.places])
+
+
+def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
+    """Returns the rows of a table of a layout, each with the number of its bag, as a part."""
+    common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
+    packed: dict[str, Packed] = {}
+    if table.payload_hashes is not None:
+        is_hashed = table.payload_hashes != UNHASHED
+        common[PAYLOAD_HASH] = table.payload_hashes
+        common[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
+        # Those of a table without columns may be log times.
+        if is_hashed.all() or "" not in table.left_out:
+            published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
+            packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
+    steps = (kind.step for kind in layout.slots.values())
+    columns = [*common.values(), *(column for _, column in columns_in(table))]
+    packs = map(pack, columns, chain(repeat(EXACT, len(common)), steps))
+    packed.update(zip((*common, *layout.slots), packs, strict=True))
+    return PackedPart(
+        int(table.log_times[0]),
+        int(table.log_times[-1]),
+        len(table),
+        tuple(np.unique(bags).tolist()),
+        {
+            path: replace(column, data=compressed(column.data)) if column.data else column
+            for path, column in packed.items()
+        },
+    )
+
+
+def _hashes(table: Table) -> IntArray:
+    hashes = table.payload_hashes
+    return np.full(len(table), UNHASHED) if hashes is None else hashes
 
 
 class ReadBag(NamedTuple):
@@ -57,8 +161,7 @@ class ReadBag(NamedTuple):
 class LongBag:
     """A bag that is written in several transactions.
 
-    Attributes:
-        goes_on: whether it may be written on, as the last transaction found.
+    What writes returns whether it may be written on, as that transaction found.
 
     Args:
         to_store: the bag.
@@ -67,7 +170,6 @@ class LongBag:
     """
 
     def __init__(self, to_store: ReadBag, definitions: str, budget: int) -> None:
-        self.goes_on = False
         self._bag = to_store
         self._definitions = definitions
         self._share = budget / max(_messages_of(to_store.bag), 1)
@@ -75,18 +177,19 @@ class LongBag:
         self._number = 0
         self._layouts = Layouts()
 
-    def begin(self, connection: sqlite3.Connection) -> None:
+    def begin(self, connection: sqlite3.Connection) -> bool:
         """Inserts the bag with a key that none has, in place of what its path was stored with."""
-        self.goes_on = self._bag.is_current()
-        if self.goes_on:
-            key = self._bag.key
-            delete_bags(connection, [key.path])
-            self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
+        if not self._bag.is_current():
+            return False
+        key = self._bag.key
+        delete_bags(connection, [key.path])
+        self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
+        return True
 
-    def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> None:
+    def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> bool:
         """Inserts some of its messages, as parts of ten minutes each."""
         if not self._may_go_on(connection):
-            return
+            return False
         self._lacks_definitions |= lacks_definitions(tables)
         parts: list[int] = []
         for table in tables:
@@ -94,17 +197,20 @@ class LongBag:
             for rows in _in_parts(table) if len(table) else ():
                 part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
                 parts.append(_insert_part(connection, topic, part, whole=True))
-        share = round(self._share * sum(len(table) for table in tables))
+        share = round(self._share * sum(map(len, tables)))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
+        return True
 
-    def end(self, connection: sqlite3.Connection) -> None:
+    def end(self, connection: sqlite3.Connection) -> bool:
         """Gives the bag its key: now it is stored."""
-        if self._may_go_on(connection):
-            definitions = self._definitions if self._lacks_definitions else ""
-            connection.execute(
-                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
-                (self._bag.key.size, definitions, self._number),
-            )
+        if not self._may_go_on(connection):
+            return False
+        definitions = self._definitions if self._lacks_definitions else ""
+        connection.execute(
+            "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
+            (self._bag.key.size, definitions, self._number),
+        )
+        return True
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
         """Deletes the parts of it that were written, where it is not stored whole."""
@@ -114,8 +220,7 @@ class LongBag:
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
         # Meanwhile it may have been deleted, or another program may store it.
         row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
-        self.goes_on = row is not None and self._bag.is_current()
-        return self.goes_on
+        return row is not None and self._bag.is_current()
 
 
 def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:
