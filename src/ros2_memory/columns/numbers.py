@@ -76,8 +76,8 @@ def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | Non
         [(leaf, limits)] = _leaves(table, field, extractor)
     except (UnknownShapeError, ValueError):  # none, or several
         return None
-    is_stored = leaf.conversion in {Conversion.STORED, Conversion.REAL}
-    return leaf.sources[0] if leaf.level is ROWS and not limits and is_stored else None
+    is_stored = leaf.level is ROWS and leaf.conversion is Conversion.STORED
+    return leaf.sources[0] if is_stored and not limits else None
 
 
 def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:

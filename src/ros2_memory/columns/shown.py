@@ -392,11 +392,11 @@ class Shape:
         if not isinstance(kind, str) or _kind(kind) is Kind.TEXT:
             return listing
         count, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
+        counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
+        summary = Object({key: counted}, is_summary=True)
         if length == SEQUENCE:
-            counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
             longer = _where_longer(level, path, count, is_longer=True)
             shorter = _where_longer(level, path, count, is_longer=False)
-            summary = Object({key: counted}, is_summary=True)
             return Choice((Narrowed(longer, summary), Narrowed(shorter, listing)), listing)
         size = length or 0
         array: Node = listing
@@ -404,10 +404,7 @@ class Shape:
             array = Items(
                 tuple(Leaf(level, (f"{path}.{nth}",), _kind(kind)) for nth in range(size))
             )
-        if size <= count:
-            return array
-        constant = Leaf(level, (), Kind.INTEGER, Conversion.CONSTANT, size)
-        return Choice((Object({key: constant}, is_summary=True),), array)
+        return array if size <= count else Choice((summary,), array)
 
 
 def _converted(name: str, node: Node) -> Node:
@@ -582,7 +579,7 @@ def _below(path: str, name: str) -> str:
 
 
 def _real(level: Level, source: str) -> Leaf:
-    return Leaf(level, (source,), Kind.REAL, Conversion.REAL)
+    return Leaf(level, (source,), Kind.REAL)
 
 
 def _vector(level: Level, sources: Sequence[str]) -> Object:

@@ -68,12 +68,10 @@ class Conversion(Enum):
     """How a leaf comes out of its sources."""
 
     STORED = auto()  # the column itself
-    REAL = auto()  # as a float64
     SECONDS = auto()  # of nanoseconds
     ROLL = auto()  # degrees, of x, y, z, w; NaN where that is no rotation
     PITCH = auto()
     YAW = auto()
-    CONSTANT = auto()
 
 
 _ANGLES: Final = {Conversion.ROLL: 0, Conversion.PITCH: 1, Conversion.YAW: 2}
@@ -108,7 +106,6 @@ class Leaf(NamedTuple):
         sources: dot-paths in that level of what it is made of.
         kind: what it is.
         conversion: how its value comes out of the sources.
-        constant: its value, where that is the same everywhere.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
     """
@@ -117,7 +114,6 @@ class Leaf(NamedTuple):
     sources: tuple[str, ...]
     kind: Kind
     conversion: Conversion = Conversion.STORED
-    constant: int = 0
     json_depth: int = 0
 
     @property
@@ -236,8 +232,6 @@ class Values:
         Raises:
             UnknownShapeError: the table does not hold them.
         """
-        if leaf.conversion is Conversion.CONSTANT:
-            return LeafNumbers(np.full(self.size(leaf.level), float(leaf.constant)))
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
         held = [column for column in columns if column is not None]
         if len(held) < len(columns):
@@ -247,7 +241,7 @@ class Values:
         column, error = held[0], self.error(leaf)
         if leaf.conversion is Conversion.SECONDS:
             return LeafNumbers(seconds(column), error / NS_PER_S)
-        is_real = leaf.conversion is Conversion.REAL
+        is_real = leaf.kind is Kind.REAL and column.dtype.kind in "iu"
         return LeafNumbers(column.astype(np.float64) if is_real else column, error)
 
     def floats(self, leaf: Leaf) -> tuple[Floats, float]:
@@ -310,8 +304,6 @@ def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
         leaf: the leaf.
         zone: returns the zone of a column of a table, or its zones in some parts, by its path.
     """
-    if leaf.conversion is Conversion.CONSTANT:
-        return Zone(leaf.constant, leaf.constant, 0)
     if leaf.conversion in _ANGLES:
         most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)

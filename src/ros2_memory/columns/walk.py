@@ -10,7 +10,7 @@ the decoder, which decides message by message.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -40,9 +40,6 @@ _MAX_PADDING: Final = 3
 _UINT8: Final = np.dtype("u1")
 _UINT16: Final = np.dtype("<u2")
 _UINT32: Final = np.dtype("<u4")
-
-
-Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
 
 
 class NotWalkedError(Exception):
