@@ -175,9 +175,9 @@ def test_the_end_of_a_long_bag_is_noticed_without_another_change(tmp_path: Path)
     assert asking.stored() == set()
     found: list[set[str]] = []
 
-    def end(self: LongBag, connection: sqlite3.Connection) -> None:
+    def end(self: LongBag, connection: sqlite3.Connection) -> bool:
         found.append(asking.stored())
-        whole(self, connection)
+        return whole(self, connection)
 
     with pytest.MonkeyPatch.context() as patch:
         whole = LongBag.end

@@ -6,10 +6,9 @@ timeline serves every later timeline that still has it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import chain
 from threading import Lock
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -30,8 +29,7 @@ _FEW: Final = 8
 """Segments that are looked up one by one; for more of them all stored bags are read at once."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CoveredSegment:
+class CoveredSegment(NamedTuple):
     """The bags of a segment, each with its number in the store.
 
     Attributes:
@@ -82,8 +80,7 @@ class Coverage:
         if not self._numbers.size:
             return np.zeros(numbers.shape, np.bool_)
         at = np.minimum(np.searchsorted(self._numbers, numbers), self._numbers.size - 1)
-        are_there: NDArray[np.bool_] = self._numbers[at] == numbers
-        return are_there
+        return np.asarray(self._numbers[at] == numbers)
 
     def of_part(self, part: int, numbers: IntArray) -> IntArray:
         """Returns those of the numbers of a part whose bags are bags of the timeline."""
@@ -96,11 +93,9 @@ class Coverage:
         """Returns of how many bags of each group, which has one at least, rows count."""
         if not groups:
             return np.zeros(0, np.int64)
-        begins = np.cumsum([0, *(group.size for group in groups)])[:-1]
-        counting: IntArray = np.add.reduceat(
-            self._are_there(np.concatenate(groups)), begins, dtype=np.int64
-        )
-        return counting
+        begins = np.cumsum([0, *map(len, groups)])[:-1]
+        are_there = self._are_there(np.concatenate(groups)).astype(np.int64)
+        return np.asarray(np.add.reduceat(are_there, begins))
 
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
@@ -160,37 +155,34 @@ class Covering:
     def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
         has_changed = self._latest is None or self._latest[1].state != state
         remembered = {
-            nth: covered
-            for nth, segment in enumerate(timeline.segments)
+            id(segment): covered
+            for segment in timeline.segments
             if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
             and not (has_changed and covered.missing)
         }
-        to_look_up = [nth for nth in range(len(timeline.segments)) if nth not in remembered]
+        unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
         stored: Mapping[str, StoredBag] = {}
-        root = str(self._bag_dir)
-        if len(to_look_up) > _FEW:
+        if len(unknown) > _FEW:
             stored = self.store.bags()
-        elif to_look_up:
-            bags = chain.from_iterable(timeline.segments[nth].bags for nth in to_look_up)
+        elif unknown:
+            root = str(self._bag_dir)
+            bags = chain.from_iterable(segment.bags for segment in unknown)
             stored = self.store.bags([relative(bag.file, root) for bag in bags])
         return [
-            remembered[nth] if nth in remembered else self._covered_segment(segment, stored)
-            for nth, segment in enumerate(timeline.segments)
+            remembered.get(id(segment)) or self._covered_segment(segment, stored)
+            for segment in timeline.segments
         ]
 
     def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
-        root, offset = str(self._bag_dir), self.store.offset
+        offset = self.store.offset
         numbers, is_hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
         missing: list[BagFile] = []
         for nth, bag in enumerate(segment.bags):
-            stored_bag = stored.get(relative(bag.file, root))
-            if (
-                stored_bag is not None
-                and stored_bag.key == BagKey.of(bag, self._bag_dir)
-                and bag.state is BagState.CLOSED
-            ):
-                numbers[nth], is_hashed[nth] = offset + stored_bag.row, stored_bag.hashed
+            key = BagKey.of(bag, self._bag_dir)
+            known = stored.get(key.path)
+            if known is not None and known.key == key and bag.state is BagState.CLOSED:
+                numbers[nth], is_hashed[nth] = offset + known.row, known.hashed
             else:
                 missing.append(bag)
         return CoveredSegment(segment, numbers, is_hashed, tuple(missing))

@@ -175,8 +175,8 @@ class Database:
             # were never written.
             return unknown if self._is_lost(opened) else answer
 
-    def write(self, write: Callable[[sqlite3.Connection], None]) -> bool:
-        """Writes all or nothing; returns whether it was written."""
+    def write(self, write: Callable[[sqlite3.Connection], bool | None]) -> bool:
+        """Writes all or nothing; returns whether it was written, and `write` did not say False."""
         give_up_s = time.monotonic() + BUSY_S
         while True:
             with self._lock:
@@ -184,7 +184,7 @@ class Database:
                 if opened is None or self._is_lost(opened):
                     return False
                 try:
-                    _transact(opened.connection, write, is_probe=self.is_failing)
+                    answer = _transact(opened.connection, write, is_probe=self.is_failing)
                 except (sqlite3.Error, MemoryError) as error:
                     if not is_busy(error) or time.monotonic() >= give_up_s:
                         self._failed(error)
@@ -199,7 +199,7 @@ class Database:
                     if self.is_failing:
                         self.trouble, self.is_failing = None, False
                         log.info("database_works_again", path=str(opened.path))
-                    return not self._is_lost(opened)
+                    return not self._is_lost(opened) and answer is not False
             # Outside the lock, so that readers do not wait for another program's writes.
             time.sleep(_PAUSE_S)
 
@@ -339,17 +339,17 @@ class Database:
 
 def _transact(
     connection: sqlite3.Connection,
-    write: Callable[[sqlite3.Connection], None],
+    write: Callable[[sqlite3.Connection], bool | None],
     *,
     is_probe: bool,
-) -> None:
+) -> bool | None:
     """Writes in one transaction; as a probe it writes a page at least.
 
     A transaction without a change touches no disk, and so does not show that the disk works.
     """
     connection.execute("BEGIN IMMEDIATE")
     try:
-        write(connection)
+        answer = write(connection)
         if is_probe:
             connection.execute(f"PRAGMA user_version = {FORMAT:d}")
         connection.execute("COMMIT")
@@ -357,6 +357,7 @@ def _transact(
         with suppress(sqlite3.Error):
             connection.execute("ROLLBACK")
         raise
+    return answer
 
 
 def open_file(

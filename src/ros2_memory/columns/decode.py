@@ -1,7 +1,7 @@
 """Decodes a bag as tables, all messages of a topic at once.
 
 What the walk over bytes (`walk.py`) does not read, for whatever reason, goes through the reader's
-decoder message by message (`objects.py`), into the same columns. No message is decoded in part.
+decoder message by message (`_level_of`), into the same columns. No message is decoded in part.
 """
 
 from __future__ import annotations
@@ -9,17 +9,29 @@ from __future__ import annotations
 import zlib
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.objects import level_of
-from ros2_memory.columns.plan import Plan, UnplannedError, plan_of
-from ros2_memory.columns.table import Table, joined, order_of
-from ros2_memory.columns.walk import LevelColumns, NotWalkedError, walked
+from ros2_memory.columns.plan import (
+    Array,
+    Number,
+    NumberSequence,
+    Plan,
+    Run,
+    Text,
+    Time,
+    UnplannedError,
+    plan_of,
+)
+from ros2_memory.columns.table import MAX_RANGED_BYTES, Numbers, Table, Texts, joined, order_of
+from ros2_memory.columns.walk import LevelColumns, NotWalkedError, add_array, add_sequence, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.storage.base import (
     BATCH_BYTES,
     BagReader,
@@ -116,12 +128,13 @@ def decoded(
         kinds = _Kinds(reader, hashed, columns)
         kinds.look_at(channels, path, window)
         alone = reader.times_alone(path)
-        bare = {channel.topic for channel in channels}
-        for channel in channels:
-            kind = kinds.of(channel)
-            # Copies of messages without a payload are recognised by their publish times.
-            if kind.plan is not None or (kind.is_hashed and channel.topic not in alone):
-                bare.discard(channel.topic)
+        kind_of = [(channel.topic, kinds.of(channel)) for channel in channels]
+        # Copies of messages without a payload are recognised by their publish times.
+        bare = {channel.topic for channel in channels} - {
+            topic
+            for topic, kind in kind_of
+            if kind.plan is not None or (kind.is_hashed and topic not in alone)
+        }
         wanted = {channel.topic for channel in channels}
         group = _Group(reader, skip_undecodable)
         for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
@@ -156,20 +169,16 @@ class _Kinds:
 
     def look_at(self, channels: Sequence[Channel], path: Path, window: TimeWindow) -> None:
         """Finds the topics of a large file that have large messages, by the newest of each."""
-        size = 0
-        if not self.columns:
+        try:
+            is_large = self.columns and path.stat().st_size > LARGE_FILE_BYTES
+        except OSError:
             return
-        with suppress(OSError):
-            size = path.stat().st_size
-        if size <= LARGE_FILE_BYTES:
-            return
-        for channel in channels:
-            if self._plan(channel, self.reader.definition(channel))[0] is None:
-                continue
-            with suppress(BagError):
-                newest = self.reader.newest(path, channel.topic, window)
-                if newest is not None and len(newest.payload) > BULKY_BYTES:
-                    self._bulky.add(channel.topic)
+        for channel in channels if is_large else ():
+            if self._plan(channel, self.reader.definition(channel))[0] is not None:
+                with suppress(BagError):
+                    newest = self.reader.newest(path, channel.topic, window)
+                    if newest is not None and len(newest.payload) > BULKY_BYTES:
+                        self._bulky.add(channel.topic)
 
     def of(self, channel: Channel) -> _Kind:
         """Returns the kind of a channel."""
@@ -235,19 +244,13 @@ class _Group:
         channel = batch.channel
         parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
         for piece in _pieces_of(batch):
-            self._append_alike(
-                parts, _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
-            )
-
-    def _append_alike(self, parts: list[Table], table: Table) -> None:
-        """Adds a table to those of its topic, of which all have columns or none has."""
-        if "" in table.left_out and parts and "" not in parts[0].left_out:
-            parts[:] = [
-                replace(part, columns={}, elements={}, left_out=table.left_out) for part in parts
-            ]
-        elif parts and "" in parts[0].left_out:
-            table = replace(table, columns={}, elements={}, left_out=parts[0].left_out)
-        parts.append(table)
+            table = _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
+            # Of one topic all have columns, or none has.
+            if parts and ("" in table.left_out) != ("" in parts[0].left_out):
+                reason = table.left_out.get("") or parts[0].left_out[""]
+                parts[:] = [part.without_columns(reason) for part in parts]
+                table = table.without_columns(reason)
+            parts.append(table)
 
     def tables(self, following: _Group | None = None) -> list[Table]:
         """Returns the tables, each of all its parts.
@@ -312,7 +315,7 @@ def _decoded_batch(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) 
     try:
         return joined([*_one_by_one(reader, kind.plan, batch, table, skip=skip)])
     except UndecodableError as error:
-        return replace(table, left_out={"": f"some cannot be decoded: {error.reason}"})
+        return table.without_columns(f"some cannot be decoded: {error.reason}")
 
 
 def _with_columns(table: Table, level: LevelColumns) -> Table:
@@ -342,5 +345,58 @@ def _one_by_one(
                     raise
             size += sizes[nth]
             nth += 1
-        yield _with_columns(table.rows(np.array(rows, np.int64)), level_of(plan, messages))
+        yield _with_columns(table.rows(np.array(rows, np.int64)), _level_of(plan, messages))
         begin = nth
+
+
+# Messages that the reader decoded one by one
+
+
+def _level_of(plan: Plan, messages: Sequence[object]) -> LevelColumns:
+    """Returns the columns of decoded messages of the type of a plan."""
+    level = LevelColumns(left_out=dict(plan.left_out))
+    for step in plan.steps:
+        if isinstance(step, Run):
+            for entry in step.fields:
+                _add_fixed(level, entry, messages)
+            continue
+        values = _values(messages, step.attribute)
+        if isinstance(step, Text):
+            level.columns[step.path] = Texts.of([*map(str, values)])
+        elif isinstance(step, NumberSequence):
+            arrays = [*map(_numbers, values)]
+            counts = np.array([array.size for array in arrays], np.int64)
+            looked_at = [array for array in arrays if array.size * step.size <= MAX_RANGED_BYTES]
+            numbers = np.concatenate([np.zeros(0, step.dtype), *looked_at]).astype(step.dtype)
+            add_sequence(level, step.path, counts, numbers, is_bool=step.is_bool)
+        else:
+            lists = [value if isinstance(value, list) else [] for value in values]
+            inner = _level_of(step.plan, [*chain.from_iterable(lists)])
+            level.add_elements(step.path, np.array([*map(len, lists)], np.int64), inner)
+    return level
+
+
+def _values(messages: Sequence[object], attribute: str) -> Sequence[object]:
+    """Returns a field of all messages; "" stands for the value itself."""
+    return [*map(attrgetter(attribute), messages)] if attribute else messages
+
+
+def _add_fixed(
+    level: LevelColumns, entry: Number | Time | Array, messages: Sequence[object]
+) -> None:
+    values = _values(messages, entry.attribute)
+    if isinstance(entry, Time):
+        seconds, rest = (np.array(_values(values, name), np.int64) for name in ("sec", "nanosec"))
+        level.columns[entry.path] = seconds * NS_PER_S + rest
+    elif isinstance(entry, Array):
+        arrays = np.array([*map(_numbers, values)]) if entry.is_ranged else None
+        add_array(level.columns, entry, len(values), arrays)
+    else:
+        if entry.nth is not None:
+            values = [_numbers(value)[entry.nth] for value in values]
+        dtype = np.dtype(np.bool_) if entry.is_bool else entry.dtype
+        level.columns[entry.path] = np.array(values, dtype)
+
+
+def _numbers(value: object) -> Numbers:
+    return value if isinstance(value, np.ndarray) else np.array(value)

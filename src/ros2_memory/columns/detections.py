@@ -8,42 +8,34 @@ have to be read.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.columns.plan import fields_at
-from ros2_memory.columns.scores import Scored, hypotheses, is_object, or_else, ranked, scored
+from ros2_memory.columns.scores import NamedScores, Scored, hypotheses, or_else, ranked, scored
 from ros2_memory.columns.shown import (
     ByType,
-    Group,
     Items,
     Listing,
-    Message,
     Narrowed,
     Node,
     Nothing,
-    UnknownShapeError,
-    children,
+    Object,
+    is_object,
 )
 from ros2_memory.columns.table import Table, Texts, joined_texts
-from ros2_memory.columns.values import ROWS, Kind, Leaf, Values, zone_of
+from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, zone_of
 from ros2_memory.columns.walk import entries_of_codes
-from ros2_memory.columns.zones import PartZones
 from ros2_memory.core.text import LISTS_OF_LABELS
-from ros2_memory.messages.detections import (
-    MAX_DEPTH,
-    POSITIONS,
-    Detection,
-    detections_of,
-)
+from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, Detection, detections_of
 from ros2_memory.storage.base import Definition
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.columns.values import Floats, Ints, Level, Mask
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
@@ -72,12 +64,17 @@ class Detections(NamedTuple):
         message = np.searchsorted(rows, self.rows)
         is_among = message < rows.size
         is_among[is_among] = rows[message[is_among]] == self.rows[is_among]
+        return self._replace(rows=message).taken(is_among)
+
+    def taken(self, which: Ints | Mask) -> Detections:
+        """Returns some of them."""
+        rows, labels, scores, places, frames = self
         return Detections(
-            message[is_among],
-            Texts(self.labels.codes[is_among], self.labels.words),
-            self.scores[is_among],
-            self.places[is_among],
-            Texts(self.frames.codes[is_among], self.frames.words),
+            rows[which],
+            Texts(labels.codes[which], labels.words),
+            scores[which],
+            places[which],
+            Texts(frames.codes[which], frames.words),
         )
 
 
@@ -105,36 +102,32 @@ class Point(NamedTuple):
     frames: tuple[Leaf, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Labels:
+class Labels(NamedTuple):
     """Objects that may be detections: what names them, and what else there is where nothing does.
 
     Attributes:
         scored: names and scores; of the hypotheses with `is_best`.
         otherwise: where detections are where the object is none.
         frames: that name the frame, outermost first.
-        best_points: where the best hypothesis may say that the thing is.
-        points: where the object itself may; None where that depends on the message.
+        points: where they may have their place, first choice first; None where that depends on the
+            message.
         is_best: they are named by the best of several hypotheses, which is what is scored.
     """
 
     scored: Scored
     otherwise: tuple[Source, ...]
     frames: tuple[Leaf, ...]
-    best_points: tuple[Point, ...] | None
     points: tuple[Point, ...] | None
     is_best: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
+class Words(NamedTuple):
     """A list of labels."""
 
     leaf: Leaf
 
 
-@dataclass(frozen=True, slots=True)
-class Json:
+class Json(NamedTuple):
     """A text that may be JSON, and how deep detections are looked for in it."""
 
     leaf: Leaf
@@ -161,15 +154,16 @@ class DetectionColumns:
         if definition is None or sources is None:
             return None
         values = Values(table)
+        header_frames = _header_frames(definition)
         try:
-            parts = [part for source in sources for part in found_in(values, source, places=True)]
-            header_frames = _header_frames(definition)
             detections = joined_detections(
-                [_with_frames(values, part, header_frames) for part in parts]
+                [part for source in sources for part in found_in(values, source, places=True)]
             )
-            frames = texts_of(values, header_frames[0]) if header_frames else None
+            frames = _frames_at(values, ROWS, detections.rows, header_frames)
             return StampedDetections(
-                detections, _stamps(values, definition), frames or _no_frames(len(table))
+                detections._replace(frames=or_else(detections.frames, frames)),
+                _stamps(values, definition),
+                _frames_at(values, ROWS, np.arange(values.rows), header_frames),
             )
         except UnknownShapeError:
             return None
@@ -177,7 +171,7 @@ class DetectionColumns:
     def has_labels(self, table: Table) -> bool:
         """Returns whether the type of a table has fields for labels, not only texts."""
         sources = self._sources.of(table)
-        return sources is None or not all(isinstance(source, Json) for source in sources)
+        return sources is None or any(not isinstance(source, Json) for source in sources)
 
     def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a message may hold a detection, as known without reading a column.
@@ -187,29 +181,24 @@ class DetectionColumns:
         sources = self._sources.of(table_or_parts)
         possible: bool | Mask = sources is None
         for source in sources or ():
-            possible = possible | (
-                not isinstance(source, Json) or _may_be_json(table_or_parts, source.leaf)
-            )
+            if not isinstance(source, Json):
+                return True
+            possible = possible | _may_be_json(table_or_parts, source.leaf)
         return possible
 
 
 def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:
     """Returns the detections of messages that were read one by one."""
-    numbered = [
-        (row, detection) for row, detections in enumerate(by_message) for detection in detections
-    ]
-    places = [
-        (math.nan,) * 3 if detection.place is None else detection.place for _, detection in numbered
-    ]
+    numbered = [(row, found) for row, several in enumerate(by_message) for found in several]
+    nowhere, none = (math.nan,) * 3, math.nan
+    places = [nowhere if found.place is None else found.place for _, found in numbered]
+    scores = [none if found.score is None else found.score for _, found in numbered]
     return Detections(
         np.array([row for row, _ in numbered], np.int64),
-        Texts.of([detection.label for _, detection in numbered]),
-        np.array(
-            [math.nan if detection.score is None else detection.score for _, detection in numbered],
-            np.float64,
-        ),
+        Texts.of([found.label for _, found in numbered]),
+        np.array(scores, np.float64),
         np.array(places, np.float64).reshape(-1, 3),
-        Texts.of([detection.frame_id for _, detection in numbered]),
+        Texts.of([found.frame_id for _, found in numbered]),
     )
 
 
@@ -248,33 +237,32 @@ def sources_in(
     if isinstance(node, Leaf):
         if node.kind is Kind.TEXT:
             yield Json(node, depth, frames)
-    elif isinstance(node, Listing | Items):
-        for element in [node.element] if isinstance(node, Listing) else node.items:
-            if is_object(element) or isinstance(element, Narrowed):
-                yield from sources_in(element, depth - 1, frames)
+    elif isinstance(node, Listing):
+        if is_object(node.element) or isinstance(node.element, Narrowed):
+            yield from sources_in(node.element, depth - 1, frames)
     elif is_object(node):
-        yield from _sources_in_object(dict(children(node)), depth, frames)
+        yield from _sources_in_object(node.fields, depth, frames)
 
 
 def _sources_in_object(
-    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+    fields: Mapping[str, Node], depth: int, frames: tuple[Leaf, ...]
 ) -> Iterator[Source]:
-    named, several = scored(fields), hypotheses(fields)
+    named, several, results = scored(fields), hypotheses(fields), fields.get("results")
     frames = (*frames, *_frame_leaves(fields))
     inner = tuple(_sources_in_fields(fields, depth, frames))
     if named is not None:
-        yield Labels(named, inner, frames, (), _points(fields))
-    elif several is not None:
-        results = fields["results"]
-        element = results.element if isinstance(results, Listing) else results
-        best = dict(children(element)) if isinstance(element, Message | Group) else {}
-        yield Labels(several, inner, frames, _points(best), _points(fields), is_best=True)
+        yield Labels(named, inner, frames, _points(fields))
+    elif several is not None and isinstance(results, Listing) and is_object(results.element):
+        best_points, points = _points(results.element.fields), _points(fields)
+        is_known = best_points is not None and points is not None
+        both = (*(best_points or ()), *(points or ())) if is_known else None
+        yield Labels(several, inner, frames, both, is_best=True)
     else:
         yield from inner
 
 
 def _sources_in_fields(
-    fields: dict[str, Node], depth: int, frames: tuple[Leaf, ...]
+    fields: Mapping[str, Node], depth: int, frames: tuple[Leaf, ...]
 ) -> Iterator[Source]:
     for name, node in fields.items():
         element = node.element if isinstance(node, Listing) else None
@@ -283,44 +271,37 @@ def _sources_in_fields(
         yield from sources_in(node, depth - 1, frames)
 
 
-def _frame_leaves(fields: dict[str, Node]) -> Iterator[Leaf]:
+def _frame_leaves(fields: Mapping[str, Node]) -> Iterator[Leaf]:
     header = fields.get("header")
-    if isinstance(header, Message | Group):
-        fields = dict(children(header))
-    leaf = fields.get("frame_id")
+    leaf = (header.fields if isinstance(header, Object) else fields).get("frame_id")
     if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT:
         yield leaf
 
 
-def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
+def _points(fields: Mapping[str, Node]) -> tuple[Point, ...] | None:
     """Returns where an object may have its place, first choice first; None: it depends."""
     points: list[Point] = []
     for path in POSITIONS:
-        node: Node | None = Group(fields)
+        node: Node | None = Object(fields)
         frames: list[Leaf] = []
         for name in path:
-            node = node.child(name) if node and is_object(node) else None
-            if node is not None and is_object(node):
-                frames += _frame_leaves(dict(children(node)))
+            node = node.fields.get(name) if is_object(node) else None
+            if is_object(node):
+                frames += _frame_leaves(node.fields)
         if node is None or isinstance(node, Leaf | Nothing):
             continue
         if isinstance(node, Items):
-            leaves = [*node.items]
-        elif isinstance(node, Message | Group):
-            axes = dict(children(node))
-            leaves = [axes[axis] for axis in "xyz" if axis in axes]
+            axes: list[Node] = [*node.items]
+        elif isinstance(node, Object):
+            axes = [node.fields[axis] for axis in "xyz" if axis in node.fields]
         else:
             return None
-        numbers = [leaf for leaf in leaves if isinstance(leaf, Leaf) and _is_number(leaf)]
-        if len(leaves) == len(numbers) == 3:
-            points.append(Point(tuple(numbers), tuple(frames)))
-        elif any(not isinstance(leaf, Leaf) for leaf in leaves):
+        leaves = [axis for axis in axes if isinstance(axis, Leaf)]
+        if len(leaves) < len(axes):
             return None
+        if len(leaves) == 3 and all(leaf.is_number for leaf in leaves):
+            points.append(Point(tuple(leaves), tuple(frames)))
     return tuple(points)
-
-
-def _is_number(leaf: Leaf) -> bool:
-    return leaf.kind in {Kind.INTEGER, Kind.REAL}
 
 
 # What a table holds
@@ -344,7 +325,7 @@ def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detect
 
 def _in_labels(values: Values, leaf: Leaf) -> Detections:
     """Returns the labels of lists that are not empty, without a score."""
-    texts = texts_of(values, leaf)
+    texts = values.texts(leaf)
     is_label = np.array([bool(word) for word in texts.words], np.bool_)
     positions = np.flatnonzero(is_label[texts.codes])
     return _detections_at(values, leaf.level, texts, positions, np.full(len(texts), math.nan))
@@ -352,42 +333,20 @@ def _in_labels(values: Values, leaf: Leaf) -> Detections:
 
 def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     """Returns the objects that have a name, with their scores; raises as `found_in`."""
-    objects = source.scored
-    named = objects.read(values)
-    if named is None:
-        raise UnknownShapeError("names or scores are not held")
-    name, score, error = named
-    positions, size = np.arange(len(name)), len(name)
+    level, named = source.scored.level, source.scored.read(values)
+    positions, size = np.arange(len(named.name)), len(named.name)
     if source.is_best:
-        elements, parent = values.elements(objects.level), objects.level.parent
-        if elements is None or parent is None:
-            raise UnknownShapeError("hypotheses are not held")
-        positions, size = (
-            _best_hypotheses(name, score, error, elements.owners),
-            values.size(parent) or 0,
-        )
-    is_named = np.array([bool(word.strip()) for word in name.words], np.bool_)
-    positions = positions[is_named[name.codes[positions]]]
+        positions = _best_hypotheses(named, values.elements(level).owners)
+        size = values.size(level.parent or level)
+    positions = positions[named.is_named[positions]]
     if positions.size < size and any(
         detections.rows.size
         for inner in source.otherwise
         for detections in found_in(values, inner, places=False)
     ):
         raise UnknownShapeError("some objects are detections, and some have such in them")
-    detections = _detections_at(values, objects.level, name, positions, score)
+    detections = _detections_at(values, level, named.name, positions, named.score)
     return _placed(values, source, positions, detections) if places else detections
-
-
-def texts_of(values: Values, leaf: Leaf) -> Texts:
-    """Returns the texts of a leaf.
-
-    Raises:
-        UnknownShapeError: the table does not hold them.
-    """
-    texts = values.texts(leaf)
-    if texts is None:
-        raise UnknownShapeError(f"{leaf.sources[0]} is not held")
-    return texts
 
 
 def _detections_at(
@@ -398,13 +357,9 @@ def _detections_at(
         _owners_at(values, level, positions, ROWS),
         Texts(names.codes[positions], names.words),
         scores[positions],
-        _nowhere(positions.size),
+        np.full((positions.size, 3), math.nan),
         _no_frames(positions.size),
     )
-
-
-def _nowhere(count: int) -> Points:
-    return np.full((count, 3), math.nan)
 
 
 def _no_frames(count: int) -> Texts:
@@ -413,11 +368,7 @@ def _no_frames(count: int) -> Texts:
 
 def _may_be_json(table_or_parts: Table | PartZones, leaf: Leaf) -> bool | Mask:
     """Returns whether a text may be JSON, by its zone, or in which parts by their zones."""
-    zone = (
-        zone_of(leaf, table_or_parts.zone)
-        if isinstance(table_or_parts, PartZones)
-        else Values(table_or_parts).zone(leaf)
-    )
+    zone = zone_of(leaf, table_or_parts.zone)
     return True if zone is None else zone.may_be_json
 
 
@@ -425,7 +376,7 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     """Yields the detections in texts that are JSON, each of which is parsed once."""
     if not _may_be_json(values.table, source.leaf):
         return
-    texts = texts_of(values, source.leaf)
+    texts = values.texts(source.leaf)
     parsed = values.table.remember(
         f"JSON of depth {source.depth} in {source.leaf.level.full(source.leaf.sources[0])}",
         lambda: detections_by([detections_of(word, depth=source.depth) for word in texts.words]),
@@ -436,47 +387,39 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     counts, nth = entries_of_codes(parsed.rows, texts.codes.astype(np.int64))
     positions = np.repeat(np.arange(len(texts)), counts)
     rows = _owners_at(values, source.leaf.level, positions, ROWS)
-    outer_frames = _frames_at(values, source.leaf.level, positions, source.frames)
-    yield Detections(
-        rows,
-        Texts(parsed.labels.codes[nth], parsed.labels.words),
-        parsed.scores[nth],
-        parsed.places[nth],
-        or_else(Texts(parsed.frames.codes[nth], parsed.frames.words), outer_frames),
-    )
+    found = parsed.taken(nth)._replace(rows=rows)
+    frames = _frames_at(values, source.leaf.level, positions, source.frames)
+    yield found._replace(frames=or_else(found.frames, frames))
 
 
-def _best_hypotheses(name: Texts, score: Floats, error: float, owners: Ints) -> Ints:
+def _best_hypotheses(named: NamedScores, owners: Ints) -> Ints:
     """Returns the first of the hypotheses of the highest score, for each detection.
 
     Raises:
         UnknownShapeError: they were rounded, so that another may be the best.
     """
-    order, begins = ranked(score, owners)
+    order, begins = ranked(named.score, owners)
     best: Ints = order[begins]
-    if error:
+    if named.error:
         follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-        best_of, next_best = order[follows], order[follows + 1]
+        score, codes = named.score[order], named.name.codes[order]
         with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = score[best_of] - score[next_best] <= 2 * error
-        if (is_close & (name.codes[best_of] != name.codes[next_best])).any():
+            is_close = score[follows] - score[follows + 1] <= 2 * named.error
+        if (is_close & (codes[follows] != codes[follows + 1])).any():
             raise UnknownShapeError("another hypothesis may be the best")
     return best
 
 
 def _placed(values: Values, source: Labels, positions: Ints, detections: Detections) -> Detections:
     """Returns detections at the first valid point of each; NaN where it has none."""
-    if source.points is None or source.best_points is None:
+    if source.points is None:
         raise UnknownShapeError("points are of another shape in each message")
     level, places = source.scored.level, detections.places
     frames = _frames_at(values, level, positions, source.frames)
-    for point in (*source.best_points, *source.points):
+    for point in source.points:
         at = _owners_at(values, level, positions, point.axes[0].level)
-        columns = [values.numbers(leaf) for leaf in point.axes]
-        numbers = [column.values[at] for column in columns if column is not None]
-        if len(numbers) < len(columns):
-            raise UnknownShapeError("points are not held")
-        place = np.stack(numbers, axis=1).astype(np.float64)
+        axes = [values.numbers(leaf).values[at] for leaf in point.axes]
+        place = np.stack(axes, axis=1).astype(np.float64)
         # All zeros means that nobody filled it in.
         is_given = np.isfinite(place).all(axis=1) & place.any(axis=1)
         is_given &= np.isnan(places[:, 0])
@@ -491,7 +434,7 @@ def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[L
     """Returns the frame of each detection: what the innermost object around it names."""
     frames = _no_frames(positions.size)
     for leaf in leaves:
-        texts = texts_of(values, leaf)
+        texts = values.texts(leaf)
         codes = texts.codes[_owners_at(values, level, positions, leaf.level)]
         frames = or_else(Texts(codes, texts.words), frames)
     return frames
@@ -499,11 +442,8 @@ def _frames_at(values: Values, level: Level, positions: Ints, leaves: Sequence[L
 
 def _owners_at(values: Values, level: Level, positions: Ints, outer: Level) -> Ints:
     """Returns, of some elements of a level, the elements or rows around them."""
-    while level != outer:
-        elements = values.elements(level)
-        if elements is None or level.parent is None:
-            raise UnknownShapeError("elements are not held")
-        positions, level = elements.owners[positions], level.parent
+    while level != outer and level.parent is not None:
+        positions, level = values.elements(level).owners[positions], level.parent
     return positions
 
 
@@ -519,17 +459,6 @@ def _header_frames(definition: Definition) -> tuple[Leaf, ...]:
     if _kind_at(definition, "header", "frame_id") not in {"string", "wstring"}:
         return ()
     return (Leaf(ROWS, ("header.frame_id",), Kind.TEXT),)
-
-
-def _with_frames(
-    values: Values, detections: Detections, header_frames: tuple[Leaf, ...]
-) -> Detections:
-    """Returns detections with the frame of their message where they name none."""
-    if not header_frames or detections.frames.words.count("") == 0:
-        return detections
-    return detections._replace(
-        frames=or_else(detections.frames, _frames_at(values, ROWS, detections.rows, header_frames))
-    )
 
 
 def _stamps(values: Values, definition: Definition) -> Ints | None:

@@ -14,7 +14,7 @@ from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore
-from ros2_memory.columns.writing import PART_NS, DecodedBags, ReadBag
+from ros2_memory.columns.writing import PART_NS, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
@@ -173,18 +173,21 @@ class Filling:
 
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
-        bags, whole = batch
-        pending = DecodedBags([], [])
+        pending: list[ReadBag] = []
         done = held = 0
-        for bag in sorted(bags, key=in_time):
-            begin = len(pending.tables)
-            done += self._read(bag, pending, hashed=self._is_shared(bag, timeline))
+        for bag in sorted(batch.bags, key=in_time):
+            read = self._read(bag, hashed=self._is_shared(bag, timeline))
+            if isinstance(read, ReadBag):
+                pending.append(read)
+                held += sum(table.memory_bytes for table in read.tables)
+            else:
+                done += read
+            del read  # and its tables, before the next is read
             self._large.release()
-            held += sum(table.memory_bytes for table, _ in pending.tables[begin:])
             if held > _MOST_HELD:
-                done += self._put(pending, whole=whole)
-                pending, held = DecodedBags([], []), 0
-        return done + self._put(pending, whole=whole)
+                done += self._put(pending, whole=batch.whole)
+                pending, held = [], 0
+        return done + self._put(pending, whole=batch.whole)
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -253,8 +256,8 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _read(self, bag: BagFile, pending: DecodedBags, *, hashed: bool) -> bool:
-        """Adds a bag to the pending ones, or stores a long one; returns whether it is stored."""
+    def _read(self, bag: BagFile, *, hashed: bool) -> ReadBag | bool:
+        """Returns a bag that was read, or whether it is stored: a long one is at once."""
         if not self._may_be_stored(bag):
             return False
         try:
@@ -268,7 +271,7 @@ class Filling:
             begin = [*islice(groups, 2)]
             if len(begin) > 1 or bag.end - bag.start > LONG_NS:
                 return self._put_long(to_store, self._released_groups(begin, groups))
-            pending.add(to_store, begin[0] if begin else [])
+            return to_store._replace(tables=begin[0] if begin else ())
         except BagError as error:
             self._scanner.met_damage(bag, error)
             self._refuse(bag, error.reason)
@@ -278,17 +281,16 @@ class Filling:
             self._refuse(bag, type(error).__name__)
         return False
 
-    def _put(self, pending: DecodedBags, *, whole: bool) -> int:
+    def _put(self, pending: Sequence[ReadBag], *, whole: bool) -> int:
         """Stores bags in parts together; each alone where the database refuses that."""
-        bags = [to_store.bag for to_store in pending.bags]
+        bags = [to_store.bag for to_store in pending]
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
         written = self.store.put(pending, whole=whole)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                alone = (pending.chosen([nth]) for nth in range(len(bags)))
-                return sum(self._put(single, whole=whole) for single in alone)
+                return sum(self._put([bag], whole=whole) for bag in pending)
             self._refuse(bags[0], self.store.refused_for or "")
         if written.parts and whole:
             begin = self._slot(bags[0])[1]

@@ -46,7 +46,7 @@ class Layout:
     @cached_property
     def levels(self) -> dict[str, LevelPaths]:
         """The columns of the messages (""), and of the elements of each sequence by its path."""
-        levels: dict[str, LevelPaths] = {"": LevelPaths({}, {})}
+        levels = {"": LevelPaths({}, {})}
         sequence = ""
         for path in self.slots:
             if path.endswith("#"):
@@ -65,16 +65,6 @@ class Layout:
         """Whether the table has these columns, and no others, and leaves the same out."""
         paths = [path for path, _ in columns_in(table)]
         return self.left_out == table.left_out and paths == [*self.slots]
-
-    def columns_of(self, table: Table) -> list[Column]:
-        """Returns the columns of a table and the owners of its elements, in the order of `slots`.
-
-        Raises:
-            ValueError: the table has other columns.
-        """
-        if not self.fits(table):
-            raise ValueError(f"a table of {table.channel.topic} has other columns than its layout")
-        return [column for _, column in columns_in(table)]
 
     def to_json(self) -> str:
         """Returns it as a person can read it; equal layouts give equal texts."""

@@ -1,7 +1,8 @@
-"""The numbers of a field in all rows of a table."""
+"""What a field is in all rows of a table: its numbers, or its value as JSON text."""
 
 from __future__ import annotations
 
+import json
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -10,18 +11,17 @@ from ros2_memory.columns.shown import (
     Limits,
     Node,
     Spot,
-    UnknownShapeError,
+    is_object,
     leaves_below,
-    opened,
     placed,
     shape_of,
 )
-from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
+from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError, Values
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Floats, Ints
     from ros2_memory.extract import SchemaExtractor
 
@@ -61,16 +61,8 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
     Returns:
         None where the columns do not hold them all: then the bag has to be read.
     """
-    shape, values = shape_of(table, extractor), Values(table)
-    if shape is None:
-        return None
-    parts: list[FieldNumbers] = []
     try:
-        for leaf, limits in _leaves(shape.find(field)):
-            part = _numbers_of(values, leaf, limits)
-            if part is None:
-                return None
-            parts.append(part)
+        parts = [_numbers_of(Values(table), *found) for found in _leaves(table, field, extractor)]
     except UnknownShapeError:
         return None
     if not parts:
@@ -80,15 +72,38 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
 
 def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:
     """Returns the path of the column that has all numbers of a field as they are; None: none."""
-    shape = shape_of(table, extractor)
     try:
-        leaves = [] if shape is None else [*_leaves(shape.find(field))]
-    except UnknownShapeError:
+        [(leaf, limits)] = _leaves(table, field, extractor)
+    except (UnknownShapeError, ValueError):  # none, or several
         return None
-    if len(leaves) != 1 or leaves[0][0].level is not ROWS or leaves[0][1]:
+    is_stored = leaf.level is ROWS and leaf.conversion is Conversion.STORED
+    return leaf.sources[0] if is_stored and not limits else None
+
+
+def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
+    """Returns a field of each row as JSON text, as `history.held_values.HeldValues` has it.
+
+    None where the columns do not hold it as it is, or it is more than a text, a boolean or a whole
+    number: then the messages have to be read.
+    """
+    try:
+        node = _node(table, field, extractor)
+        if is_object(node):
+            [node] = node.fields.values()
+        if (
+            not isinstance(node, Leaf)
+            or node.level is not ROWS
+            or node.conversion is not Conversion.STORED
+            or node.kind is Kind.REAL
+        ):
+            return None
+        if node.kind is Kind.TEXT:
+            texts = Values(table).texts(node)
+            return Texts(texts.codes, tuple(map(json.dumps, texts.words)))
+        distinct, codes = np.unique(Values(table).numbers(node).values, return_inverse=True)
+        return Texts(codes.astype(np.uint32), tuple(map(json.dumps, distinct.tolist())))
+    except (UnknownShapeError, ValueError):  # more than one part
         return None
-    leaf, _ = leaves[0]
-    return leaf.sources[0] if leaf.conversion in {Conversion.STORED, Conversion.REAL} else None
 
 
 def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
@@ -123,38 +138,46 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
     )
 
 
-def _leaves(value: Node | None) -> Iterator[tuple[Leaf, Limits]]:
+def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node | None:
+    """Returns a field of the value of a table's messages, or all of it; None where nothing is."""
+    shape = shape_of(table, extractor)
+    if shape is None:
+        raise UnknownShapeError("there are no columns")
+    return shape.value if field is None else shape.find(field)
+
+
+def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> Iterator[tuple[Leaf, Limits]]:
     """Yields the numbers of a field; not those of a summary."""
-    for spot in () if value is None else opened(Spot(value)):
-        for _, leaf, limits in leaves_below(spot):
-            if leaf.kind in {Kind.INTEGER, Kind.REAL}:
-                yield leaf, limits
+    node = _node(table, field, extractor)
+    for _, leaf, limits in () if node is None else leaves_below(Spot(node)):
+        if leaf.is_number:
+            yield leaf, limits
 
 
-def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers | None:
-    numbers = values.numbers(leaf)
-    if numbers is None or not values.holds_all(leaf):
-        return None
-    everything = np.arange(len(numbers.values))
+def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers:
+    column, error, exactly = values.numbers(leaf)
+    everything = np.arange(len(column))
     kept, rows = placed(values, leaf.level, everything, limits, surely=True)
-    if len(kept) < len(placed(values, leaf.level, everything, limits, surely=False)[0]):
-        return None
-    is_all = len(kept) == len(numbers.values)
-    column = numbers.values if is_all else numbers.values[kept]
+    possible, _ = placed(values, leaf.level, everything, limits, surely=False)
+    if len(kept) < len(possible) or not values.holds_all(leaf):
+        raise UnknownShapeError("some numbers are not held, or may not stand there")
+    if len(kept) < len(column):
+        column = column[kept]
     is_finite = np.isfinite(column)
     if not is_finite.all():
         column, rows, kept = column[is_finite], rows[is_finite], kept[is_finite]
     if column.dtype.kind != "u" or not (column > _LARGEST_INT64).any():
         is_whole = column.dtype.kind in "iu"
         column = column.astype(np.int64 if is_whole else np.float64, copy=False)
-    of_field = FieldNumbers(
+
+    def exactly_at(positions: Ints) -> Floats:
+        assert exactly is not None  # noqa: S101 - else nobody has this function
+        return exactly(kept[positions])
+
+    return FieldNumbers(
         rows,
         column,
-        float(np.max(numbers.error, initial=0.0)),
+        float(np.max(error, initial=0.0)),
+        error[kept] if isinstance(error, np.ndarray) else None,
+        exactly and exactly_at,
     )
-    if isinstance(numbers.error, np.ndarray):
-        of_field = of_field._replace(errors=numbers.error[kept])
-    if numbers.exactly is not None:
-        exactly = numbers.exactly
-        of_field = of_field._replace(exactly=lambda positions: exactly(kept[positions]))
-    return of_field

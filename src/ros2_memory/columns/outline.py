@@ -110,16 +110,9 @@ class Outline(NamedTuple):
     @classmethod
     def of(cls, totals: Mapping[str, Totals], letters: Mapping[str, Letters]) -> Outline:
         """Returns the outline of columns, by their paths."""
-        ordered = [*totals.values()]
-        return cls(
-            [*totals],
-            np.array([column.size for column in ordered], np.int64),
-            np.array([column.total for column in ordered], np.float64),
-            np.array([(*column.least, *column.greatest) for column in ordered], np.int64).reshape(
-                -1, 4
-            ),
-            letters,
-        )
+        sizes, sums, least, greatest = zip(*totals.values(), strict=True) if totals else ((),) * 4
+        ends = np.array([*zip(least, greatest, strict=True)], np.int64).reshape(-1, 4)
+        return cls([*totals], np.array(sizes, np.int64), np.array(sums, float), ends, letters)
 
     def totals(self, path: str) -> Totals | None:
         """Returns what is known of a column of numbers; None: nothing."""
@@ -145,12 +138,13 @@ def outline_of(table: Table, times: IntArray) -> Outline:
     letters: dict[str, Letters] = {}
     for path in table.columns:
         zone = table.zone(path)
-        if zone is not None and (zone.words or "").startswith(IN_PART):
+        if zone is None:
+            continue
+        if (zone.words or "").startswith(IN_PART):
             texts = table.columns[path]
-            in_texts = Letters.of(texts) if isinstance(texts, Texts) else None
-            if in_texts is not None:
+            if isinstance(texts, Texts) and (in_texts := Letters.of(texts)) is not None:
                 letters[path] = in_texts
-        elif zone is not None and np.isfinite([zone.low, zone.high]).all():
+        elif np.isfinite([zone.low, zone.high]).all():
             column = table.columns[path]
             if not isinstance(column, Texts) and column.dtype.kind in "iuf":
                 totals[path] = _totals_of(column, table.error(path), times)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import keyword
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -19,7 +20,7 @@ from ros2_memory.columns.table import MAX_NUMBERS, MAX_RANGED_BYTES
 from ros2_memory.storage.base import SEQUENCE, Definition, Field
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator
 
 MAX_COLUMNS: Final = 5_000
 """Of one type, with those of its sequences."""
@@ -161,26 +162,16 @@ def plan_of(definition: Definition) -> Plan:
         UnplannedError: it has more columns than `MAX_COLUMNS`, a type that has none, or an array
             that no message holds.
     """
-    planner = _Planner(_Budget())
+    planner = _Planner(iter(range(MAX_COLUMNS)))
     planner.add_message(definition, "", "")
     return planner.finished()
-
-
-@dataclass(slots=True)
-class _Budget:
-    left: int = MAX_COLUMNS
-
-    def take(self, columns: int = 1) -> None:
-        self.left -= columns
-        if self.left < 0:
-            raise UnplannedError(f"it has more than {MAX_COLUMNS} fields")
 
 
 @dataclass(slots=True)
 class _Planner:
     """Follows the position through one message: known to be `rest` behind a multiple of `unit`."""
 
-    budget: _Budget
+    budget: Iterator[int]
     steps: list[Step] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
     unit: int = 8
@@ -222,7 +213,7 @@ class _Planner:
         kind, length = entry.kind, entry.length
         if length is not None and length > _MOST_ELEMENTS:
             raise UnplannedError(f"{path} is an array of {length} elements, more than a bag holds")
-        self.budget.take()
+        self._take(1)
         if entry.name == _FILLER:
             self._pass(1, 1)
         elif length is None and isinstance(kind, Definition):
@@ -245,6 +236,10 @@ class _Planner:
         else:
             self._array(kind, length, path, attribute)
 
+    def _take(self, columns: int) -> None:
+        if len([*islice(self.budget, columns)]) < columns:
+            raise UnplannedError(f"it has more than {MAX_COLUMNS} fields")
+
     def _numbers(self, kind: str, path: str, attribute: str) -> None:
         dtype = _dtype(kind)
         align, skip = self._variable()
@@ -257,7 +252,7 @@ class _Planner:
         dtype = _dtype(kind)
         size = dtype.itemsize
         if length <= MAX_NUMBERS:
-            self.budget.take(length)
+            self._take(length)
             for nth in range(length):
                 at = f"{path}.{nth}"
                 number = Number(at, attribute, dtype, kind == "bool", nth)
@@ -312,13 +307,8 @@ class _Planner:
         """Ends the run."""
         if self.size:
             shown = [(str(nth), kind, at) for nth, (_, kind, at) in enumerate(self.read) if kind]
-            dtype = np.dtype(
-                {
-                    "names": [name for name, _, _ in shown],
-                    "formats": [kind for _, kind, _ in shown],
-                    "offsets": [at for _, _, at in shown],
-                }
-            )
+            names, formats, offsets = zip(*shown, strict=True) if shown else ((), (), ())
+            dtype = np.dtype({"names": names, "formats": formats, "offsets": offsets})
             fields = tuple(read for read, _, _ in self.read)
             self.steps.append(Run(self.align, self.size, dtype, fields))
         self.align, self.size, self.read = 1, 0, []

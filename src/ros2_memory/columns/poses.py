@@ -12,9 +12,10 @@ import numpy as np
 
 from ros2_memory.analysis.poses import FrameCodes, Poses
 from ros2_memory.columns.plan import fields_at
-from ros2_memory.columns.shown import ByType, UnknownShapeError
+from ros2_memory.columns.shown import ByType
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.values import UnknownShapeError
 from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.extract import (
     FRAME,
@@ -89,13 +90,6 @@ class NoPoseError(Exception):
     """Messages of a type have no pose."""
 
 
-class _Paths(NamedTuple):
-    """Which columns a place and a rotation are in; see `_Columns`."""
-
-    axes: tuple[str, ...]
-    turn: tuple[str, ...]
-
-
 class _Columns(NamedTuple):
     """Which columns a pose is in, by their dot-paths.
 
@@ -107,11 +101,11 @@ class _Columns(NamedTuple):
         velocity: of the linear velocity's one to three components; or none.
     """
 
-    axes: tuple[str, ...]
-    turn: tuple[str, ...]
-    frame: str
-    numbered_frame: str
-    velocity: tuple[str, ...]
+    axes: tuple[str, ...] = ()
+    turn: tuple[str, ...] = ()
+    frame: str = ""
+    numbered_frame: str = ""
+    velocity: tuple[str, ...] = ()
 
 
 class _Field(NamedTuple):
@@ -164,21 +158,20 @@ def _field_at(definition: Definition, path: Segments) -> _Field | None:
 
 def _columns_of(plan: Plan, definition: Definition) -> _Columns:
     """Returns where poses are in messages of a type; without axes where they have none."""
-    paths = _pose(plan, definition)
-    if paths is None:
-        return _Columns((), (), "", "", ())
+    pose = _pose(plan, definition)
+    if pose is None:
+        return _Columns()
     frame = _field_at(definition, FRAME.segments)
     is_named = frame is not None and frame.length is None and frame.kind in _TEXTS
     numbered = plan.pose_frame and _field_at(definition, plan.pose_frame.segments)
-    return _Columns(
-        *paths,
-        frame.path if frame is not None and is_named else "",
-        numbered.path if numbered and numbered.is_number else "",
-        _velocity(plan, definition),
+    return pose._replace(
+        frame=frame.path if frame is not None and is_named else "",
+        numbered_frame=numbered.path if numbered and numbered.is_number else "",
+        velocity=_velocity(plan, definition),
     )
 
 
-def _pose(plan: Plan, definition: Definition) -> _Paths | None:
+def _pose(plan: Plan, definition: Definition) -> _Columns | None:
     """Returns the paths of the first route by which messages of a type have a pose."""
     routes = [*plan.poses]
     if plan is UNMAPPED:
@@ -187,16 +180,17 @@ def _pose(plan: Plan, definition: Definition) -> _Paths | None:
         if heading is not None:
             routes.append(PlanarPose(*map(Route, ("x", "y", "z", heading))))
     for route in routes:
-        if isinstance(route, PlanarPose):
-            paths = _planar(route, definition)
-        else:
-            paths = _point(route, definition)
-        if paths is not None:
-            return paths
+        pose = (
+            _planar(route, definition)
+            if isinstance(route, PlanarPose)
+            else _point(route, definition)
+        )
+        if pose is not None:
+            return pose
     return None
 
 
-def _point(route: PointPose, definition: Definition) -> _Paths | None:
+def _point(route: PointPose, definition: Definition) -> _Columns | None:
     position = _field_at(definition, route.position.segments)
     orientation = _field_at(definition, route.orientation.segments)
     axes = position.parts("xyz") if position else ()
@@ -206,16 +200,16 @@ def _point(route: PointPose, definition: Definition) -> _Paths | None:
         # PX4 writes w first.
         elements = orientation.elements(4) if orientation and not turn else ()
         turn = turn or (*elements[1:], *elements[:1])
-    return _Paths(axes, turn) if axes else None
+    return _Columns(axes, turn) if axes else None
 
 
-def _planar(route: PlanarPose, definition: Definition) -> _Paths | None:
+def _planar(route: PlanarPose, definition: Definition) -> _Columns | None:
     routes = (route.x, route.y, route.z, route.heading)
     fields = (_field_at(definition, axis.segments) for axis in routes)
     x, y, z, heading = (entry.path if entry and entry.is_number else "" for entry in fields)
     if not x or not y:
         return None
-    return _Paths((x, y, z) if z else (x, y), (heading,) if heading else ())
+    return _Columns((x, y, z) if z else (x, y), (heading,) if heading else ())
 
 
 def _velocity(plan: Plan, definition: Definition) -> tuple[str, ...]:

@@ -9,17 +9,24 @@ from __future__ import annotations
 import math
 from bisect import bisect_right
 from collections import OrderedDict, defaultdict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.copies import Identities, copies_among, joined_identities, relatched_among
 from ros2_memory.columns.fragments import FragmentKey
-from ros2_memory.columns.parts import DELAY, PUBLISH_TIME, UNHASHED
-from ros2_memory.columns.units import BagUnit, GoneError, Rows, Unit
+from ros2_memory.columns.units import (
+    BagUnit,
+    GoneError,
+    Identities,
+    Rows,
+    Unit,
+    copies_among,
+    relatched_among,
+)
+from ros2_memory.columns.writing import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -101,6 +108,11 @@ class _Source(NamedTuple):
     part: PartHead | None
     bag: BagFile | None = None
 
+    @property
+    def number(self) -> int | None:
+        """The number of the part; None of a bag."""
+        return None if self.part is None else self.part.number
+
 
 class Stretch(NamedTuple):
     """A stretch of the clock in a scan. No rows that begin in it overlap those of another one.
@@ -136,7 +148,7 @@ class Scan:
         self._shared = [
             span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
         ]
-        self._decoded: OrderedDict[str, list[Unit]] = OrderedDict()
+        self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
         self._relatched: dict[object, IntArray] = {}
@@ -184,11 +196,10 @@ class Scan:
                 # Who goes on reads many.
                 together = min(2 * together, _MOST_LOOKED_UP)
                 ahead += together
-                self._together = [s.part for s in sources[nth:ahead] if s.part is not None]
+                self._together = _heads(sources[nth:ahead])
             self._request.check(source.last if newest_first else source.first)
-            may_match = source.part is None or source.part.number not in ruled_out
             waiting += [
-                Rows(unit, partial(self._counting, unit), may_match=may_match)
+                Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
                 for unit in self._units(source)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
@@ -203,26 +214,22 @@ class Scan:
         self, *, newest_first: bool, among: TimeWindow | None
     ) -> tuple[Sequence[_Source], set[int]]:
         """Returns the sources that are asked for, in their order; and the parts without a match."""
+        request = self._request
         sources = self._sources if among is None else self._sources_in(among)
         if newest_first:
             sources = sorted(sources, key=lambda source: (source.last, source.first))[::-1]
-        window = self._request.window
         # Before zones are asked: what lies elsewhere neither matches nor says that nothing does.
-        sources = [s for s in sources if window.overlaps(s.first, s.last)]
-        ruled_out = self._ruled_out(sources)
-        if not self._request.may_not_match:
-            sources = [s for s in sources if s.part is None or s.part.number not in ruled_out]
-        if (within := self._request.within) is not None:
-            sources = [s for s in sources if overlaps_any(within, s.first, s.last)]
+        sources = [s for s in sources if request.window.overlaps(s.first, s.last)]
+        ruled_out: set[int] = set()
+        if request.may_match is not None:
+            heads = _heads(sources)
+            wanted = self._scanner.matching(heads, request.may_match)
+            ruled_out = {head.number for head, may in zip(heads, wanted, strict=True) if not may}
+        if not request.may_not_match:
+            sources = [source for source in sources if source.number not in ruled_out]
+        if request.within is not None:
+            sources = [s for s in sources if overlaps_any(request.within, s.first, s.last)]
         return sources, ruled_out
-
-    def _ruled_out(self, sources: Sequence[_Source]) -> set[int]:
-        """Returns the numbers of the parts that have no wanted row, by their zones."""
-        if self._request.may_match is None:
-            return set()
-        heads = [source.part for source in sources if source.part is not None]
-        wanted = self._scanner.matching(heads, self._request.may_match)
-        return {head.number for head, may in zip(heads, wanted, strict=True) if not may}
 
     def stretches(self, beside: Ns = 0) -> list[Stretch]:
         """Returns the stretches of the clock that the window consists of, the newest first.
@@ -270,31 +277,27 @@ class Scan:
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
-        bag = self._first_bag(self._heads[part])
+        bag = self._first_bag(self._head_of[part])
         if bag is None:
             raise GoneError
         return bag.recording
 
     @cached_property
     def _numbers(self) -> IntArray:
-        return np.array(
-            [0 if source.part is None else source.part.number for source in self._sources]
-        )
+        return np.array([source.number or 0 for source in self._sources])
 
     @cached_property
-    def _heads(self) -> dict[int, PartHead]:
-        return {source.part.number: source.part for source in self._sources if source.part}
+    def _head_of(self) -> dict[int, PartHead]:
+        return {head.number: head for head in _heads(self._sources)}
 
     @cached_property
     def _others(self) -> IntArray:
         """How many of the first sources are not whole parts of which all rows count."""
-        parts = [source.part for source in self._sources]
-        is_whole = np.array([part is not None and part.is_whole for part in parts], np.bool_)
-        heads = [part for part in parts if part is not None]
-        if self._coverage is not None and heads:
-            counting = self._coverage.counts([head.bags for head in heads])
-            all_count = counting == [head.bags.size for head in heads]
-            is_whole[[part is not None for part in parts]] &= all_count
+        is_whole = np.array([bool(s.part and s.part.is_whole) for s in self._sources], np.bool_)
+        bags = [head.bags for head in _heads(self._sources)]
+        if self._coverage is not None and bags:
+            all_count = self._coverage.counts(bags) == [*map(len, bags)]
+            is_whole[self._numbers > 0] &= all_count
         is_whole &= self._lasts - self._firsts < STRETCH_NS
         return np.concatenate([[0], np.cumsum(~is_whole)])
 
@@ -333,10 +336,8 @@ class Scan:
         spans = [TimeWindow(*span) for span in self._shared]
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         for source in self._sources:
-            part = None if source.part is None else source.part.number
-            if id(source) not in shared and not (
-                self._request.relatches and self._may_be_late(part)
-            ):
+            may_be_late = self._request.relatches and self._may_be_late(source.number)
+            if not may_be_late and id(source) not in shared:
                 continue
             self._request.check(source.first)
             for unit in self._units(source):
@@ -358,11 +359,8 @@ class Scan:
             if self._coverage is None:
                 return sources
             before, now = self._coverage.state, store.state()
-            if (failures, before.part, before.deletion) == (
-                store.failures,
-                now.part,
-                now.deletion,
-            ):
+            is_same = (before.part, before.deletion) == (now.part, now.deletion)
+            if is_same and store.failures == failures:
                 return sources
         self._coverage = None
         return [*self._sources_of(reach)]
@@ -409,21 +407,19 @@ class Scan:
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         return self._units_of_bag(source.bag)
 
-    def _units_of_bag(self, bag: BagFile) -> list[Unit]:
+    def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
         """Returns the tables of a bag, which is decoded unless it was one of the last."""
-        units = self._decoded.get(bag.file)
-        if units is None:
+        if bag.file not in self._decoded:
             hashed = bool(self._shared) or self._request.relatches
-            tables = _without_columns_if_large(
-                self._request.decode(bag, self._request.topic, hashed)
-            )
-            units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
+            tables = self._request.decode(bag, self._request.topic, hashed)
+            held = _without_columns_if_large(tables)
+            units = [BagUnit(bag, table, nth) for nth, table in enumerate(held) if len(table)]
             self._decoded[bag.file] = units
             while len(self._decoded) > _MOST_DECODED or (
                 len(self._decoded) > 1 and self._decoded_bytes() > _MOST_BYTES
             ):
                 self._decoded.popitem(last=False)
-        return units
+        return self._decoded[bag.file]
 
     def _decoded_bytes(self) -> int:
         return sum(unit.table.memory_bytes for units in self._decoded.values() for unit in units)
@@ -431,11 +427,8 @@ class Scan:
     def _counting(self, unit: Unit) -> IntArray | None:
         """Returns the rows of a unit that count in the window; None: all do."""
         window = self._request.window
-        is_counted = unit.counting()
-        if not window.covers(unit.first, unit.last):
-            times = unit.times()
-            is_inside = (times >= window.start) & (times < window.stop)
-            is_counted = is_inside if is_counted is None else is_counted & is_inside
+        is_covered = window.covers(unit.first, unit.last)
+        is_counted = unit.counting() if is_covered else _in_window(unit, window)
         repeated = self._repeated(unit)
         if repeated.size:
             is_counted = np.ones(len(unit.table), np.bool_) if is_counted is None else is_counted
@@ -449,9 +442,7 @@ class Scan:
         spans: list[tuple[Ns, Ns]] = []
         for start, stop in self._shared:
             published = sorted(
-                (-math.inf, math.inf)
-                if source.part is None
-                else self._published[source.part.number]
+                self._published.get(source.number, (-math.inf, math.inf))
                 for source in self._sources_in(TimeWindow(start, stop))
             )
             if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
@@ -476,20 +467,29 @@ class Scan:
 
     def _compare(self, span: TimeWindow, part: TimeWindow) -> None:
         """Finds the copies in a part of a shared span."""
+
+        def are_copies(messages: Identities) -> Mask:
+            times = messages.log_times
+            return copies_among(messages) & (times >= part.start) & (times < part.stop)
+
         around = part.widened(2 * COPY_HORIZON_NS).intersect(span)
-        units = [*self._units_in(around)]
-        if len({unit.first_bag.recording for unit in units}) < 2:
-            return
-        rows = [self._rows_in(unit, around) for unit in units]
-        messages = self._messages(units, rows)
-        copies = copies_among(messages)
-        copies &= (messages.log_times >= part.start) & (messages.log_times < part.stop)
-        begin = 0
-        for unit, unit_rows in zip(units, rows, strict=True):
-            of_unit = unit_rows[copies[begin : begin + unit_rows.size]]
-            begin += unit_rows.size
-            if of_unit.size:
-                self._copies[unit.key].append(of_unit)
+        for unit, rows in self._judged(around, are_copies):
+            self._copies[unit.key].append(rows)
+
+    def _judged(
+        self, window: TimeWindow, judge: Callable[[Identities], Mask]
+    ) -> Iterator[tuple[Unit, IntArray]]:
+        """Yields the units of several recordings, with those rows in a window that are judged so.
+
+        `judge` is given all of their messages in the window.
+        """
+        units = [*self._units_in(window)]
+        if len({unit.first_bag.recording for unit in units}) > 1:
+            rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
+            judged = judge(self._messages(units, rows))
+            for unit, unit_rows in zip(units, rows, strict=True):
+                yield unit, unit_rows[judged[: unit_rows.size]]
+                judged = judged[unit_rows.size :]
 
     def _received_again(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that were received before, as late messages of a latch."""
@@ -506,37 +506,27 @@ class Scan:
         if since < self._relatched_since:
             # As much again before it: late messages come many at once, of about the same age.
             self._relatched_since = max(since - (unit.last - since), MIN_NS)
-            self._find_relatched(TimeWindow(self._relatched_since, MAX_NS))
+            window = TimeWindow(self._relatched_since, MAX_NS)
+            for late, rows in self._judged(window, relatched_among):
+                if late.table.channel.latched:
+                    self._relatched[late.key] = rows
         return self._relatched.get(unit.key, none)
 
-    def _find_relatched(self, window: TimeWindow) -> None:
-        units = [*self._units_in(window)]
-        rows = [self._rows_in(unit, window) for unit in units]
-        messages = self._messages(units, rows)
-        latched = np.repeat(
-            [unit.table.channel.latched for unit in units], [unit_rows.size for unit_rows in rows]
-        )
-        is_relatched = relatched_among(messages) & latched
-        begin = 0
-        for unit, unit_rows in zip(units, rows, strict=True):
-            self._relatched[unit.key] = unit_rows[is_relatched[begin : begin + unit_rows.size]]
-            begin += unit_rows.size
-
     @cached_property
-    def _delays(self) -> dict[int, tuple[float, float]]:
+    def _delays(self) -> dict[int | None, tuple[float, float]]:
         return self._bounds(DELAY)
 
     @cached_property
-    def _published(self) -> dict[int, tuple[float, float]]:
+    def _published(self) -> dict[int | None, tuple[float, float]]:
         return self._bounds(PUBLISH_TIME)
 
-    def _bounds(self, path: str) -> dict[int, tuple[float, float]]:
-        heads = [source.part for source in self._sources if source.part is not None]
-        return self._scanner.bounds(heads, path)
+    def _bounds(self, path: str) -> dict[int | None, tuple[float, float]]:
+        bounds = self._scanner.bounds(_heads(self._sources), path)
+        return {number: span for number, span in bounds.items()}  # noqa: C416 - also of None
 
     def _may_be_late(self, part: int | None) -> bool:
-        """Returns whether a part may have messages that were received long after."""
-        return part is None or self._delays[part][1] > RELATCHED_NS
+        """Returns whether a part, or a bag, may have messages that were received long after."""
+        return self._delays.get(part, (0.0, math.inf))[1] > RELATCHED_NS
 
     def _sources_in(self, window: TimeWindow) -> list[_Source]:
         # They are in the order of their first times, and reach beyond the next ones.
@@ -548,28 +538,19 @@ class Scan:
         for source in self._sources_in(window):
             yield from self._units(source)
 
-    def _rows_in(self, unit: Unit, window: TimeWindow) -> IntArray:
-        times, is_counted = unit.times(), unit.counting()
-        is_inside = (times >= window.start) & (times < window.stop)
-        return np.flatnonzero(is_inside if is_counted is None else is_inside & is_counted)
-
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
         # By their names: of messages of one time that counts which lies in the first recording.
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
-        numbers = {recording: number for number, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, unit_rows in zip(units, rows, strict=True):
-            recording = numbers[unit.first_bag.recording]
+            recording = recordings.index(unit.first_bag.recording)
             published, hashes = self._identities(unit, unit_rows)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)
-            parts.append(
-                Identities(
-                    unit.times()[unit_rows], published, hashes, np.full(unit_rows.size, recording)
-                )
-            )
-        return joined_identities(parts)
+            of_recording = np.full(unit_rows.size, recording)
+            parts.append(Identities(unit.times()[unit_rows], published, hashes, of_recording))
+        return Identities(*map(np.concatenate, zip(*parts, strict=True)))
 
     def _identities(self, unit: Unit, positions: IntArray) -> tuple[IntArray, IntArray]:
         """Returns publish times and hashes of some rows of a unit.
@@ -583,10 +564,9 @@ class Scan:
         if not unknown.size:
             return published[positions], hashes[positions]
         published, hashes, numbers = published.copy(), hashes.copy(), unit.bag_numbers()
-        bags = unit.bags()
         for number in np.unique(numbers[unknown]).tolist():
             rows = np.flatnonzero(numbers == number)
-            for table in self._request.decode(bags[number], self._request.topic, True):
+            for table in self._request.decode(unit.bag_of(number), self._request.topic, True):
                 if table.payload_hashes is None or table.channel.type != unit.table.channel.type:
                     continue
                 # A part has ten minutes of a long bag.
@@ -596,6 +576,17 @@ class Scan:
                     published[rows] = table.publish_times[same]
                     hashes[rows] = table.payload_hashes[same]
         return published[positions], hashes[positions]
+
+
+def _in_window(unit: Unit, window: TimeWindow) -> Mask:
+    """Returns which rows of a unit are in a window, and of bags that count."""
+    times, is_counted = unit.times(), unit.counting()
+    is_inside: Mask = (times >= window.start) & (times < window.stop)
+    return is_inside if is_counted is None else is_inside & is_counted
+
+
+def _heads(sources: Iterable[_Source]) -> list[PartHead]:
+    return [source.part for source in sources if source.part is not None]
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:
@@ -613,9 +604,6 @@ def _without_columns_if_large(tables: Iterable[Table]) -> list[Table]:
         size += table.memory_bytes
         held.append(table)
         if size > _MOST_BYTES:
-            left_out = {"": _TOO_LARGE}
-            held = [
-                replace(earlier, columns={}, elements={}, left_out=left_out) for earlier in held
-            ]
+            held = [earlier.without_columns(_TOO_LARGE) for earlier in held]
         del table
     return held

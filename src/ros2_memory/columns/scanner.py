@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -17,10 +17,10 @@ from ros2_memory.columns.database import row_id
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, Sized
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
-from ros2_memory.columns.parts import LOG_TIME
 from ros2_memory.columns.stored import StoredTable, lazy_columns
 from ros2_memory.columns.table import Column, Table, Zone, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
+from ros2_memory.columns.writing import LOG_TIME
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
@@ -59,8 +59,7 @@ _MOST_DAMAGED: Final = 10_000
 """Files whose damage is remembered."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Heads:
+class _Heads(NamedTuple):
     """The parts of a topic, in order of their first log times.
 
     Attributes:
@@ -363,12 +362,13 @@ class Scanner:
         return Unit(
             head.number,
             table,
-            (head.first, head.last),
-            load=integers,
-            counting=counting - offset,
-            bag_of=bag_of,
-            part=head.number if head.is_whole else None,
-            all_count=counting.size == head.bags.size,
+            head.first,
+            head.last,
+            integers,
+            counting - offset,
+            bag_of,
+            head.number if head.is_whole else None,
+            counting.size == head.bags.size,
         )
 
     def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:

@@ -8,36 +8,31 @@ and more would have to be looked at then, the limits say that they do not know.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ros2_memory.columns.shown import (
     Choice,
-    Group,
+    Limit,
     Listing,
-    Message,
     Narrowed,
     Node,
+    Object,
     Spot,
     TruthValues,
-    children,
+    is_object,
     leaves_below,
     opened,
-    unknown,
 )
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.values import Kind, Leaf, Level
+from ros2_memory.columns.values import Kind, Leaf, Level, UnknownShapeError
 from ros2_memory.messages.detections import MAX_DEPTH, SCORES, looks_like_json, naming
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Callable, Iterable, Mapping
 
     from ros2_memory.columns.values import Floats, Ints, Mask, Values
-
-Object: TypeAlias = Message | Group
 
 
 class NamedScores(NamedTuple):
@@ -47,9 +42,13 @@ class NamedScores(NamedTuple):
     score: Floats
     error: float
 
+    @property
+    def is_named(self) -> Mask:
+        """Which objects have a name."""
+        return np.array([bool(word.strip()) for word in self.name.words], np.bool_)[self.name.codes]
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scored:
+
+class Scored(NamedTuple):
     """An object that may be a detection: what names it, in order, and what its score is.
 
     Attributes:
@@ -62,30 +61,23 @@ class Scored:
     labels: tuple[Leaf, ...]
     scores: tuple[Leaf, ...]
 
-    def read(self, values: Values) -> NamedScores | None:
-        """Returns the names and scores of all; None where the table does not hold them."""
+    def read(self, values: Values) -> NamedScores:
+        """Returns the names and scores of all; raises `UnknownShapeError` where not held."""
         name, *fallbacks = (_names(values, leaf) for leaf in self.labels)
         for fallback in fallbacks:
-            name = None if name is None or fallback is None else or_else(name, fallback, blank=True)
-        if name is None:
-            return None
+            name = or_else(name, fallback, blank=True)
         score, error = np.full(len(name), np.nan), 0.0
         for leaf in self.scores:
-            numbers = values.numbers(leaf)
-            if numbers is None or not isinstance(numbers.error, float):
-                return None
-            column = numbers.values.astype(np.float64, copy=False)
-            score = np.where(np.isnan(score), column, score)
-            error = max(error, numbers.error)
+            column, leaf_error = values.floats(leaf)
+            score, error = np.where(np.isnan(score), column, score), max(error, leaf_error)
         return NamedScores(name, score, error)
 
 
-def _names(values: Values, leaf: Leaf) -> Texts | None:
-    """Returns the texts of a leaf, or its whole numbers as such; None where they are not held."""
+def _names(values: Values, leaf: Leaf) -> Texts:
+    """Returns the texts of a leaf, or its whole numbers as such."""
     if leaf.kind is Kind.TEXT:
         return values.texts(leaf)
-    numbers = values.numbers(leaf)
-    return None if numbers is None else Texts.of([*map(str, numbers.values.tolist())])
+    return Texts.of([*map(str, values.numbers(leaf).values.tolist())])
 
 
 def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
@@ -97,85 +89,74 @@ def or_else(texts: Texts, fallback: Texts, *, blank: bool = False) -> Texts:
     return Texts(codes.astype(np.uint32), (*texts.words, *fallback.words))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _ScoreLimit(ABC):
-    """Which detections of a level stay; that is found once for each table."""
+def _limit_of_all(level: Level, find: Callable[[Values], TruthValues]) -> Limit:
+    """Returns a limit on the detections of a level, which is found once for each table."""
 
-    level: Level
-    scored: Scored
-    least: float
-    texts: tuple[Leaf, ...]
-    has_inner: bool
-
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where the detection stays."""
-        if self not in values.kept:
-            values.kept[self] = self._all_kept(values)
-        surely, perhaps = values.kept[self]
+    def some(values: Values, positions: Ints) -> TruthValues:
+        surely, perhaps = values.once(limit, find)
         return TruthValues(surely[positions], perhaps[positions])
 
-    @abstractmethod
-    def _all_kept(self, values: Values) -> TruthValues:
-        """Returns where the detections of a table stay."""
+    limit = Limit(level, some, is_of_scores=True)
+    return limit
 
 
-class _OwnScoreLimit(_ScoreLimit):
-    """Which detections score enough."""
+def _own_limit(objects: Scored, least: float, may_have_more: Callable[[Values], bool]) -> Limit:
+    """Returns the limit to detections that score enough.
 
-    def _all_kept(self, values: Values) -> TruthValues:
-        named = self.scored.read(values)
-        if named is None:
-            return unknown(values.size(self.level) or 0)
-        name, score, error = named
-        is_labelled = _has_label(name)
-        surely = ~(is_labelled & (score < self.least + error))
-        perhaps = ~(is_labelled & (score < self.least - error))
-        if self.has_inner or may_be_json(values, self.texts):
-            surely &= is_labelled
-        return TruthValues(surely, perhaps)
+    Args:
+        objects: that may be detections.
+        least: the least score that is enough.
+        may_have_more: whether there may be detections in those that are none.
+    """
+
+    def find(values: Values) -> TruthValues:
+        named = objects.read(values)
+        surely = ~(named.is_named & (named.score < least + named.error))
+        if may_have_more(values):
+            surely &= named.is_named
+        return TruthValues(surely, ~(named.is_named & (named.score < least - named.error)))
+
+    return _limit_of_all(objects.level, find)
 
 
-class _BestScoreLimit(_ScoreLimit):
-    """Which detections stay that are named by the best of several hypotheses (vision_msgs)."""
+def _best_limit(
+    level: Level, results: Scored, least: float, may_have_more: Callable[[Values], bool]
+) -> Limit:
+    """Returns the limit to detections whose best hypothesis scores enough (vision_msgs)."""
 
-    def _all_kept(self, values: Values) -> TruthValues:
-        size = values.size(self.level) or 0
-        named, results = self.scored.read(values), values.elements(self.scored.level)
-        if named is None or results is None or named.error:
-            return unknown(size)  # also with rounded scores, of which another may be the best
-        is_labelled = _has_label(named.name)
-        order, begins = ranked(named.score, results.owners)
+    def find(values: Values) -> TruthValues:
+        size = values.size(level)
+        named, owners = _exact(values, results)
+        order, begins = ranked(named.score, owners)
         best = order[begins]
-        detections = results.owners[best]
-        surely, perhaps = np.ones(size, np.bool_), np.ones(size, np.bool_)
-        if self.has_inner or may_be_json(values, self.texts):
-            surely[:] = False
-        is_low = named.score[best] < self.least
-        surely[detections] = is_labelled[best] & ~is_low
-        perhaps[detections] = ~(is_labelled[best] & is_low)
+        is_named, is_low = named.is_named[best], named.score[best] < least
+        surely, perhaps = np.full(size, not may_have_more(values)), np.ones(size, np.bool_)
+        surely[owners[best]] = is_named & ~is_low
+        perhaps[owners[best]] = ~(is_named & is_low)
         return TruthValues(surely, perhaps)
 
+    return _limit_of_all(level, find)
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _HypothesisLimit:
-    """Which of several hypotheses stay, in a detection that stays."""
 
-    best: _BestScoreLimit
+def _hypothesis_limit(best: Limit, results: Scored, least: float) -> Limit:
+    """Returns the limit to hypotheses that score enough, in a detection that stays."""
 
-    @property
-    def level(self) -> Level:
-        """The level of the hypotheses."""
-        return self.best.scored.level
-
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where the hypothesis stays."""
-        named, results = self.best.scored.read(values), values.elements(self.level)
-        if named is None or named.error or results is None:
-            return unknown(len(positions))
+    def find(values: Values, positions: Ints) -> TruthValues:
+        named, owners = _exact(values, results)
         # Where it is not sure that the detection is one, neither is what stays of it.
-        is_detection = self.best.kept(values, results.owners[positions]).surely
-        is_low = named.score[positions] < self.best.least
+        is_detection = best.kept(values, owners[positions]).surely
+        is_low = named.score[positions] < least
         return TruthValues(~is_low & is_detection, ~is_low | ~is_detection)
+
+    return Limit(results.level, find)
+
+
+def _exact(values: Values, results: Scored) -> tuple[NamedScores, Ints]:
+    """Returns hypotheses and their detections; raises `UnknownShapeError` where not exact."""
+    named = results.read(values)
+    if named.error:
+        raise UnknownShapeError("with rounded scores another one may be the best")
+    return named, values.elements(results.level).owners
 
 
 def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
@@ -196,43 +177,34 @@ def without_low(node: Node, least: float, depth: int = MAX_DEPTH) -> Node:
         inner = without_low(node.element, least, depth - 1) if has_objects else node.element
         return Listing(node.level, inner)
     if isinstance(node, Leaf) and node.kind is Kind.TEXT:
-        return replace(node, json_depth=depth)
+        return node._replace(json_depth=depth)
     return _object_without_low(node, least, depth) if is_object(node) else node
 
 
-def is_object(node: Node) -> TypeGuard[Object]:
-    """Returns whether a node is an object that may be a detection, or have some in it."""
-    return isinstance(node, Message) or (isinstance(node, Group) and node.turned is None)
-
-
 def _object_without_low(node: Object, least: float, depth: int) -> Node:
-    fields = dict(children(node))
-    single = scored(fields)
+    fields = node.fields
+    single, several, results = scored(fields), hypotheses(fields), fields.get("results")
     if single is not None:
-        return Narrowed(
-            _OwnScoreLimit(single.level, single, least, *_inner_detections(fields, depth)), node
-        )
-    results, several = fields.get("results"), hypotheses(fields)
+        return Narrowed(_own_limit(single, least, _may_have_more(fields, depth)), node)
     if isinstance(results, Listing) and several is not None:
         others = {name: child for name, child in fields.items() if name != "results"}
-        texts, has_inner = _inner_detections(others, depth)
-        best = _BestScoreLimit(
-            several.level.parent or several.level, several, least, texts, has_inner
-        )
-        kept = Narrowed(_HypothesisLimit(best), results.element)
-        return Narrowed(best, Group({**fields, "results": Listing(results.level, kept)}))
-    kept_fields = {name: without_low(child, least, depth - 1) for name, child in fields.items()}
-    return replace(node, fields=kept_fields) if isinstance(node, Group) else Group(kept_fields)
+        level = several.level.parent or several.level
+        best = _best_limit(level, several, least, _may_have_more(others, depth))
+        kept = Narrowed(_hypothesis_limit(best, several, least), results.element)
+        shown = node._replace(fields={**fields, "results": Listing(results.level, kept)})
+        return Narrowed(best, shown)
+    inner = {name: without_low(child, least, depth - 1) for name, child in fields.items()}
+    return node._replace(fields=inner)
 
 
 def hypotheses(fields: Mapping[str, Node]) -> Scored | None:
     """Returns how the hypotheses of a detection are named and scored (vision_msgs); None: none."""
     results = fields.get("results")
-    if not isinstance(results, Listing) or not isinstance(results.element, Message | Group):
+    if not isinstance(results, Listing) or not isinstance(results.element, Object):
         return None
-    inner = dict(children(results.element))
+    inner = results.element.fields
     named = inner.get("hypothesis")
-    return scored(dict(children(named)) if isinstance(named, Message | Group) else inner)
+    return scored(named.fields if isinstance(named, Object) else inner)
 
 
 def scored(fields: Mapping[str, Node]) -> Scored | None:
@@ -248,27 +220,26 @@ def _leaves(fields: Mapping[str, Node], names: tuple[str, ...], *kinds: Kind) ->
     return tuple(node for node in nodes if isinstance(node, Leaf) and node.kind in kinds)
 
 
-def _inner_detections(fields: Mapping[str, Node], depth: int) -> tuple[tuple[Leaf, ...], bool]:
-    """Returns the texts in an object that may be JSON, and whether there are detections in it.
-
-    No texts where there are: they decide nothing then.
-    """
+def _may_have_more(fields: Mapping[str, Node], depth: int) -> Callable[[Values], bool]:
+    """Returns what says whether there may be detections in the fields of an object."""
     texts: list[Leaf] = []
     for node in fields.values():
         # Any limit on scores will do: where one is shows where a detection is.
         limited = without_low(node, 0.0, depth - 1)
         for _, leaf, limits in leaves_below(Spot(limited)):
-            if any(isinstance(limit, _ScoreLimit) for limit in limits):
-                return (), True
+            if any(limit.is_of_scores for limit in limits):
+                return lambda _: True
             if leaf.json_depth:
                 texts.append(leaf)
-    return tuple(texts), False
+    return lambda values: may_be_json(values, texts)
 
 
-def may_be_json(values: Values, texts: tuple[Leaf, ...]) -> bool:
+def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
     """Returns whether one of these texts looks like JSON, or is not held."""
-    columns = [values.texts(leaf) for leaf in texts]
-    return any(column is None or any(map(looks_like_json, column.words)) for column in columns)
+    try:
+        return any(looks_like_json(word) for leaf in texts for word in values.texts(leaf).words)
+    except UnknownShapeError:
+        return True
 
 
 def ranked(score: Floats, owners: Ints) -> tuple[Ints, Mask]:
@@ -279,7 +250,3 @@ def ranked(score: Floats, owners: Ints) -> tuple[Ints, Mask]:
     rank = np.where(np.isnan(score), -np.inf, score)
     order = np.lexsort((-rank, owners))
     return order, np.diff(owners[order], prepend=-1) != 0
-
-
-def _has_label(name: Texts) -> Mask:
-    return np.array([bool(word.strip()) for word in name.words], np.bool_)[name.codes]

@@ -6,21 +6,31 @@ has, under which names, and the column that each is read or computed from. What 
 looked at, so one tree serves all tables of a type.
 
 A node is what may stand in the value: a `Leaf` (a number, boolean or text of each row or element),
-an object (`Message`, `Group`), a list (`Listing` over the elements of a level, `Items` of a short
-fixed array), or null (`NOTHING`). `Narrowed` and `Choice` say for which rows a node stands there.
+an `Object`, a list (`Listing` over the elements of a level, `Items` of a short fixed array), or
+null (`NOTHING`). `Narrowed` and `Choice` say for which rows a node stands there.
 """
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeGuard, TypeVar
 
 import numpy as np
 
+from ros2_memory.columns.stored import Lazily
 from ros2_memory.columns.table import MAX_NUMBERS, Table
-from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Level, Values
+from ros2_memory.columns.values import (
+    NUMBERS,
+    ROWS,
+    Conversion,
+    Kind,
+    Leaf,
+    Level,
+    UnknownShapeError,
+    Values,
+)
 from ros2_memory.extract import POINTS, SchemaExtractor
 from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
@@ -43,15 +53,16 @@ _BYTES: Final = frozenset({"uint8", "char"})
 """What rosbags decodes to uint8, whose long arrays are shown as their length."""
 
 
-class UnknownShapeError(Exception):
-    """What the value looks like differs from message to message: the messages decide."""
-
-
 class TruthValues(NamedTuple):
     """Of some rows or elements: where something surely stands, and where it may stand."""
 
     surely: Mask
     perhaps: Mask
+
+    @classmethod
+    def known(cls, stands: Mask) -> TruthValues:
+        """Returns that it stands there and nowhere else."""
+        return cls(stands, stands)
 
     @property
     def unsure(self) -> Mask:
@@ -74,49 +85,47 @@ def unknown(size: int) -> TruthValues:
     return TruthValues(np.zeros(size, np.bool_), np.ones(size, np.bool_))
 
 
-class Limit(Protocol):
-    """For which rows or elements of a level something stands in the value."""
+class Limit(NamedTuple):
+    """For which rows or elements of a level something stands in the value.
 
-    @property
-    def level(self) -> Level:
-        """The level that it is about."""
+    Attributes:
+        level: the level that it is about.
+        find: returns where it stands, for some rows or elements of the level; may raise
+            `UnknownShapeError`.
+        is_of_scores: whether detections of a low score are left out by it.
+    """
+
+    level: Level
+    find: Callable[[Values, Ints], TruthValues]
+    is_of_scores: bool = False
 
     def kept(self, values: Values, positions: Ints) -> TruthValues:
         """Returns where it stands, for some rows or elements of the level."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pick:
-    """The element at this place of each list alone; negative from the end."""
-
-    level: Level
-    place: int
-
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where the elements stand at the place."""
-        places = values.places(self.level, positions, from_end=self.place < 0)
-        if places is None:
+        try:
+            return self.find(values, positions)
+        except UnknownShapeError:
             return unknown(len(positions))
-        is_kept = places == self.place
-        return TruthValues(is_kept, is_kept)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LongerThan:
-    """Where a sequence of numbers has more elements than this; else where it has no more."""
+def _at_place(level: Level, place: int) -> Limit:
+    """Returns the limit to the element at this place of each list; negative from the end."""
 
-    level: Level
-    sequence: str
-    count: int
-    is_longer: bool
+    def find(values: Values, positions: Ints) -> TruthValues:
+        return TruthValues.known(values.places(level, positions, from_end=place < 0) == place)
 
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where the sequence is that long."""
-        lengths = values.numeric(self.level, f"{self.sequence}.length")
+    return Limit(level, find)
+
+
+def _where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) -> Limit:
+    """Returns the limit to sequences of more numbers than this, or else of no more."""
+
+    def find(values: Values, positions: Ints) -> TruthValues:
+        lengths = values.numeric(level, f"{sequence}.length")
         if lengths is None:
             return unknown(len(positions))
-        is_kept = (lengths[positions] > self.count) == self.is_longer
-        return TruthValues(is_kept, is_kept)
+        return TruthValues.known((lengths[positions] > count) == is_longer)
+
+    return Limit(level, find)
 
 
 class Place(NamedTuple):
@@ -128,84 +137,58 @@ class Place(NamedTuple):
     length: int | None
     depth: int
 
+    def fields(self, definition: Definition) -> dict[str, Place]:
+        """Returns the fields of the message that lies here."""
+        level, path, _, _, depth = self
+        return {
+            field.name: Place(level, _below(path, field.name), field.kind, field.length, depth + 1)
+            for field in definition.fields
+            if field.name != _FILLER
+        }
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Message:
-    """A message that is shown field by field; `plain`: as its definition has them."""
-
-    shape: Shape
-    level: Level
-    path: str
-    definition: Definition
-    depth: int
-    plain: bool = False
-
-    def names(self) -> list[str]:
-        """Returns the names of its fields."""
-        return [field.name for field in self.definition.fields if field.name != _FILLER]
-
-    def child(self, name: str) -> Node | None:
-        """Returns what stands under a name; None where no field has it."""
-        for field in self.definition.fields:
-            if field.name == name != _FILLER:
-                path = f"{self.path}.{name}" if self.path else name
-                place = Place(self.level, path, field.kind, field.length, self.depth + 1)
-                if self.plain:
-                    return self.shape.plain(place)
-                if name == SUMMARIZED.get(self.definition.type):
-                    return self.shape.summary(self, place)
-                return self.shape.shown(place)
-        return None
+    def element(self) -> Place:
+        """Returns the elements of the list that lies here."""
+        return Place(Level(self.level, self.path), "", self.kind, None, self.depth + 1)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Group:
-    """An object that the conversions make.
+class Object(NamedTuple):
+    """A message that is shown field by field, or an object that the conversions make.
 
     Attributes:
-        fields: its parts.
-        turned: the message, of a quaternion.
+        fields: what stands under each name; of a message it is made when it is asked for, which may
+            raise `UnknownShapeError`.
+        place: of a message.
+        xyzw: the rotation as its message has it, of angles that a message was converted to.
         is_summary: whether it is a `messages.conversions.Summary`.
     """
 
     fields: Mapping[str, Node]
-    turned: Message | None = None
+    place: Place | None = None
+    xyzw: Object | None = None
     is_summary: bool = False
 
-    def names(self) -> list[str]:
-        """Returns the names of its fields."""
-        return [*self.fields]
 
-    def child(self, name: str) -> Node | None:
-        """Returns what stands under a name; None where no field has it."""
-        return self.fields.get(name)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Listing:
+class Listing(NamedTuple):
     """A list of the elements of a level."""
 
     level: Level
     element: Node
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Items:
+class Items(NamedTuple):
     """A list of so many for all rows."""
 
-    items: tuple[Node, ...]
+    items: tuple[Leaf, ...]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Narrowed:
+class Narrowed(NamedTuple):
     """A node that stands in the value of some rows or elements alone, and null in the others."""
 
     limit: Limit
     node: Node
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Choice:
+class Choice(NamedTuple):
     """An array of numbers (`array`), which is shown as one of these, whichever holds for a row."""
 
     cases: tuple[Node, ...]
@@ -219,8 +202,8 @@ class Nothing:
 
 NOTHING: Final = Nothing()
 
-Node: TypeAlias = Leaf | Message | Group | Listing | Items | Narrowed | Choice | Nothing
-Limits: TypeAlias = tuple["Limit", ...]
+Node: TypeAlias = Leaf | Object | Listing | Items | Narrowed | Choice | Nothing
+Limits: TypeAlias = tuple[Limit, ...]
 
 
 class Spot(NamedTuple):
@@ -248,10 +231,9 @@ def placed(
             if limit.level == current and len(kept):
                 mask = limit.kept(values, owners)[0 if surely else 1]
                 kept, owners = kept[mask], owners[mask]
-        elements = values.elements(current)
-        if current.parent is None or elements is None:
+        if current.parent is None:
             return kept, owners
-        owners, current = elements.owners[owners], current.parent
+        owners, current = values.elements(current).owners[owners], current.parent
 
 
 class Shape:
@@ -282,10 +264,10 @@ class Shape:
         """
         nodes = {name: self._at(path) for name, path in self._fields.items()}
         if all(node is None for node in nodes.values()):
-            return self._message()
-        return Group(
+            return self.shown(self._root)
+        return Object(
             {
-                name: NOTHING if node is None else self._converted(name, node)
+                name: NOTHING if node is None else _converted(name, node)
                 for name, node in nodes.items()
             }
         )
@@ -296,65 +278,77 @@ class Shape:
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        segments = tuple(path.split("."))
-        mapped = self._fields.get(segments[0])
+        name, *inner = path.split(".")
         node: Node | None = None
-        if mapped is not None:
-            whole = self._at(mapped)
-            if whole is not None:
-                node = descend(self._converted(segments[0], whole), segments[1:])
+        if name in self._fields:
+            whole = self._at(self._fields[name])
+            node = None if whole is None else descend(_converted(name, whole), inner)
         elif not self._fields:
-            node = descend(self._message(), segments)
-        if node is not None:
-            return node
-        plain = self._at(segments)
-        return None if plain is None else _with_changed_leaves(plain, _quaternion_as_xyzw)
+            node = descend(self.shown(self._root), [name, *inner])
+        if node is None:
+            plain = self._at([name, *inner])
+            node = None if plain is None else _with_changed_leaves(plain, _quaternion_as_xyzw)
+        return node
 
     def shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
-        if place.length is None and isinstance(place.kind, str):
-            return Leaf(place.level, (place.path,), _kind(place.kind))
-        if place.depth >= MAX_DEPTH:
-            raise UnknownShapeError(f"{place.path} lies {place.depth} levels deep")
-        if place.length is None and isinstance(place.kind, Definition):
-            return self._shown_message(place, place.kind)
-        return self._array(place)
+        level, path, kind, length, depth = place
+        if length is None and isinstance(kind, str):
+            return Leaf(level, (path,), _kind(kind))
+        if depth >= MAX_DEPTH:
+            raise UnknownShapeError(f"{path} lies {depth} levels deep")
+        if length is not None or isinstance(kind, str):
+            return self._array(place)
+        return self._message(place, kind)
 
-    def _shown_message(self, place: Place, definition: Definition) -> Node:
-        level, path = place.level, place.path
-        message = Message(self, level, path, definition, place.depth)
+    def _message(self, place: Place, definition: Definition) -> Node:
+        level, path, *_ = place
         kind = kind_of_type(definition.type, [field.name for field in definition.fields])
         if kind is ValueKind.TIME:
             return Leaf(level, (path,), Kind.REAL, Conversion.SECONDS)
-        are_numbers = all(_is_number(field.kind, field.length) for field in definition.fields)
-        sources = [f"{path}.{field.name}" if path else field.name for field in definition.fields]
+        fields = place.fields(definition)
+        sources = [field.path for field in fields.values()]
+        are_numbers = all(
+            field.length is None and isinstance(field.kind, str) and _kind(field.kind) in NUMBERS
+            for field in fields.values()
+        )
         if kind is ValueKind.VECTOR and are_numbers:
             return _vector(level, sources)
         if kind is ValueKind.QUATERNION:
-            return _angles_of(level, sources, message) if are_numbers else NOTHING
+            xyzw = Object({name: _real(level, _below(path, name)) for name in "xyzw"})
+            return _angles_of(level, sources, xyzw) if are_numbers else NOTHING
+        summarized = SUMMARIZED.get(definition.type)
+
+        def shown(name: str) -> Node:
+            make = partial(self._summary, message) if name == summarized else self.shown
+            return make(fields[name])
+
+        message = Object(Lazily(fields, shown), place)
         return message
 
-    def plain(self, place: Place) -> Node:
+    def _plain(self, place: Place) -> Node:
         """Returns a part of the message as its definition has it, to be walked further."""
-        level, path, kind, length, depth = place
+        kind = place.kind
         if isinstance(kind, str):
             return self.shown(place)
-        if length is not None:
-            inner = Level(level, path)
-            return Listing(inner, self.plain(Place(inner, "", kind, None, depth + 1)))
-        return Message(self, level, path, kind, depth, plain=True)
+        if place.length is not None:
+            element = place.element()
+            return Listing(element.level, self._plain(element))
+        fields = place.fields(kind)
+        return Object(Lazily(fields, lambda name: self._plain(fields[name])), place)
 
-    def summary(self, message: Message, place: Place) -> Node:
+    def _summary(self, message: Object, place: Place) -> Node:
         """Returns what the conversions make of the data of an image, a map or a magnet.
 
         Raises:
             UnknownShapeError: it is a plain image or a cloud, or the definition is not the standard
                 one.
         """
-        kind = message.definition.type.rpartition("/")[2]
+        around = message.place.kind if message.place else ""
+        kind = around.type.rpartition("/")[2] if isinstance(around, Definition) else ""
         if kind == "MagneticField":
             node = self.shown(place)
-            if isinstance(node, Group) and node.turned is None:
+            if is_object(node) and node.place is None:
                 return node
         if not isinstance(place.kind, str) or place.length != SEQUENCE:
             raise UnknownShapeError(f"{place.path} is no sequence of bytes")
@@ -368,79 +362,67 @@ class Shape:
         count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
         if kind == "CompressedImage":  # as markers have them
             parts = {"bytes": count, "encoding": leaf(Kind.TEXT, "format")}
-            return Group(parts, is_summary=True)
+            return Object(parts, is_summary=True)
         if kind != "OccupancyGrid":
             raise UnknownShapeError("images and clouds are no columns")
         shape = tuple(leaf(Kind.INTEGER, "info", name) for name in ("height", "width"))
-        return Group({"bytes": count, "shape": Items(shape)}, is_summary=True)
+        return Object({"bytes": count, "shape": Items(shape)}, is_summary=True)
 
-    def _message(self) -> Node:
-        return self.shown(Place(ROWS, "", self.definition, None, 0))
+    @cached_property
+    def _root(self) -> Place:
+        return Place(ROWS, "", self.definition, None, 0)
 
     def _at(self, path: Sequence[str]) -> Node | None:
-        node = descend(self._message(), path)
+        node = descend(self.shown(self._root), path)
         if node is not None:
             return node
-        plain = descend(self.plain(Place(ROWS, "", self.definition, None, 0)), path)
+        plain = descend(self._plain(self._root), path)
         return None if plain is None else _with_changed_leaves(plain, self._as_shown)
 
     def _as_shown(self, node: Node) -> Node:
         """Returns the end of a walk through definitions as the value shows it."""
-        if not isinstance(node, Message):
-            return node
-        return self.shown(Place(node.level, node.path, node.definition, None, node.depth))
+        if isinstance(node, Object) and node.place is not None:
+            return self.shown(node.place)
+        return node
 
     def _array(self, place: Place) -> Node:
-        level, path, kind, length, depth = place
-        inner = Level(level, path)
-        element = self.shown(Place(inner, "", kind, None, depth + 1))
-        listing = Listing(inner, element)
+        level, path, kind, length, _ = place
+        element = place.element()
+        listing = Listing(element.level, self.shown(element))
         if not isinstance(kind, str) or _kind(kind) is Kind.TEXT:
             return listing
         count, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
+        counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
+        summary = Object({key: counted}, is_summary=True)
         if length == SEQUENCE:
-            counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
-            longer = LongerThan(level, path, count, is_longer=True)
-            shorter = LongerThan(level, path, count, is_longer=False)
-            summary = Group({key: counted}, is_summary=True)
-            cases = (Narrowed(longer, summary), Narrowed(shorter, listing))
-            return Choice(cases, listing)
+            longer = _where_longer(level, path, count, is_longer=True)
+            shorter = _where_longer(level, path, count, is_longer=False)
+            return Choice((Narrowed(longer, summary), Narrowed(shorter, listing)), listing)
         size = length or 0
         array: Node = listing
         if size <= MAX_NUMBERS:
             array = Items(
                 tuple(Leaf(level, (f"{path}.{nth}",), _kind(kind)) for nth in range(size))
             )
-        if size <= count:
-            return array
-        constant = Leaf(level, (), Kind.INTEGER, Conversion.CONSTANT, size)
-        return Choice((Group({key: constant}, is_summary=True),), array)
+        return array if size <= count else Choice((summary,), array)
 
-    def _converted(self, name: str, node: Node) -> Node:
-        """Returns the value of a name of the schema map: an array as the point or turn it is."""
-        if isinstance(node, Narrowed):
-            return Narrowed(node.limit, self._converted(name, node.node))
-        if name not in POINTS and name != "orientation":
-            return node
-        if isinstance(node, Choice):
-            if isinstance(node.array, Listing) and len(node.cases) > 1:
-                raise UnknownShapeError(f"{name} has another length in each message")
-            array = node.array
-        else:
-            array = node
-        if not isinstance(array, Items):
-            return node
-        leaves = [item for item in array.items if isinstance(item, Leaf)]
-        is_numeric = all(leaf.kind in {Kind.INTEGER, Kind.REAL} for leaf in leaves)
-        sources = [leaf.sources[0] for leaf in leaves]
-        if name in POINTS:
-            return _vector(leaves[0].level, sources) if is_numeric and len(leaves) == 3 else node
-        if len(leaves) != 4:
-            return node
-        # PX4 writes w first.
-        return (
-            _angles_of(leaves[0].level, [*sources[1:], sources[0]], None) if is_numeric else NOTHING
-        )
+
+def _converted(name: str, node: Node) -> Node:
+    """Returns the value of a name of the schema map: an array as the point or turn it is."""
+    if isinstance(node, Narrowed):
+        return Narrowed(node.limit, _converted(name, node.node))
+    count = 3 if name in POINTS else 4 if name == "orientation" else 0
+    array = node.array if isinstance(node, Choice) else node
+    if count and isinstance(node, Choice) and isinstance(array, Listing) and len(node.cases) > 1:
+        raise UnknownShapeError(f"{name} has another length in each message")
+    if not count or not isinstance(array, Items) or len(array.items) != count:
+        return node
+    is_numeric = all(leaf.is_number for leaf in array.items)
+    level, first, *others = array.items[0].level, *(leaf.sources[0] for leaf in array.items)
+    if name in POINTS:
+        return _vector(level, [first, *others]) if is_numeric else node
+    # PX4 writes w first.
+    return _angles_of(level, [*others, first]) if is_numeric else NOTHING
 
 
 def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
@@ -495,11 +477,8 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
         elif isinstance(node, Listing):
             inner = descend(node.element, path[nth:])
             return None if inner is None else Listing(node.level, inner)
-        elif isinstance(node, Message | Group):
-            child = node.child(segment)
-            if child is None:
-                return None
-            node = child
+        elif isinstance(node, Object) and segment in node.fields:
+            node = node.fields[segment]
         else:
             return None
     return node
@@ -550,28 +529,25 @@ def leaves_below(root: Spot) -> Iterator[tuple[str, Leaf, Limits]]:
             elif isinstance(node, Listing):
                 waiting.append((path, Spot(node.element, limits)))
             elif isinstance(node, Items):
-                waiting.extend((path, Spot(item, limits)) for item in reversed(node.items))
-            elif isinstance(node, Message | Group):
-                is_summary = isinstance(node, Group) and node.is_summary
+                yield from ((path, item, limits) for item in node.items)
+            elif isinstance(node, Object):
                 waiting.extend(
-                    (f"{path}.{key}" if path else key, Spot(child, limits))
-                    for key, child in reversed(children(node))
-                    if not is_summary or (isinstance(child, Leaf) and child.kind is Kind.TEXT)
+                    (_below(path, key), Spot(child, limits))
+                    for key, child in reversed([*node.fields.items()])
+                    if not node.is_summary or (isinstance(child, Leaf) and child.kind is Kind.TEXT)
                 )
 
 
-def children(node: Message | Group) -> list[tuple[str, Node]]:
-    """Returns the fields of an object in their order."""
-    named = [(name, node.child(name)) for name in node.names()]
-    return [(name, child) for name, child in named if child is not None]
+def is_object(node: Node | None) -> TypeGuard[Object]:
+    """Returns whether a node is an object that may be a detection, or have some in it."""
+    return isinstance(node, Object) and node.xyzw is None
 
 
 def _step(spot: Spot, segment: str) -> Iterator[Spot]:
     for node, limits in opened(spot):
-        if isinstance(node, Message | Group):
-            child = node.child(segment)
-            if child is not None:
-                yield Spot(child, limits)
+        if isinstance(node, Object):
+            if segment in node.fields:
+                yield Spot(node.fields[segment], limits)
         elif isinstance(node, Listing | Items) and _INDEX.fullmatch(segment):
             yield Spot(_element_at(node, int(segment)), limits)
         elif isinstance(node, Listing):
@@ -580,7 +556,7 @@ def _step(spot: Spot, segment: str) -> Iterator[Spot]:
 
 def _element_at(node: Listing | Items, index: int) -> Node:
     if isinstance(node, Listing):
-        return Narrowed(Pick(node.level, index), node.element)
+        return Narrowed(_at_place(node.level, index), node.element)
     return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
 
 
@@ -595,30 +571,25 @@ def _with_changed_leaves(node: Node, change: Callable[[Node], Node]) -> Node:
 
 def _quaternion_as_xyzw(node: Node) -> Node:
     """Returns a rotation as the x, y, z, w of its message, and not as angles; others unchanged."""
-    if not isinstance(node, Group) or node.turned is None:
-        return node
-    message = node.turned
-    path = f"{message.path}." if message.path else ""
-    return Group({name: _real(message.level, f"{path}{name}") for name in "xyzw"})
+    return node.xyzw if isinstance(node, Object) and node.xyzw is not None else node
+
+
+def _below(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
 
 
 def _real(level: Level, source: str) -> Leaf:
-    return Leaf(level, (source,), Kind.REAL, Conversion.REAL)
+    return Leaf(level, (source,), Kind.REAL)
 
 
-def _vector(level: Level, sources: Sequence[str]) -> Group:
-    return Group({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
+def _vector(level: Level, sources: Sequence[str]) -> Object:
+    return Object({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
 
 
-def _angles_of(level: Level, sources: Sequence[str], message: Message | None) -> Group:
+def _angles_of(level: Level, sources: Sequence[str], xyzw: Object | None = None) -> Object:
     angles = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
-    return Group(
-        {
-            name: Leaf(level, tuple(sources), Kind.REAL, angle)
-            for name, angle in zip(ANGLES, angles, strict=True)
-        },
-        message,
-    )
+    leaves = [Leaf(level, tuple(sources), Kind.REAL, angle) for angle in angles]
+    return Object(dict(zip(ANGLES, leaves, strict=True)), xyzw=xyzw)
 
 
 def _kind(primitive: str) -> Kind:
@@ -627,7 +598,3 @@ def _kind(primitive: str) -> Kind:
     if primitive in {"string", "wstring"}:
         return Kind.TEXT
     return Kind.REAL if primitive.startswith("float") else Kind.INTEGER
-
-
-def _is_number(kind: str | Definition, length: int | None) -> bool:
-    return isinstance(kind, str) and length is None and _kind(kind) in {Kind.INTEGER, Kind.REAL}

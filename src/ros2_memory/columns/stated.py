@@ -7,6 +7,7 @@ of a goal, which has no columns) the messages are named that have to be read.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -34,8 +35,7 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import Source, found_in, sources_in, texts_of
-from ros2_memory.columns.scores import is_object
+from ros2_memory.columns.detections import Source, found_in, sources_in
 from ros2_memory.columns.shown import (
     ByType,
     Listing,
@@ -43,21 +43,23 @@ from ros2_memory.columns.shown import (
     Node,
     Shape,
     Spot,
-    UnknownShapeError,
-    children,
+    is_object,
     leaves_below,
     placed,
 )
-from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError, Values
 from ros2_memory.columns.walk import entries_of_codes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
-    from ros2_memory.columns.values import Ints
+    from ros2_memory.columns.values import Floats, Ints, Mask
     from ros2_memory.core.model import JsonValue
     from ros2_memory.extract import SchemaExtractor
+
+
+_NO_ROWS: Final = np.empty(0, np.int64)
 
 
 class FromColumns(NamedTuple):
@@ -90,19 +92,15 @@ class StatedColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._plans = ByType(extractor, _Plan.of)
+        self._readers = ByType(extractor, _reader_of)
 
     def of(self, table: Table) -> FromColumns | None:
         """Returns what the messages of a table state; None where they all have to be read."""
-        plan = self._plans.of(table)
+        read = self._readers.of(table)
         try:
-            return None if plan is None else plan.read(table)
+            return None if read is None else read(Values(table))
         except UnknownShapeError:
             return None
-
-
-_CHARGE: Final = (Word(CHARGE),)
-_COMMAND: Final = (Word(COMMAND),)
 
 
 class _Entry(NamedTuple):
@@ -113,65 +111,29 @@ class _Entry(NamedTuple):
     text: Leaf
 
 
-class _Plan(NamedTuple):
-    """What is looked for in the messages of a type."""
+def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
+    """Returns what reads from tables what messages of a type state.
 
-    type: str
-    labels: tuple[Source, ...] = ()
-    flags: tuple[tuple[str, Leaf], ...] = ()
-    entry: _Entry | None = None
-    numbers: tuple[Leaf, ...] = ()
-
-    @classmethod
-    def of(cls, shape: Shape) -> _Plan:
-        """Returns what is looked for in the value of a type.
-
-        Raises:
-            UnknownShapeError: it depends on the message.
-        """
-        value, type_name = shape.value, shape.type
-        if type_name == GOALS:
-            return cls(type_name, numbers=tuple(_goal_leaves(value)))
-        if has_errors(type_name):
-            return cls(type_name, entry=_entry_leaves(value, type_name))
-        numbers: tuple[Leaf, ...] = ()
-        if type_name in VELOCITIES:
-            numbers = tuple(_command_leaves(value))
-        elif type_name == BATTERY:
-            numbers = tuple(_charge_leaves(value))
-        if not has_events(type_name):
-            return cls(type_name, numbers=numbers)
-        flags = tuple(_flag_leaves(value, ""))
-        if len(flags) > MOST[FLAG]:
-            raise UnknownShapeError("more booleans than are tracked")
-        return cls(type_name, tuple(sources_in(value)), flags, numbers=numbers)
-
-    def read(self, table: Table) -> FromColumns:
-        """Returns what the messages of a table state.
-
-        Raises:
-            UnknownShapeError: they have to be read.
-        """
-        values, nothing = Values(table), np.empty(0, np.int64)
-        if self.type == GOALS:
-            stated = Stated(table.log_times)
-            return FromColumns(stated, nothing, _alike_goals(values, self.numbers))
-        if self.entry:
-            facts = _entry_facts(values, self.entry, self.type)
-            return FromColumns(Stated(table.log_times, facts), nothing)
-        labels = joined_facts(
-            [facts for source in self.labels for facts in _label_facts(values, source)]
-        )
-        if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
-            raise UnknownShapeError("more labels than are tracked")
-        numbers, to_read = NOTHING, nothing
-        if self.numbers:
-            facts_of = _charge_facts if self.type == BATTERY else _command_facts
-            numbers, to_read = facts_of(values, self.numbers)
-        flags = [_flag_facts(values, path, leaf) for path, leaf in self.flags]
-        return FromColumns(
-            Stated(table.log_times, joined_facts([labels, *flags, numbers])), to_read
-        )
+    Raises:
+        UnknownShapeError: that depends on the message.
+    """
+    value, type_name = shape.value, shape.type
+    if type_name == GOALS:
+        return partial(_goals, [*_goal_leaves(value)])
+    if has_errors(type_name):
+        return partial(_entries, _entry_leaves(value, type_name), type_name)
+    numbers: Callable[[Values], tuple[Facts, Ints]] | None = None
+    commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
+    leaf = _child(value, "percentage")
+    if commands:
+        numbers = partial(_command_facts, commands)
+    elif type_name == BATTERY and isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
+        numbers = partial(_charge_facts, leaf)
+    flags = [*_flag_leaves(value, "")] if has_events(type_name) else []
+    if len(flags) > MOST[FLAG]:
+        raise UnknownShapeError("more booleans than are tracked")
+    sources = [*sources_in(value)] if has_events(type_name) else []
+    return partial(_states, sources, flags, numbers)
 
 
 # What a type has
@@ -184,33 +146,26 @@ def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
     if isinstance(node, Leaf) and node.kind is Kind.BOOLEAN:
         yield path, node
     elif is_object(node):
-        for name, inner in children(node):
+        for name, inner in node.fields.items():
             yield from _flag_leaves(inner, f"{path}.{name}" if path else name)
 
 
 def _entry_leaves(value: Node, type_name: str) -> _Entry:
     """Returns level, name and text of a log entry, or of the elements of a list of diagnostics."""
     node: Node | None = value
+    texts = ("name", "msg")
     if type_name == DIAGNOSTICS:
         listed = _child(value, "status")
-        node = listed.element if isinstance(listed, Listing) else None
-    text = "message" if type_name == DIAGNOSTICS else "msg"
-    nodes = [] if node is None else [_child(node, name) for name in ("level", "name", text)]
-    leaves = tuple(leaf for leaf in nodes if isinstance(leaf, Leaf))
-    kinds = [leaf.kind for leaf in leaves]
+        texts, node = ("name", "message"), listed.element if isinstance(listed, Listing) else None
+    leaves = [_child(node, name) for name in ("level", *texts)]
+    kinds = [leaf.kind for leaf in leaves if isinstance(leaf, Leaf)]
     if kinds != [Kind.INTEGER, Kind.TEXT, Kind.TEXT]:
         raise UnknownShapeError("the definition is not the standard one")
-    return _Entry(*leaves)
+    return _Entry(*(leaf for leaf in leaves if isinstance(leaf, Leaf)))
 
 
-def _child(node: Node, name: str) -> Node | None:
-    return node.child(name) if is_object(node) else None
-
-
-def _charge_leaves(value: Node) -> Iterator[Leaf]:
-    leaf = _child(value, "percentage")
-    if isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
-        yield leaf
+def _child(node: Node | None, name: str) -> Node | None:
+    return node.fields.get(name) if is_object(node) else None
 
 
 def _command_leaves(value: Node) -> Iterator[Leaf]:
@@ -240,25 +195,50 @@ def _goal_leaves(value: Node) -> Iterator[Leaf]:
 # What a table holds
 
 
-def _label_facts(values: Values, source: Source) -> Iterator[Facts]:
-    """Yields the labels at one place of the messages, with their scores."""
-    for detections in found_in(values, source, places=False):
-        words = [Word(LABEL, label) for label in detections.labels.words]
-        yield Facts(
-            detections.rows, detections.labels.codes.astype(np.int64), detections.scores, words
-        )
+def _goals(leaves: Sequence[Leaf], values: Values) -> FromColumns:
+    return FromColumns(Stated(values.table.log_times), _NO_ROWS, _alike_goals(values, leaves))
+
+
+def _entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
+    return FromColumns(
+        Stated(values.table.log_times, _entry_facts(values, entry, type_name)), _NO_ROWS
+    )
+
+
+def _states(
+    sources: Sequence[Source],
+    flags: Sequence[tuple[str, Leaf]],
+    numbers: Callable[[Values], tuple[Facts, Ints]] | None,
+    values: Values,
+) -> FromColumns:
+    """Returns what messages state by labels with their scores, booleans and numbers."""
+    found = [part for source in sources for part in found_in(values, source, places=False)]
+    labels = joined_facts(
+        [
+            Facts(
+                part.rows,
+                part.labels.codes.astype(np.int64),
+                part.scores,
+                [Word(LABEL, label) for label in part.labels.words],
+            )
+            for part in found
+        ]
+    )
+    if labels.rows.size and np.bincount(labels.rows).max() > MOST[LABEL]:
+        raise UnknownShapeError("more labels than are tracked")
+    of_numbers, unsure = numbers(values) if numbers else (NOTHING, _NO_ROWS)
+    of_flags = [_flag_facts(values, path, leaf) for path, leaf in flags]
+    facts = joined_facts([labels, *of_flags, of_numbers])
+    return FromColumns(Stated(values.table.log_times, facts), unsure)
 
 
 def _flag_facts(values: Values, path: str, leaf: Leaf) -> Facts:
-    zone, rows = values.zone(leaf), np.arange(values.rows)
+    zone = values.zone(leaf)
     if zone is not None and zone.least is not None and zone.least == zone.greatest:
-        flags = np.full(rows.size, float(zone.least))
+        flags = np.full(values.rows, float(zone.least))
     else:
-        numbers = values.numbers(leaf)
-        if numbers is None:
-            raise UnknownShapeError(f"{path} is not held")
-        flags = numbers.values.astype(np.float64)
-    return Facts(rows, np.zeros(rows.size, np.int64), flags, [Word(FLAG, path)])
+        flags = values.numbers(leaf).values.astype(np.float64)
+    return _facts_of(FLAG, np.arange(values.rows), flags, path)
 
 
 def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
@@ -268,11 +248,8 @@ def _entry_facts(values: Values, entry: _Entry, type_name: str) -> Facts:
         zone.greatest is None or not _facts_of_entry(int(zone.greatest), type_name)
     ):
         return NOTHING
-    numbers = values.numbers(entry.level)
-    name, text = texts_of(values, entry.name), texts_of(values, entry.text)
-    if numbers is None:
-        raise UnknownShapeError("levels are not held")
-    levels = numbers.values.astype(np.int64)
+    levels = values.numbers(entry.level).values.astype(np.int64)
+    name, text = values.texts(entry.name), values.texts(entry.text)
     telling = [level for level in np.unique(levels).tolist() if _facts_of_entry(level, type_name)]
     positions = np.flatnonzero(np.isin(levels, telling))
     _, rows = placed(values, entry.level.level, positions, (), surely=True)
@@ -299,35 +276,30 @@ def _facts_of_entry(level: int, type_name: str, name: str = "", text: str = "") 
     return state_of(value, type_name).facts
 
 
-def _charge_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _charge_facts(leaf: Leaf, values: Values) -> tuple[Facts, Ints]:
     """Returns how low a battery is, and the rows in which rounding may have changed that."""
-    numbers = values.numbers(leaves[0])
-    if numbers is None or not isinstance(numbers.error, float):
-        raise UnknownShapeError("the charge is not held")
-    charges = numbers.values.astype(np.float64)
-    low, levels, high = (charge_levels(charges + off) for off in (-numbers.error, 0, numbers.error))
+    charges, error = values.floats(leaf)
+    low, levels, high = (charge_levels(charges + off) for off in (-error, 0, error))
     settled = np.flatnonzero((levels >= 0) & (low == high))
-    charge = Facts(
-        settled, np.zeros(settled.size, np.int64), levels[settled].astype(np.float64), _CHARGE
-    )
+    charge = _facts_of(CHARGE, settled, levels[settled])
     return charge, np.flatnonzero(low != high)
 
 
-def _command_facts(values: Values, leaves: Sequence[Leaf]) -> tuple[Facts, Ints]:
+def _command_facts(leaves: Sequence[Leaf], values: Values) -> tuple[Facts, Ints]:
     """Returns whether a velocity is commanded, and the rows in which rounding may hide that."""
     surely, perhaps = np.ones(values.rows, np.bool_), np.ones(values.rows, np.bool_)
     for leaf in leaves:
-        column = values.numbers(leaf)
-        if column is None or not isinstance(column.error, float):
-            raise UnknownShapeError("the command is not held")
-        numbers = column.values.astype(np.float64)
-        surely &= is_still(numbers, column.error)
-        perhaps &= is_still(numbers, -column.error)
+        numbers, error = values.floats(leaf)
+        surely &= is_still(numbers, error)
+        perhaps &= is_still(numbers, -error)
     settled = np.flatnonzero(surely == perhaps)
-    moves = (~surely[settled]).astype(np.float64)
-    return Facts(settled, np.zeros(settled.size, np.int64), moves, _COMMAND), np.flatnonzero(
-        surely != perhaps
-    )
+    return _facts_of(COMMAND, settled, ~surely[settled]), np.flatnonzero(surely != perhaps)
+
+
+def _facts_of(kind: str, rows: Ints, numbers: Ints | Mask | Floats, name: str = "") -> Facts:
+    """Returns a number of each row as a fact, under one word."""
+    words = [Word(kind, name) if name else Word(kind)]
+    return Facts(rows, np.zeros(rows.size, np.int64), numbers.astype(np.float64), words)
 
 
 def _alike_goals(values: Values, leaves: Sequence[Leaf]) -> Ints:
@@ -336,20 +308,17 @@ def _alike_goals(values: Values, leaves: Sequence[Leaf]) -> Ints:
     An action server lists a goal with the time at which it accepted it, so one goal does not take
     the place of another without a trace.
     """
-    columns = [values.numbers(leaf) for leaf in leaves]
-    numbers = [column.values for column in columns if column is not None]
-    elements = values.elements(leaves[0].level) if leaves else None
-    if len(numbers) < len(columns) or elements is None:
-        raise UnknownShapeError("goals are not held")
-    first = np.searchsorted(elements.owners, np.arange(values.rows + 1))
+    columns = [values.numbers(leaf).values for leaf in leaves]
+    owners = values.elements(leaves[0].level).owners
+    first = np.searchsorted(owners, np.arange(values.rows + 1))
     counts = np.diff(first)
     is_new = np.diff(counts, prepend=-1) != 0
     # Each element is compared with the one that has its place in the row before.
-    nth = np.arange(elements.owners.size) - first[elements.owners]
-    before = np.maximum(first[np.maximum(elements.owners - 1, 0)] + nth, 0)
-    before = np.minimum(before, max(elements.owners.size - 1, 0))
-    is_different = np.zeros(elements.owners.size, np.bool_)
-    for column in numbers:
+    nth = np.arange(owners.size) - first[owners]
+    before = np.maximum(first[np.maximum(owners - 1, 0)] + nth, 0)
+    before = np.minimum(before, max(owners.size - 1, 0))
+    is_different = np.zeros(owners.size, np.bool_)
+    for column in columns:
         is_different |= column != column[before]
-    is_new[elements.owners[is_different]] = True
+    is_new[owners[is_different]] = True
     return np.cumsum(is_new)

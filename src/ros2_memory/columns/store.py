@@ -32,7 +32,6 @@ from ros2_memory.columns.stored import Topic
 from ros2_memory.columns.writing import (
     PART_NS,
     UNMERGED,
-    DecodedBags,
     Layouts,
     LongBag,
     ReadBag,
@@ -226,22 +225,20 @@ class ColumnStore(Database):
     def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
         """Returns the bags that are stored, by their paths; among some, or all of them."""
         condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
-        rows = self._rows(
-            list[tuple[int, int, str, int, Ns, Ns, Ns, Ns]](),
+        return self._asked(
+            lambda rows: {
+                key[0]: StoredBag(BagKey(*key), row, bool(hashed)) for row, hashed, *key in rows
+            },
+            {},
             f"SELECT id, hashed, {_KEY} FROM bag WHERE definitions IN ('', ?) {condition}",
-            self._definitions,
-            *(() if paths is None else (json.dumps(paths),)),
+            *(self._definitions, *(() if paths is None else (json.dumps(paths),))),
         )
-        stored = (StoredBag(BagKey._make(key), row, bool(hashed)) for row, hashed, *key in rows)
-        return {bag.key.path: bag for bag in stored}
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
-
-        def ask(connection: sqlite3.Connection) -> frozenset[int]:
-            return frozenset(self.offset + row[0] for row in connection.execute(UNMERGED))
-
-        return self.read(ask, frozenset())
+        return self._asked(
+            lambda rows: frozenset(self.offset + row for (row,) in rows), frozenset(), UNMERGED
+        )
 
     def dropped(self) -> dict[str, Ns]:
         """Returns the topics of which columns were dropped, with the log time (ns) of the first."""
@@ -249,21 +246,21 @@ class ColumnStore(Database):
             "SELECT name, min(first_ns) FROM part JOIN topic ON topic.id = part.topic"
             " WHERE dropped <> '' GROUP BY name ORDER BY name"
         )
-        return dict(self._rows(list[tuple[str, Ns]](), query))
+        return self._asked(dict, {}, query)
 
     def oldest(self) -> Ns | None:
         """Returns the earliest log time (ns) of any bag; None without one."""
-        rows = self._rows(list[tuple[Ns | None]](), "SELECT min(first_ns) FROM bag")
-        return rows[0][0] if rows else None
+        query, none = "SELECT min(first_ns) FROM bag", list[tuple[Ns | None]]()
+        return next((first for (first,) in self._asked(list, none, query)), None)
 
     def beginning_before(self, before: Ns) -> list[BagKey]:
         """Returns the bags whose first message is earlier than a log time (ns)."""
         query = f"SELECT {_KEY} FROM bag WHERE first_ns < ?"
-        return [*map(BagKey._make, self._rows(list[tuple[str | int, ...]](), query, before))]
+        return self._asked(lambda rows: [*map(BagKey._make, rows)], [], query, before)
 
     def paths(self) -> list[str]:
         """Returns the paths of all bags, also of those that are stored in part."""
-        return [path for (path,) in self._rows(list[tuple[str]](), "SELECT path FROM bag")]
+        return self._asked(lambda rows: [path for (path,) in rows], [], "SELECT path FROM bag")
 
     def topics(self) -> dict[int, Topic]:
         """Returns all topics that were ever stored, by their numbers."""
@@ -304,13 +301,13 @@ class ColumnStore(Database):
 
         def ask(connection: sqlite3.Connection) -> list[PartHead]:
             rows = connection.execute(
-                "SELECT id, topic, first_ns, last_ns, bags, messages, dropped, whole FROM part"
+                "SELECT bags, id, topic, first_ns, last_ns, messages, dropped, whole FROM part"
                 " WHERE topic IN (SELECT id FROM topic WHERE name = ?)"
                 " AND first_ns < ? AND last_ns >= ? AND id > ? ORDER BY first_ns, id",
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(numbers) for _, _, _, _, numbers, *_ in rows]
+            bags = [json.loads(numbers) for numbers, *_ in rows]
             all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
             bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
             return [
@@ -324,16 +321,16 @@ class ColumnStore(Database):
                     tuple(json.loads(dropped)) if dropped else (),
                     bool(whole),
                 )
-                for (
+                for numbers, (
+                    _,
                     number,
                     topic_number,
                     first,
                     last,
-                    _,
                     messages,
                     dropped,
                     whole,
-                ), numbers in zip(rows, bags_of_parts, strict=True)
+                ) in zip(bags_of_parts, rows, strict=True)
             ]
 
         return self.read(ask, [])
@@ -400,17 +397,18 @@ class ColumnStore(Database):
 
         They are of the same settings, the newest first.
         """
-        key_parts, rows = self._ids(key.parts), list[tuple[int, str, bytes]]()
-        query = (
+        key_parts = self._ids(key.parts)
+        return self._asked(
+            lambda rows: [
+                (key._replace(start=start, parts=self._numbers_of(parts)), data)
+                for start, parts, data in rows
+                if start < key.start or parts == key_parts
+            ],
+            [],
             "SELECT start_ns, parts, data FROM fragment"
-            " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC"
+            " WHERE kind = ? AND settings = ? AND start_ns BETWEEN ? AND ? ORDER BY start_ns DESC",
+            *(kind, key.settings, max(key.start - also_before, MIN_NS), key.start),
         )
-        since = max(key.start - also_before, MIN_NS)
-        return [
-            (key._replace(start=start, parts=self._numbers_of(parts)), data)
-            for start, parts, data in self._rows(rows, query, kind, key.settings, since, key.start)
-            if start < key.start or parts == key_parts
-        ]
 
     def fragments_of_others(self, reading: str) -> list[Ns]:
         """Returns where slices begin whose fragments all depend on other settings, newest first.
@@ -425,15 +423,17 @@ class ColumnStore(Database):
             " HAVING max(substr(kind, instr(kind, ' ') + 1) = ?) = 0)"
             " ORDER BY start_ns DESC"
         )
-        return [start for (start,) in self._rows(list[tuple[Ns]](), query, reading)]
+        return self._asked(lambda rows: [start for (start,) in rows], [], query, reading)
 
     def listings(self) -> dict[str, str]:
         """Returns what each `metadata.yaml` lists, by its folder's path as in a `BagKey`."""
-        return dict(self._rows(list[tuple[str, str]](), "SELECT folder, listed FROM listing"))
+        return self._asked(dict, {}, "SELECT folder, listed FROM listing")
 
-    def _rows(self, none: list[T], query: str, *given: str | int) -> list[T]:
-        """Returns the rows of a query; `none` where the file cannot be read."""
-        return self.read(lambda connection: connection.execute(query, given).fetchall(), none)
+    def _asked(
+        self, make: Callable[[sqlite3.Cursor], T], unknown: T, query: str, *given: str | int
+    ) -> T:
+        """Returns what is made of the rows of a query; `unknown` where the file cannot be read."""
+        return self.read(lambda connection: make(connection.execute(query, given)), unknown)
 
     def _ids(self, parts: Iterable[int]) -> str:
         return json.dumps([part - self.offset for part in parts])
@@ -469,18 +469,17 @@ class ColumnStore(Database):
             return True
         return self.write(write)
 
-    def put(self, decoded: DecodedBags, *, whole: bool) -> Written:
+    def put(self, bags: Sequence[ReadBag], *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
         One that is in whole parts stays as it is: another program has stored it. One that changed
         meanwhile is left out.
 
         Args:
-            decoded: the bags.
+            bags: with their tables.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
         written = Written(0, ())
-        bags = decoded.bags
 
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
@@ -491,11 +490,11 @@ class ColumnStore(Database):
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = [nth for nth, bag in enumerate(bags) if stored.get(bag.key, -1) < bag.hashed]
-            new = decoded.chosen([nth for nth in missing if bags[nth].is_current()])
-            delete_bags(connection, [bag.key.path for bag in new.bags])
+            missing = [bag for bag in bags if stored.get(bag.key, -1) < bag.hashed]
+            new = [bag for bag in missing if bag.is_current()]
+            delete_bags(connection, [bag.key.path for bag in new])
             parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
-            done = len(bags) - len(missing) + len(new.bags)
+            done = len(bags) - len(missing) + len(new)
             written = Written(done, tuple(self.offset + part for part in parts))
 
         return written if self.write(write) else Written(0, ())
@@ -505,24 +504,17 @@ class ColumnStore(Database):
 
         Only if it was stored with as many messages of each topic as it has now.
         """
-        kept = False
 
-        def write(connection: sqlite3.Connection) -> None:
-            nonlocal kept
+        def write(connection: sqlite3.Connection) -> bool:
             cursor = connection.execute(
                 "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
                 " AND mtime_ns = ?4 AND counts = ?5"
                 " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
-                (
-                    key.sidecar_ns,
-                    *key[:3],
-                    bag.summary.packed,
-                    bag.summary.schema.to_json(),
-                ),
+                (key.sidecar_ns, *key[:3], bag.summary.packed, bag.summary.schema.to_json()),
             )
-            kept = cursor.rowcount > 0
+            return cursor.rowcount > 0
 
-        return self.write(write) and kept
+        return self.write(write)
 
     def put_long(
         self, to_store: ReadBag, groups: Iterable[Sequence[Table]], *, budget: int
@@ -538,14 +530,12 @@ class ColumnStore(Database):
             budget: how many bytes the parts may take.
         """
         long = LongBag(to_store, self._definitions, budget)
-        if not (self.write(long.begin) and long.goes_on):
+        if not self.write(long.begin):
             return False
         is_whole = False
         try:
-            for tables in groups:
-                if not (self.write(partial(long.add, tables=tables)) and long.goes_on):
-                    return False
-            is_whole = self.write(long.end) and long.goes_on
+            goes_on = all(self.write(partial(long.add, tables=tables)) for tables in groups)
+            is_whole = goes_on and self.write(long.end)
         finally:
             if not is_whole:
                 self.write(long.delete_half)

@@ -287,6 +287,10 @@ class Table:
         order = order_of(self.log_times, self.places)
         return self if order is None else self.rows(order)
 
+    def without_columns(self, reason: str) -> Table:
+        """Returns the times of the rows alone, and why there is no more."""
+        return replace(self, columns={}, elements={}, left_out={"": reason})
+
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
@@ -366,9 +370,7 @@ def column_bytes(column: Column) -> int:
 
 
 def _bytes(columns: Mapping[str, Column], elements: Mapping[str, Elements]) -> int:
-    size = 0
-    for column in columns.values():
-        size += column_bytes(column)
-    for inner in elements.values():
-        size += inner.owners.nbytes + _bytes(inner.columns, inner.elements)
-    return size
+    inner = elements.values()
+    return sum(map(column_bytes, columns.values())) + sum(
+        sequence.owners.nbytes + _bytes(sequence.columns, sequence.elements) for sequence in inner
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -26,13 +26,6 @@ _CHILD: Final = "child_frame_id"
 _STAMP: Final = "header.stamp"
 _TRANSLATION: Final = tuple(f"transform.translation.{axis}" for axis in "xyz")
 _ROTATION: Final = tuple(f"transform.rotation.{part}" for part in "xyzw")
-
-
-class _CodedPairs(NamedTuple):
-    """The edges of the transforms of a table: `pairs[codes]`; -1 where there is none."""
-
-    pairs: list[Pair]
-    codes: IntArray
 
 
 def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Edges | None:
@@ -76,15 +69,14 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
     transforms = _transforms_of(table)
     if transforms is None:
         return None
-    if index is not None:
-        edges = edges_in(table, np.zeros(index.size, np.int64), index)
-        return None if edges is None else frozenset(edges)
     zones = [table.zone(f"{_LIST}.{path}") for path in (*_TRANSLATION, *_ROTATION)]
-    if any(zone is None or zone.nulls or math.isinf(zone.high - zone.low) for zone in zones):
-        edges = edges_in(table, np.zeros(len(table), np.int64))
-        return None if edges is None else frozenset(edges)
-    pairs, _ = _coded_pairs(transforms)
-    return frozenset(pairs)
+    if index is None and all(
+        zone is not None and not zone.nulls and math.isfinite(zone.high - zone.low)
+        for zone in zones
+    ):
+        return frozenset(_coded_pairs(transforms)[0])
+    edges = edges_in(table, np.zeros(len(table) if index is None else index.size, np.int64), index)
+    return None if edges is None else frozenset(edges)
 
 
 def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:
@@ -153,25 +145,23 @@ def _transforms_of(table: Table) -> Elements | None:
     return transforms if needed <= held else None
 
 
-def _coded_pairs(transforms: Elements) -> _CodedPairs:
-    """Returns the edges that occur, in the order of their names."""
+def _coded_pairs(transforms: Elements) -> tuple[list[Pair], IntArray]:
+    """Returns the edges that occur, and for each transform the place of its edge; -1: none."""
     parents, children = transforms.columns[_PARENT], transforms.columns[_CHILD]
     if not isinstance(parents, Texts) or not isinstance(children, Texts):
-        return _CodedPairs([], np.full(len(transforms), -1))
+        return [], np.full(len(transforms), -1)
     several = max(len(children.words), 1)
     used, codes = np.unique(
         parents.codes.astype(np.int64) * several + children.codes, return_inverse=True
     )
-    pairs: list[Pair] = []
-    numbers: list[int] = []
+    place_of: dict[Pair, int] = {}
+    places: list[int] = []
     for code in used.tolist():
         parent = parents.words[code // several].removeprefix("/")
         child = children.words[code % several].removeprefix("/")
         is_edge = bool(child) and parent != child
-        if is_edge and (parent, child) not in pairs:
-            pairs.append((parent, child))
-        numbers.append(pairs.index((parent, child)) if is_edge else -1)
-    return _CodedPairs(pairs, np.array(numbers, np.int64)[codes])
+        places.append(place_of.setdefault((parent, child), len(place_of)) if is_edge else -1)
+    return [*place_of], np.array(places, np.int64)[codes]
 
 
 def _rounded_rows(transforms: Elements, paths: tuple[str, ...], step: Step) -> Floats:

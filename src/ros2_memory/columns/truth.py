@@ -10,10 +10,9 @@ What is known without unpacking a column (its zone) is looked at first.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -29,38 +28,40 @@ from ros2_memory.columns.scores import may_be_json, without_low
 from ros2_memory.columns.shown import (
     MAX_LEAVES,
     ByType,
-    Group,
     Limits,
     Listing,
-    Message,
     Node,
     Nothing,
+    Object,
     Shape,
     Spot,
     TruthValues,
-    UnknownShapeError,
     at_field,
-    children,
     leaves_below,
     nowhere,
     opened,
     placed,
     unknown,
 )
-from ros2_memory.columns.table import MAX_NUMBERS, Table, Zone, as_float
-from ros2_memory.columns.values import Kind, Leaf, LeafNumbers, Level, Values, zone_of
-from ros2_memory.columns.zones import PartZones, Zones
-from ros2_memory.messages.detections import MAX_DEPTH, looks_like_json, without_low_scores
+from ros2_memory.columns.table import MAX_NUMBERS, as_float
+from ros2_memory.columns.values import (
+    Kind,
+    Leaf,
+    LeafNumbers,
+    Level,
+    UnknownShapeError,
+    Values,
+    zone_of,
+)
+from ros2_memory.messages.detections import looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
-    from ros2_memory.columns.values import Mask, Numeric
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.columns.table import Table
+    from ros2_memory.columns.values import Mask, Numeric, ZoneOf
+    from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
-
-ZoneOf: TypeAlias = "Callable[[Leaf], Zone | Zones | None]"
-"""Returns what is known of a leaf without reading it, of one part or of several."""
 
 _EXACT_BELOW: Final = 2**53
 _ROUNDING: Final = 1e-9
@@ -107,9 +108,7 @@ class ColumnCondition:
         plan = self._plans.of(table_or_parts)
         if plan is None:
             return True
-        if isinstance(table_or_parts, PartZones):
-            return plan.may_match(lambda leaf: zone_of(leaf, table_or_parts.zone))
-        return plan.may_match(Values(table_or_parts).zone)
+        return plan.may_match(lambda leaf: zone_of(leaf, table_or_parts.zone))
 
 
 class _Plan(NamedTuple):
@@ -130,7 +129,7 @@ class _Plan(NamedTuple):
             return cls(whole, None)
         return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
 
-    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
+    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
         possible: bool | Mask = False
         for test in self.whole:
             possible = possible | test.may_match(zone_of)
@@ -141,17 +140,17 @@ class _Plan(NamedTuple):
 
 def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> TruthValues:
     """Returns which rows pass any of the tests."""
-    surely, perhaps = np.zeros(values.rows, np.bool_), np.zeros(values.rows, np.bool_)
+    surely, perhaps = nowhere(values.rows)
     for test in tests:
         if not test.may_match(values.zone):
             continue
-        for level, passing, limits in test.passing(values):
-            if passing is None:
-                return TruthValues(surely, np.ones(values.rows, np.bool_))
-            certain = np.flatnonzero(passing.surely)
-            surely[placed(values, level, certain, limits, surely=True)[1]] = True
-            possible = np.flatnonzero(passing.perhaps)
-            perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
+        try:
+            for level, passing, limits in test.passing(values):
+                certain, possible = map(np.flatnonzero, passing)
+                surely[placed(values, level, certain, limits, surely=True)[1]] = True
+                perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
+        except UnknownShapeError:
+            return TruthValues(surely, unknown(values.rows).perhaps)
         if surely.all():
             break
     return TruthValues(surely, perhaps | surely)
@@ -179,8 +178,7 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
     return tests
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _LeafTest:
+class _LeafTest(NamedTuple):
     """`contains`, `equals`, `above` or `below`, on one leaf of a value.
 
     Attributes:
@@ -223,7 +221,7 @@ class _LeafTest:
             return True
         return isinstance(self.test, Contains) and self.is_element and self.test.has_element(value)
 
-    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
+    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
         """Returns whether some value may pass, as far as it is known without reading any."""
         zone = zone_of(self.leaf)
         if zone is None:
@@ -241,53 +239,54 @@ class _LeafTest:
             possible = possible | zone.spans(number)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
-        """Yields which rows or elements of a level pass; None where the table cannot say."""
-        leaf = self.leaf
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, Limits]]:
+        """Yields which rows or elements of a level pass.
+
+        Raises:
+            UnknownShapeError: the table cannot say.
+        """
+        leaf, around = self.leaf, self.leaf.level.parent
         if leaf.kind is Kind.TEXT:
             yield leaf.level, self._passing_texts(values), self.limits
-            return
-        numbers = values.numbers(leaf)
-        if numbers is not None:
-            yield leaf.level, self._passing_numbers(numbers), self.limits
-        if leaf.is_of_array and leaf.level.parent is not None:
-            yield from self._in_long_arrays(values, leaf.level.parent, is_part=numbers is not None)
-        elif numbers is None:
-            yield leaf.level, None, self.limits
+        elif not leaf.is_of_array or around is None:
+            yield leaf.level, self._passing_numbers(values.numbers(leaf)), self.limits
+        else:
+            is_held = values.numeric(leaf.level, "") is not None
+            if is_held:
+                yield leaf.level, self._passing_numbers(values.numbers(leaf)), self.limits
+            yield from self._in_long_arrays(values, around, is_part=is_held)
 
     @property
     def _folded(self) -> str | None:
         return None if isinstance(self.test, Beyond) else self.test.folded
 
-    def _passing_texts(self, values: Values) -> TruthValues | None:
-        """Returns which texts pass; None where the table cannot say."""
+    def _passing_texts(self, values: Values) -> TruthValues:
         may = values.letters(self.leaf, self._folded or "")
         is_word = isinstance(self.test, Contains) and self.test.is_one_word
         if may is not None and (not may.any() or (is_word and not self.leaf.json_depth)):
-            return TruthValues(may, may)
-        texts = values.texts(self.leaf)
-        if texts is None:
-            return None if may is None else TruthValues(np.zeros_like(may), may)
-        used = [True] * len(texts.words)
-        if may is not None:
-            used = (np.bincount(texts.codes[may], minlength=len(texts.words)) > 0).tolist()
-        depth, least = self.leaf.json_depth, self.least_score
+            return TruthValues.known(may)
+        try:
+            codes, words = (texts := values.texts(self.leaf)).codes, texts.words
+        except UnknownShapeError:
+            if may is None:
+                raise
+            return TruthValues(np.zeros_like(may), may)
+        used = np.bincount(codes if may is None else codes[may], minlength=len(words)) > 0
+        depth = self.leaf.json_depth
         flags = [
-            is_used and self.passes(_without_low(word, least, depth) if depth else word)
-            for word, is_used in zip(texts.words, used, strict=True)
+            is_used and self.passes(_without_low(word, self.least_score, depth))
+            for word, is_used in zip(words, used.tolist(), strict=True)
         ]
-        passed = np.array(flags, np.bool_)[texts.codes] if flags else np.zeros(0, np.bool_)
-        return TruthValues(passed, passed)
+        return TruthValues.known(np.array(flags, np.bool_)[codes])
 
     def _passing_numbers(self, numbers: LeafNumbers) -> TruthValues:
         column, error, exactly = numbers
         if column.dtype.kind == "b":
             if_false, if_true = self.passes(value=False), self.passes(value=True)
-            passed = np.where(column, if_true, if_false)
-            return TruthValues(passed, passed)
+            return TruthValues.known(np.where(column, if_true, if_false))
         passed = self._passing_exactly(column)
         if isinstance(error, float) and error == 0.0:
-            return TruthValues(passed, passed)
+            return TruthValues.known(passed)
         is_near = np.isinf(error) | np.zeros(len(column), np.bool_)
         for bound in self._bounds:
             with np.errstate(invalid="ignore"):  # infinity less infinity
@@ -296,7 +295,7 @@ class _LeafTest:
             return TruthValues(passed & ~is_near, passed | is_near)
         unsettled = np.flatnonzero(is_near)
         passed[unsettled] = self._passing_exactly(exactly(unsettled))
-        return TruthValues(passed, passed)
+        return TruthValues.known(passed)
 
     @property
     def _bounds(self) -> tuple[int | float, ...]:
@@ -315,14 +314,14 @@ class _LeafTest:
 
     def _in_long_arrays(
         self, values: Values, level: Level, *, is_part: bool
-    ) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
+    ) -> Iterator[tuple[Level, TruthValues, Limits]]:
         """Yields the rows or elements whose arrays are too long to be held, by what is known."""
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
         if lengths is None:
-            if not is_part:
-                yield level, None, self.limits
-            return
+            if is_part:
+                return
+            raise UnknownShapeError(f"{path} is not held")
         is_long = lengths > (MAX_NUMBERS if is_part else 0)
         if not is_long.any():
             return
@@ -369,17 +368,10 @@ class _LeafTest:
 
 
 def _without_low(word: str, least: float, depth: int) -> str:
-    """Returns a text of a value, which lies that deep in it, without detections of a low score."""
-    if not looks_like_json(word):
+    """Returns a text without detections of a low score, which are looked for so deep in it."""
+    if not depth or not looks_like_json(word):
         return word
-    around = MAX_DEPTH - depth
-    value: JsonValue = word
-    for _ in range(around):
-        value = {"": value}
-    kept = without_low_scores(value, least)
-    while isinstance(kept, dict):
-        kept = kept[""]
-    return str(kept)
+    return str(without_low_scores(word, least, depth))
 
 
 def beyond(column: Numeric, limit: float, *, above: bool) -> Mask:
@@ -408,15 +400,14 @@ def equal_to_any(column: Numeric, numbers: Sequence[float]) -> Mask:
     return is_equal
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _PlaceTest:
+class _PlaceTest(NamedTuple):
     """`near_position`, on one position of a value: the leaves of its x, y and perhaps z."""
 
     test: NearPosition
     leaves: tuple[Leaf, ...]
     limits: Limits
 
-    def may_match(self, zone_of: ZoneOf) -> bool | Mask:
+    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
         """Returns whether some position may be near, as far as known without reading any."""
         reach = self.test.tolerance_m * (1 + _ROUNDING) + _TINY_M
         possible: bool | Mask = True
@@ -425,16 +416,10 @@ class _PlaceTest:
             possible = possible if zone is None else possible & zone.may_be_near(center, reach)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues | None, Limits]]:
-        """Yields which rows or elements of a level are near; None where the table cannot say."""
-        leaves = self.leaves[: len(self._center)]
-        columns = [values.numbers(leaf) for leaf in leaves]
-        held = [column for column in columns if column is not None]
-        level = self.leaves[0].level
-        if len(held) < len(columns):
-            yield level, None, self.limits
-        else:
-            yield level, self._near(held), self.limits
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, Limits]]:
+        """Yields which rows or elements of a level are near; raises as that of `_LeafTest`."""
+        columns = [values.numbers(leaf) for leaf in self.leaves[: len(self._center)]]
+        yield self.leaves[0].level, self._near(columns), self.limits
 
     @property
     def _center(self) -> tuple[float, ...]:
@@ -460,7 +445,7 @@ class _PlaceTest:
         for nth in np.flatnonzero(is_doubtful).tolist():
             x, y, z = (*(float(axis[nth]) for axis in axes), math.nan)[:3]
             is_near[nth] = self.test.is_near(x, y, z)
-        return TruthValues(is_near, is_near)
+        return TruthValues.known(is_near)
 
 
 def _positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
@@ -479,8 +464,8 @@ def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
                 raise UnknownShapeError(f"the value has more than {MAX_LEAVES} parts")
             if isinstance(node, Listing):
                 waiting.append(Spot(node.element, limits))
-            elif isinstance(node, Message | Group):
-                fields = dict(children(node))
+            elif isinstance(node, Object):
+                fields = node.fields
                 named = [Spot(fields[key], limits) for key in POSITION_KEYS if key in fields]
                 for inner in chain.from_iterable(map(opened, named)):
                     yield from _own_positions(inner)
@@ -494,15 +479,13 @@ def _own_positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
         for inner in opened(Spot(node.element, limits)):
             if not isinstance(inner.node, Listing):
                 yield from _own_positions(inner)
-    elif isinstance(node, Message | Group):
-        fields = dict(children(node))
-        axes = [fields.get(axis) for axis in "xyz"]
+    elif isinstance(node, Object):
+        axes = [node.fields.get(axis) for axis in "xyz"]
         is_position = all(
             isinstance(axis, Nothing) or (isinstance(axis, Leaf) and axis.kind is not Kind.TEXT)
             for axis in axes[:2]
         )
         if is_position:
-            numeric = {Kind.INTEGER, Kind.REAL}
-            leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.kind in numeric]
+            leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.is_number]
             if all(axis in leaves for axis in axes[:2]):
                 yield tuple(leaves), limits

@@ -1,20 +1,34 @@
-"""The pieces that a scan is made of: the rows of a topic in a part, or in a bag."""
+"""The pieces that a scan is made of: the rows of a topic in a part, or in a bag; and copies.
+
+Recordings overlap for some seconds while one takes over from the other. A message that is in both
+has the same publish time and payload in each, and log times that differ by little
+(`COPY_HORIZON_NS` at most); it counts once, at its earliest log time. Where one recording has it n
+times and another m times, it counts max(n, m) times. Inside one recording nothing is a copy,
+however alike two messages are.
+
+A latched message is received again by each new recording: it counts at its earliest log time,
+however long ago that is.
+"""
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.parts import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.columns.walk import within
+from ros2_memory.columns.writing import BAG, DELAY, LOG_TIME, PAYLOAD_HASH
 from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.errors import BusyError
+from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
+from ros2_memory.storage.base import RELATCHED_NS, IntArray
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Container, Iterator, Mapping
+    from collections.abc import Callable, Container, Iterator
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -22,7 +36,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.base import IntArray
 
 
 class GoneError(BusyError):
@@ -32,6 +45,7 @@ class GoneError(BusyError):
         super().__init__("stored columns were deleted while they were read: ask again")
 
 
+@dataclass(eq=False)
 class Unit:
     """The rows of a topic in a part of the store, or in a bag.
 
@@ -40,40 +54,27 @@ class Unit:
         table: the rows, ordered by log time.
         first: the earliest log time, inclusive.
         last: the latest, inclusive.
-        part: the number of the part; None where it is none, or may be replaced.
-
-    Args:
         load: returns one of the columns that every part may have; None where it has none.
-        counting: the numbers, as the part has them, of its bags of which rows count; at least one.
+        numbers: of its bags of which rows count, as the part has them; at least one.
         bag_of: returns the bag of such a number.
+        part: the number of the part; None where it is none, or may be replaced.
         all_count: whether these are all of its bags.
     """
 
-    def __init__(
-        self,
-        key: object,
-        table: Table,
-        span: tuple[Ns, Ns],
-        *,
-        load: Callable[[str], IntArray | None],
-        counting: IntArray,
-        bag_of: Callable[[int], BagFile],
-        part: int | None = None,
-        all_count: bool = True,
-    ) -> None:
-        self.key = key
-        self.part = part
-        self.table = table
-        self.first, self.last = span
-        self._load = load
-        self._counting = counting
-        self._bag_of = bag_of
-        self._all_count = all_count
+    key: object
+    table: Table
+    first: Ns
+    last: Ns
+    load: Callable[[str], IntArray | None]
+    numbers: IntArray
+    bag_of: Callable[[int], BagFile]
+    part: int | None = None
+    all_count: bool = True
 
     @cached_property
     def first_bag(self) -> BagFile:
         """The first bag of which rows count; all are of one recording."""
-        return self._bag_of(int(self._counting[0]))
+        return self.bag_of(int(self.numbers[0]))
 
     def times(self) -> IntArray:
         """Returns the log times of the rows (ns)."""
@@ -81,12 +82,8 @@ class Unit:
 
     def identities(self) -> tuple[IntArray, IntArray] | None:
         """Returns publish times and hashes of payloads; None where they are not known."""
-        delays, hashes = self._load(DELAY), self._load(PAYLOAD_HASH)
+        delays, hashes = self.load(DELAY), self.load(PAYLOAD_HASH)
         return None if delays is None or hashes is None else (self.times() - delays, hashes)
-
-    def bags(self) -> Mapping[int, BagFile]:
-        """Returns the bags of which rows count, by their numbers."""
-        return {number: self._bag_of(number) for number in self._counting.tolist()}
 
     def bag_numbers(self) -> IntArray:
         """Returns for each row the number of its bag."""
@@ -94,10 +91,10 @@ class Unit:
 
     def counting(self) -> NDArray[np.bool_] | None:
         """Returns which rows are of bags that count; None: all are."""
-        return None if self._all_count else np.isin(self.bag_numbers(), self._counting)
+        return None if self.all_count else np.isin(self.bag_numbers(), self.numbers)
 
     def _column(self, path: str) -> IntArray:
-        column = self._load(path)
+        column = self.load(path)
         if column is None:
             raise GoneError
         return column
@@ -114,38 +111,38 @@ class BagUnit(Unit):
             PAYLOAD_HASH: table.payload_hashes,
             BAG: zeros,
         }
-        span = int(times[0]), int(times[-1])
-        key = (bag.file, nth)
-        super().__init__(
-            key, table, span, load=columns.get, counting=zeros[:1], bag_of=lambda _: bag
-        )
+        key, span = (bag.file, nth), (int(times[0]), int(times[-1]))
+        super().__init__(key, table, *span, columns.get, zeros[:1], lambda _: bag)
 
 
+@dataclass(eq=False)
 class Rows:
     """The rows of one table that count, ordered by log time.
 
     Attributes:
-        table: the table; not all of its rows need count.
+        unit: has the table; not all of its rows need count.
+        find: returns which count, when it is first asked for; see `index`.
         may_match: whether some may be wanted, as far as zones tell.
     """
 
-    def __init__(
-        self, unit: Unit, find: Callable[[], IntArray | None], *, may_match: bool = True
-    ) -> None:
-        self._unit = unit
-        self.table = unit.table
-        self.may_match = may_match
-        self._find = find
+    unit: Unit
+    find: Callable[[], IntArray | None]
+    may_match: bool = True
 
     @classmethod
     def of(cls, unit: Unit, index: IntArray) -> Rows:
         """Returns some rows of a unit."""
         return cls(unit, lambda: index)
 
+    @property
+    def table(self) -> Table:
+        """The table that has the rows."""
+        return self.unit.table
+
     @cached_property
     def index(self) -> IntArray | None:
         """Which of the table's rows count, ascending; None: all."""
-        return self._find()
+        return self.find()
 
     def __len__(self) -> int:
         """Returns how many rows count."""
@@ -154,41 +151,41 @@ class Rows:
     @property
     def times(self) -> IntArray:
         """Log times (ns) of the rows that count."""
-        times = self._unit.times()
+        times = self.unit.times()
         return times if self.index is None else times[self.index]
 
     @property
     def part(self) -> int | None:
         """The number of the whole part of which all rows count; None where it is not so."""
-        return self._unit.part if self.index is None else None
+        return self.unit.part if self.index is None else None
 
     @property
     def recording(self) -> Path:
         """The recording that the rows are of."""
-        return self._unit.first_bag.recording
+        return self.unit.first_bag.recording
 
     @property
     def order(self) -> tuple[str, str, Ns, Ns, tuple[Ns, Ns, str]]:
         """Sorts tables whose rows have one log time: by recording, as copies, type and bag."""
-        bag = self._unit.first_bag
-        span = self._unit.first, self._unit.last
+        bag = self.unit.first_bag
+        span = self.unit.first, self.unit.last
         return str(bag.recording), self.table.channel.type, *span, in_time(bag)
 
     @property
     def first(self) -> Ns:
         """A log time (ns) that none of the rows is earlier than."""
-        return self._unit.first
+        return self.unit.first
 
     @property
     def last(self) -> Ns:
         """A log time (ns) that none of the rows is later than."""
-        return self._unit.last
+        return self.unit.last
 
     @property
     def span(self) -> tuple[Ns, Ns]:
         """Log times (ns) of the first and the last row, inclusive."""
         if self.index is None:
-            return self._unit.first, self._unit.last
+            return self.unit.first, self.unit.last
         times = self.times
         return int(times[0]), int(times[-1])
 
@@ -197,10 +194,10 @@ class Rows:
 
         With `among` of these files alone.
         """
-        numbers = self._unit.bag_numbers()
+        numbers = self.unit.bag_numbers()
         if self.index is not None:
             numbers = numbers[self.index]
-        bags = self._unit.bags()
+        bags = {number: self.unit.bag_of(number) for number in self.unit.numbers.tolist()}
         for number in np.unique(numbers).tolist():
             if among is None or bags[number].file in among:
                 yield bags[number], np.flatnonzero(numbers == number)
@@ -208,10 +205,10 @@ class Rows:
     @property
     def ranks(self) -> IntArray:
         """For each row that counts, how many rows of its bag have its log time and precede it."""
-        times = self._unit.times()
+        times = self.unit.times()
         if (np.diff(times) > 0).all():
             return np.zeros(len(self), np.int64)
-        groups = Groups.of(distinct_rows((self._unit.bag_numbers(), times))[1])
+        groups = Groups.of(distinct_rows((self.unit.bag_numbers(), times))[1])
         ranks = np.empty_like(groups.order)
         ranks[groups.order] = within(groups.sizes)
         return ranks if self.index is None else ranks[self.index]
@@ -219,7 +216,7 @@ class Rows:
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""
         index = positions if self.index is None else self.index[positions]
-        return Rows.of(self._unit, index)
+        return Rows.of(self.unit, index)
 
     def mask(self) -> NDArray[np.bool_]:
         """Returns for each row of the table whether it counts."""
@@ -228,3 +225,82 @@ class Rows:
         mask = np.zeros(len(self.table), np.bool_)
         mask[self.index] = True
         return mask
+
+
+class Identities(NamedTuple):
+    """What tells messages apart, of messages of one topic.
+
+    Attributes:
+        log_times: ns.
+        publish_times: ns.
+        hashes: of the payloads.
+        recordings: a number for the recording of each.
+    """
+
+    log_times: IntArray
+    publish_times: IntArray
+    hashes: IntArray
+    recordings: IntArray
+
+    def rows(self, positions: IntArray) -> Identities:
+        """Returns some of them."""
+        return Identities(*(column[positions] for column in self))
+
+
+def copies_among(messages: Identities) -> NDArray[np.bool_]:
+    """Returns which of the messages repeat an earlier one of another recording.
+
+    Of several of one log time that of the recording with the lowest number counts.
+    """
+    copies = np.zeros(messages.log_times.size, np.bool_)
+    suspects = _shared_by_recordings(messages)
+    suspected = messages.rows(suspects)
+    order = suspects[np.lexsort((suspected.recordings, suspected.log_times))]
+    counts: dict[tuple[int, int], dict[int, int]] = {}
+    recent: deque[tuple[Ns, tuple[int, int]]] = deque()
+    columns = (column.tolist() for column in messages.rows(order))
+    rows = zip(order.tolist(), *columns, strict=True)
+    for row, time, published, payload, recording in rows:
+        while recent and recent[0][0] < time - COPY_HORIZON_NS:
+            counts.pop(recent.popleft()[1], None)
+        key = (published, payload)
+        by_recording = counts.setdefault(key, {})
+        most = max(by_recording.values(), default=0)
+        by_recording[recording] = by_recording.get(recording, 0) + 1
+        if by_recording[recording] > most:
+            recent.append((time, key))
+        else:
+            copies[row] = True
+    return copies
+
+
+def relatched_among(messages: Identities) -> NDArray[np.bool_]:
+    """Returns which messages were received again: late, and before by another recording."""
+    order = np.lexsort(
+        (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
+    )
+    ordered = messages.rows(order)
+    is_first = np.ones(order.size, np.bool_)
+    is_first[1:] = (np.diff(ordered.publish_times) != 0) | (np.diff(ordered.hashes) != 0)
+    first = np.maximum.accumulate(np.where(is_first, np.arange(order.size), 0))
+    is_late = ordered.log_times - ordered.publish_times > RELATCHED_NS
+    is_again = (
+        is_late
+        & (ordered.log_times > ordered.log_times[first])
+        & (ordered.recordings != ordered.recordings[first])
+    )
+    relatched = np.zeros(order.size, np.bool_)
+    relatched[order] = is_again
+    return relatched
+
+
+def _shared_by_recordings(messages: Identities) -> IntArray:
+    """Returns the rows whose publish time and payload several recordings have."""
+    if not messages.log_times.size:
+        return np.zeros(0, np.int64)
+    order = np.lexsort((messages.recordings, messages.hashes, messages.publish_times))
+    ordered = messages.rows(order)
+    is_same = (np.diff(ordered.publish_times) == 0) & (np.diff(ordered.hashes) == 0)
+    group = np.append(0, np.cumsum(~is_same))
+    is_elsewhere = is_same & (np.diff(ordered.recordings) != 0)
+    return order[np.isin(group, group[1:][is_elsewhere])]

@@ -2,13 +2,13 @@
 
 A `Leaf` says where a number, boolean or text of a value comes from; `Values` reads it for all rows
 (or elements) of one table at once, with the same numbers as the conversions of `messages/` give
-for each message. What the table does not hold is None: then the bag has to be read.
+for each message. Where the table does not hold them `UnknownShapeError` is raised: then the bag has
+to be read.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
@@ -30,6 +30,11 @@ if TYPE_CHECKING:
     Ints: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
     Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
+T = TypeVar("T")
+
+ZoneOf: TypeAlias = "Callable[[T], Zone | Zones | None]"
+"""Returns what is known of a column or leaf without reading it, of one part or of several."""
+
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
 _UNIT_TOLERANCE: Final = 1e-12
@@ -43,6 +48,10 @@ _LEAST_COSINE: Final = 1e-3
 """Of a pitch so steep that roll and yaw say little."""
 
 
+class UnknownShapeError(Exception):
+    """Columns do not settle it, or the value differs in shape by message: the messages decide."""
+
+
 class Kind(Enum):
     """What a leaf is."""
 
@@ -52,25 +61,23 @@ class Kind(Enum):
     TEXT = auto()
 
 
+NUMBERS: Final = frozenset({Kind.INTEGER, Kind.REAL})
+
+
 class Conversion(Enum):
     """How a leaf comes out of its sources."""
 
     STORED = auto()  # the column itself
-    REAL = auto()  # as a float64
     SECONDS = auto()  # of nanoseconds
     ROLL = auto()  # degrees, of x, y, z, w; NaN where that is no rotation
     PITCH = auto()
     YAW = auto()
-    CONSTANT = auto()
 
-
-Z = TypeVar("Z", Zone, Zones)
 
 _ANGLES: Final = {Conversion.ROLL: 0, Conversion.PITCH: 1, Conversion.YAW: 2}
 
 
-@dataclass(frozen=True, slots=True)
-class Level:
+class Level(NamedTuple):
     """Where values lie: in the rows of a table (no parent), or in the elements of a sequence.
 
     `name` is the sequence's dot-path in the parent.
@@ -91,8 +98,7 @@ class Level:
 ROWS: Final = Level(None, "")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Leaf:
+class Leaf(NamedTuple):
     """A number, a boolean or a text of each row or element of a level.
 
     Attributes:
@@ -100,7 +106,6 @@ class Leaf:
         sources: dot-paths in that level of what it is made of.
         kind: what it is.
         conversion: how its value comes out of the sources.
-        constant: its value, where that is the same everywhere.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
     """
@@ -109,8 +114,12 @@ class Leaf:
     sources: tuple[str, ...]
     kind: Kind
     conversion: Conversion = Conversion.STORED
-    constant: int = 0
     json_depth: int = 0
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it is a number, and no boolean."""
+        return self.kind in NUMBERS
 
     @property
     def is_of_array(self) -> bool:
@@ -146,47 +155,60 @@ class Values:
     Attributes:
         table: the table.
         rows: how many it has.
-        kept: for limits on whole levels, what they found.
     """
 
     def __init__(self, table: Table) -> None:
         self.table = table
         self.rows = len(table.log_times)
-        self.kept: dict[object, tuple[Mask, Mask]] = {}
-        self._angles: dict[tuple[Level, tuple[str, ...]], _Turns] = {}
+        self._kept: dict[object, object] = {}
 
-    def elements(self, level: Level) -> Elements | None:
-        """Returns the elements of a sequence; None where the table does not hold them."""
+    def once(self, key: object, make: Callable[[Values], T]) -> T:
+        """Returns what is made of the table under a key; it is made once."""
+        if key not in self._kept:
+            self._kept[key] = make(self)
+        return cast("T", self._kept[key])  # by key: each has one type
+
+    def elements(self, level: Level) -> Elements:
+        """Returns the elements of a sequence.
+
+        Raises:
+            UnknownShapeError: the table does not hold them.
+        """
+        elements = self._rows(level)
+        if not isinstance(elements, Elements):
+            raise UnknownShapeError(f"{level.name} is not held")
+        return elements
+
+    def size(self, level: Level) -> int:
+        """Returns how many rows or elements a level has; raises as `elements`."""
+        return self.rows if level.parent is None else len(self.elements(level))
+
+    def _rows(self, level: Level) -> Table | Elements | None:
         if level.parent is None:
-            return None
-        above = self.table if level.parent.parent is None else self.elements(level.parent)
-        return None if above is None else above.elements.get(level.name)
+            return self.table
+        around = self._rows(level.parent)
+        return None if around is None else around.elements.get(level.name)
 
-    def size(self, level: Level) -> int | None:
-        """Returns how many rows or elements a level has; None where that is not held."""
-        if level.parent is None:
-            return self.rows
-        elements = self.elements(level)
-        return None if elements is None else len(elements.owners)
-
-    def places(self, level: Level, positions: Ints, *, from_end: bool) -> Ints | None:
+    def places(self, level: Level, positions: Ints, *, from_end: bool) -> Ints:
         """Returns the places of some elements in their lists: 0, 1, ... or -1, -2, ..."""
-        elements = self.elements(level)
-        if elements is None:
-            return None
-        owners = elements.owners
+        owners = self.elements(level).owners
         edge = np.searchsorted(owners, owners[positions], side="right" if from_end else "left")
         return positions - edge
 
-    def column(self, level: Level, path: str) -> Column | None:
-        """Returns a column of a level; None where the table does not hold it."""
-        rows = self.table if level.parent is None else self.elements(level)
+    def _column(self, level: Level, path: str) -> Column | None:
+        rows = self._rows(level)
         return None if rows is None else rows.columns.get(path)
 
-    def texts(self, leaf: Leaf) -> Texts | None:
-        """Returns the texts of a leaf; None where the table does not hold them."""
-        column = self.column(leaf.level, leaf.sources[0])
-        return column if isinstance(column, Texts) else None
+    def texts(self, leaf: Leaf) -> Texts:
+        """Returns the texts of a leaf.
+
+        Raises:
+            UnknownShapeError: the table does not hold them.
+        """
+        column = self._column(leaf.level, leaf.sources[0])
+        if not isinstance(column, Texts):
+            raise UnknownShapeError(f"{leaf.sources[0]} is not held")
+        return column
 
     def letters(self, leaf: Leaf, text: str) -> Mask | None:
         """Returns which texts of a leaf may have a casefolded text; None where that is not known.
@@ -201,27 +223,37 @@ class Values:
 
     def numeric(self, level: Level, path: str) -> Numeric | None:
         """Returns a column of numbers or booleans; None where the table does not hold it."""
-        column = self.column(level, path)
-        return None if column is None or isinstance(column, Texts) else cast("Numeric", column)
+        column = self._column(level, path)
+        return None if isinstance(column, Texts) else cast("Numeric | None", column)
 
-    def numbers(self, leaf: Leaf) -> LeafNumbers | None:
-        """Returns the numbers or booleans of a leaf; None where the table does not hold them."""
-        if leaf.conversion is Conversion.CONSTANT:
-            size = self.size(leaf.level)
-            return None if size is None else LeafNumbers(np.full(size, float(leaf.constant)))
+    def numbers(self, leaf: Leaf) -> LeafNumbers:
+        """Returns the numbers or booleans of a leaf.
+
+        Raises:
+            UnknownShapeError: the table does not hold them.
+        """
         columns = [self.numeric(leaf.level, path) for path in leaf.sources]
         held = [column for column in columns if column is not None]
-        return self._numbers_of(leaf, held) if len(held) == len(columns) else None
-
-    def _numbers_of(self, leaf: Leaf, columns: Sequence[Numeric]) -> LeafNumbers:
+        if len(held) < len(columns):
+            raise UnknownShapeError(f"{leaf.sources} are not held")
         if leaf.conversion in _ANGLES:
-            return self._angle(leaf, columns)
-        first, error = columns[0], self.error(leaf)
+            return self._angle(leaf, held)
+        column, error = held[0], self.error(leaf)
         if leaf.conversion is Conversion.SECONDS:
-            return LeafNumbers(seconds(first), error / NS_PER_S)
-        return LeafNumbers(
-            first.astype(np.float64) if leaf.conversion is Conversion.REAL else first, error
-        )
+            return LeafNumbers(seconds(column), error / NS_PER_S)
+        is_real = leaf.kind is Kind.REAL and column.dtype.kind in "iu"
+        return LeafNumbers(column.astype(np.float64) if is_real else column, error)
+
+    def floats(self, leaf: Leaf) -> tuple[Floats, float]:
+        """Returns the numbers of a leaf, and the most by which any is off.
+
+        Raises:
+            UnknownShapeError: the table does not hold them, or each is off by another number.
+        """
+        numbers, error, _ = self.numbers(leaf)
+        if not isinstance(error, float):
+            raise UnknownShapeError("each angle has an error of its own")
+        return numbers.astype(np.float64, copy=False), error
 
     def holds_all(self, leaf: Leaf) -> bool:
         """Returns whether no array that a leaf is an element of is too long to be held."""
@@ -236,18 +268,16 @@ class Values:
 
     def zone(self, leaf: Leaf) -> Zone | None:
         """Returns what is known of a leaf without reading it."""
-        return zone_of(leaf, self.table.zone)
+        zone = zone_of(leaf, self.table.zone)
+        return zone if isinstance(zone, Zone) else None
 
     def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
         key = (leaf.level, leaf.sources)
         x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
-        if key not in self._angles:
-            self._angles[key] = _euler(x, y, z, w)
-        turn = self._angles[key]
+        turn = self.once(key, lambda _: _euler(x, y, z, w))
         which = _ANGLES[leaf.conversion]
-        angles = turn.degrees[which]
-        error = self.error(leaf)
+        angles, error = turn.degrees[which], self.error(leaf)
         if error:
             return LeafNumbers(angles, _angle_error(error, turn.length, turn.cosine, angles))
 
@@ -267,15 +297,13 @@ class Values:
         return LeafNumbers(angles, off, exactly)
 
 
-def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
+def zone_of(leaf: Leaf, zone: ZoneOf[str]) -> Zone | Zones | None:
     """Returns what is known of a leaf by the zones of its sources.
 
     Args:
         leaf: the leaf.
         zone: returns the zone of a column of a table, or its zones in some parts, by its path.
     """
-    if leaf.conversion is Conversion.CONSTANT:
-        return Zone(leaf.constant, leaf.constant, 0)
     if leaf.conversion in _ANGLES:
         most = 90.0 if leaf.conversion is Conversion.PITCH else 180.0
         return Zone(-most - _ROUNDING_DEG, most + _ROUNDING_DEG, 0)
@@ -290,12 +318,12 @@ def zone_of(leaf: Leaf, zone: Callable[[str], Z | None]) -> Z | Zone | None:
     return source_zone
 
 
-def _with_long_arrays(numbers: Z, lengths: Z) -> Z | None:
+def _with_long_arrays(numbers: Zone | Zones, lengths: Zone | Zones) -> Zone | Zones | None:
     """Returns the zone of all arrays: without bounds where some are too long to be held."""
     are_long = lengths.reaches(MAX_NUMBERS, above=True)
     if isinstance(numbers, Zones):
         low = np.where(are_long, -math.inf, numbers.low)
-        return replace(numbers, low=low, high=np.where(are_long, math.inf, numbers.high))
+        return numbers._replace(low=low, high=np.where(are_long, math.inf, numbers.high))
     return None if are_long else numbers
 
 

@@ -10,7 +10,7 @@ the decoder, which decides message by message.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -42,9 +42,6 @@ _UINT16: Final = np.dtype("<u2")
 _UINT32: Final = np.dtype("<u4")
 
 
-Floats: TypeAlias = "np.ndarray[tuple[int, ...], np.dtype[np.float64]]"
-
-
 class NotWalkedError(Exception):
     """A batch that must be decoded message by message."""
 
@@ -56,6 +53,12 @@ class LevelColumns:
     columns: dict[str, Column] = field(default_factory=dict)
     elements: dict[str, Elements] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+
+    def add_elements(self, path: str, counts: IntArray, inner: LevelColumns) -> None:
+        """Adds a sequence, of which each row has so many elements."""
+        owners = np.repeat(np.arange(counts.size), counts)
+        self.elements[path] = Elements(owners, inner.columns, inner.elements)
+        self.left_out |= {f"{path}.{below}": why for below, why in inner.left_out.items()}
 
 
 def walked(plan: Plan, batch: Batch) -> LevelColumns:
@@ -84,8 +87,7 @@ def walked(plan: Plan, batch: Batch) -> LevelColumns:
     return level
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Bodies:
+class _Bodies(NamedTuple):
     """The bodies that are walked: where each message's begins in the buffer, and its bytes.
 
     Positions count from there, since alignment does.
@@ -138,22 +140,24 @@ class _Walk:
             if isinstance(entry, Array):
                 values = block[str(nth)] if entry.is_ranged else None
                 add_array(columns, entry, places.size, values)
-            elif isinstance(entry, Time):
-                time = block[str(nth)]
-                columns[entry.path] = time["f0"] * np.int64(NS_PER_S) + time["f1"]
+                continue
+            read = block[str(nth)]
+            if isinstance(entry, Time):
+                columns[entry.path] = read["f0"] * np.int64(NS_PER_S) + read["f1"]
             else:
-                number = block[str(nth)]
-                columns[entry.path] = number != 0 if entry.is_bool else np.ascontiguousarray(number)
+                columns[entry.path] = read != 0 if entry.is_bool else np.ascontiguousarray(read)
 
-    def _length(self, rows: _Bodies, at: IntArray) -> IntArray:
-        return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64)
+    def _length(
+        self, step: Text | NumberSequence | Sequence, rows: _Bodies, at: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Returns the lengths that a step begins with, and the positions behind them."""
+        at = _aligned(at, step.align, step.skip)
+        return gathered(self.buffer, _UINT32, rows.origins + at).astype(np.int64), at + 4
 
     def _read_text(
         self, text: Text, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
-        at = _aligned(at, text.align, text.skip)
-        sizes = self._length(rows, at)
-        at = at + 4
+        sizes, at = self._length(text, rows, at)
         end = at + sizes
         # Zero behind each string, as rosbags demands.
         if (sizes < 1).any() or (end > rows.sizes).any():
@@ -182,9 +186,7 @@ class _Walk:
     def _read_numbers(
         self, step: NumberSequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
-        at = _aligned(at, step.align, step.skip)
-        counts = self._length(rows, at)
-        at = at + 4
+        counts, at = self._length(step, rows, at)
         # An empty sequence is not aligned to its elements.
         begin = np.where(counts > 0, _aligned(at, step.size), at) if step.size > 4 else at
         end = begin + counts * step.size
@@ -214,9 +216,7 @@ class _Walk:
         self, step: Sequence, rows: _Bodies, at: IntArray, level: LevelColumns | None
     ) -> IntArray:
         if step.length == SEQUENCE:
-            at = _aligned(at, step.align, step.skip)
-            counts = self._length(rows, at)
-            at = at + 4
+            counts, at = self._length(step, rows, at)
         else:
             counts = np.full(at.size, step.length, np.int64)
         if (at + counts * max(step.plan.least, 1) > rows.sizes).any():
@@ -231,8 +231,7 @@ class _Walk:
         if level is not None:
             inner = LevelColumns()
             self.read(step.plan, rows.of(owners), begins, inner)
-            level.elements[step.path] = Elements(owners, inner.columns, inner.elements)
-            level.left_out |= {f"{step.path}.{path}": why for path, why in inner.left_out.items()}
+            level.add_elements(step.path, counts, inner)
         return end
 
     def _stepped(

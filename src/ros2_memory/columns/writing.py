@@ -1,23 +1,27 @@
-"""What is written into the tables of a store: bags, their topics and their parts."""
+"""Parts, and what else is written into the tables of a store: bags and topics.
+
+A part is the rows of one topic in some bags of a recording, column by column. Beside the columns of
+the topic's layout it has `#log_time`, `#bag` (the number of each row's bag) and, where copies of a
+message of some bag may lie in other recordings, `#payload_hash`, `#delay` (how much later a message
+was received than published) and the zone of `#publish_time`. In rows of its other bags the hash is
+`UNHASHED` and the delay 0. The owners of the elements of a sequence lie under its path and `#`.
+"""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.layout import Layout
-from ros2_memory.columns.parts import (
-    ALWAYS,
-    DROPPED,
-    ZONE_ALONE,
-    PackedPart,
-    pack_rows,
-    packed_part,
-)
-from ros2_memory.columns.table import Table, Zone
+from ros2_memory.columns.layout import Layout, columns_in
+from ros2_memory.columns.pack import Packed, compressed, pack
+from ros2_memory.columns.steps import EXACT
+from ros2_memory.columns.table import Table, Zone, joined
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -35,6 +39,106 @@ UNMERGED: Final = "SELECT value FROM part, json_each(part.bags) WHERE NOT whole"
 _MOST_INTEGER: Final = 2**63 - 1
 _MOST_LAYOUTS: Final = 4_096
 
+LOG_TIME: Final = "#log_time"
+PUBLISH_TIME: Final = "#publish_time"
+PAYLOAD_HASH: Final = "#payload_hash"
+BAG: Final = "#bag"
+DELAY: Final = "#delay"
+ZONE_ALONE: Final = "zone"
+"""The codec of a column of which there is never more than the zone."""
+DROPPED: Final = "dropped"
+"""The codec of a column of which only the zone is stored: its topic is beyond its share."""
+ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
+UNHASHED: Final = -1
+"""In place of the hash of a payload that was not hashed."""
+
+
+@dataclass(frozen=True)
+class PackedPart:
+    """A part as it is stored.
+
+    Attributes:
+        first: the earliest log time (ns), inclusive.
+        last: the latest, inclusive.
+        messages: how many rows.
+        bags: the numbers of the bags that its rows are of, ascending.
+        columns: by their paths, packed; the data is compressed.
+    """
+
+    first: Ns
+    last: Ns
+    messages: int
+    bags: tuple[int, ...]
+    columns: Mapping[str, Packed]
+
+    @cached_property
+    def first_of(self) -> dict[bytes, str]:
+        """By data, the path of the first column that has it: it is stored once."""
+        paths = reversed([*self.columns.items()])
+        return {packed.data: path for path, packed in paths if packed.data}
+
+    @property
+    def size(self) -> int:
+        """How many bytes its data takes."""
+        return sum(map(len, self.first_of))
+
+
+def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> PackedPart:
+    """Returns the rows of some bags as one part.
+
+    Args:
+        layout: of the topic, type and definition that all these tables are of.
+        tables: each with the number of the bag of each row, of which it has one at least.
+    """
+    if len(tables) == 1:
+        return pack_rows(layout, *tables[0])
+    stops = np.cumsum([len(table) for table, _ in tables])
+    # The place of a row becomes its number among all rows: so its bag is known once sorted.
+    is_hashed = any(table.payload_hashes is not None for table, _ in tables)
+    numbered = [
+        replace(
+            table,
+            places=np.arange(stop - len(table), stop),
+            payload_hashes=_hashes(table) if is_hashed else None,
+        )
+        for (table, _), stop in zip(tables, stops.tolist(), strict=True)
+    ]
+    whole = joined(numbered)
+    return pack_rows(layout, whole, np.concatenate([bags for _, bags in tables])[whole.places])
+
+
+def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
+    """Returns the rows of a table of a layout, each with the number of its bag, as a part."""
+    common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
+    packed: dict[str, Packed] = {}
+    if table.payload_hashes is not None:
+        is_hashed = table.payload_hashes != UNHASHED
+        common[PAYLOAD_HASH] = table.payload_hashes
+        common[DELAY] = np.where(is_hashed, table.log_times - table.publish_times, 0)
+        # Those of a table without columns may be log times.
+        if is_hashed.all() or "" not in table.left_out:
+            published = Zone(int(table.publish_times.min()), int(table.publish_times.max()))
+            packed[PUBLISH_TIME] = Packed(ZONE_ALONE, len(table), 0.0, published, b"")
+    steps = (kind.step for kind in layout.slots.values())
+    columns = [*common.values(), *(column for _, column in columns_in(table))]
+    packs = map(pack, columns, chain(repeat(EXACT, len(common)), steps))
+    packed.update(zip((*common, *layout.slots), packs, strict=True))
+    return PackedPart(
+        int(table.log_times[0]),
+        int(table.log_times[-1]),
+        len(table),
+        tuple(np.unique(bags).tolist()),
+        {
+            path: replace(column, data=compressed(column.data)) if column.data else column
+            for path, column in packed.items()
+        },
+    )
+
+
+def _hashes(table: Table) -> IntArray:
+    hashes = table.payload_hashes
+    return np.full(len(table), UNHASHED) if hashes is None else hashes
+
 
 class ReadBag(NamedTuple):
     """A bag to be stored.
@@ -44,45 +148,20 @@ class ReadBag(NamedTuple):
         bag: the bag, for its times.
         hashed: whether tables have the hashes of all its payloads.
         is_current: whether the bag may be stored, asked once nobody else can write.
+        tables: with all of its messages, unless these follow.
     """
 
     key: BagKey
     bag: BagFile
     hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
-
-
-class BagRows(NamedTuple):
-    """A table of one of some bags, which is named by its place among these."""
-
-    table: Table
-    bag: int
-
-
-class DecodedBags(NamedTuple):
-    """Bags of one recording, and tables with all of their messages."""
-
-    bags: list[ReadBag]
-    tables: list[BagRows]
-
-    def add(self, bag: ReadBag, tables: Sequence[Table]) -> None:
-        """Adds a bag."""
-        self.tables.extend(BagRows(table, len(self.bags)) for table in tables)
-        self.bags.append(bag)
-
-    def chosen(self, places: Sequence[int]) -> DecodedBags:
-        """Returns some of the bags, by their places among these."""
-        new = DecodedBags([], [])
-        for place in places:
-            new.add(self.bags[place], [table for table, bag in self.tables if bag == place])
-        return new
+    tables: Sequence[Table] = ()
 
 
 class LongBag:
     """A bag that is written in several transactions.
 
-    Attributes:
-        goes_on: whether it may be written on, as the last transaction found.
+    What writes returns whether it may be written on, as that transaction found.
 
     Args:
         to_store: the bag.
@@ -91,7 +170,6 @@ class LongBag:
     """
 
     def __init__(self, to_store: ReadBag, definitions: str, budget: int) -> None:
-        self.goes_on = False
         self._bag = to_store
         self._definitions = definitions
         self._share = budget / max(_messages_of(to_store.bag), 1)
@@ -99,37 +177,40 @@ class LongBag:
         self._number = 0
         self._layouts = Layouts()
 
-    def begin(self, connection: sqlite3.Connection) -> None:
+    def begin(self, connection: sqlite3.Connection) -> bool:
         """Inserts the bag with a key that none has, in place of what its path was stored with."""
-        self.goes_on = self._bag.is_current()
-        if self.goes_on:
-            key = self._bag.key
-            delete_bags(connection, [key.path])
-            self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
+        if not self._bag.is_current():
+            return False
+        key = self._bag.key
+        delete_bags(connection, [key.path])
+        self._number = insert_bag(connection, self._bag._replace(key=key._replace(size=-1)), "")
+        return True
 
-    def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> None:
+    def add(self, connection: sqlite3.Connection, tables: Sequence[Table]) -> bool:
         """Inserts some of its messages, as parts of ten minutes each."""
         if not self._may_go_on(connection):
-            return
+            return False
         self._lacks_definitions |= lacks_definitions(tables)
-        packed: dict[int, list[PackedPart]] = defaultdict(list)
+        parts: list[int] = []
         for table in tables:
             topic, layout = topic_of(connection, table, self._layouts)
             for rows in _in_parts(table) if len(table) else ():
-                numbers = np.full(len(rows), self._number, np.int64)
-                packed[topic].append(pack_rows(layout, rows, numbers))
-        parts = insert_parts(connection, packed, whole=True)
-        share = round(self._share * sum(len(table) for table in tables))
+                part = pack_rows(layout, rows, np.full(len(rows), self._number, np.int64))
+                parts.append(_insert_part(connection, topic, part, whole=True))
+        share = round(self._share * sum(map(len, tables)))
         thin_parts(connection, parts, bytes_of_topics(connection), share)
+        return True
 
-    def end(self, connection: sqlite3.Connection) -> None:
+    def end(self, connection: sqlite3.Connection) -> bool:
         """Gives the bag its key: now it is stored."""
-        if self._may_go_on(connection):
-            definitions = self._definitions if self._lacks_definitions else ""
-            connection.execute(
-                "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
-                (self._bag.key.size, definitions, self._number),
-            )
+        if not self._may_go_on(connection):
+            return False
+        definitions = self._definitions if self._lacks_definitions else ""
+        connection.execute(
+            "UPDATE bag SET size = ?, definitions = ? WHERE id = ?",
+            (self._bag.key.size, definitions, self._number),
+        )
+        return True
 
     def delete_half(self, connection: sqlite3.Connection) -> None:
         """Deletes the parts of it that were written, where it is not stored whole."""
@@ -139,8 +220,7 @@ class LongBag:
     def _may_go_on(self, connection: sqlite3.Connection) -> bool:
         # Meanwhile it may have been deleted, or another program may store it.
         row = connection.execute("SELECT 1 FROM bag WHERE id = ?", (self._number,)).fetchone()
-        self.goes_on = row is not None and self._bag.is_current()
-        return self.goes_on
+        return row is not None and self._bag.is_current()
 
 
 def bytes_of_topics(connection: sqlite3.Connection) -> dict[int, float]:
@@ -173,16 +253,12 @@ def thin_parts(
         (json.dumps(parts),),
     ):
         sizes[topic][part] = size
-    left = max(sum(sum(by_part.values()) for by_part in sizes.values()) + spare, at_least)
-    dropped = 0
+    of_topic = {topic: sum(by_part.values()) for topic, by_part in sizes.items()}
+    left, dropped = max(sum(of_topic.values()) + spare, at_least), 0
     for topic in sorted(sizes, key=lambda topic: usual[topic]):
-        left -= sum(sizes[topic].values())
-        if left < 0:
-            dropped += sum(
-                size
-                for part, size in sizes[topic].items()
-                if _drop_columns(connection, topic, part)
-            )
+        left -= of_topic[topic]
+        for part, size in sizes[topic].items() if left < 0 else ():
+            dropped += size * _drop_columns(connection, topic, part)
     return dropped
 
 
@@ -220,7 +296,7 @@ def _in_parts(table: Table) -> Iterator[Table]:
 
 
 def lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether a table has no columns: with other definitions it may have some."""
+    """Returns whether some table has no columns: with other definitions it may have some."""
     return any("" in table.left_out for table in tables)
 
 
@@ -230,8 +306,8 @@ def _messages_of(bag: BagFile) -> int:
 
 def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
     """Inserts a bag; returns its number."""
-    key, bag, hashed, _ = to_store
-    summary = _number_of(connection, "summary", {"topics": bag.summary.schema.to_json()})
+    key, bag, hashed, *_ = to_store
+    summary = _number_of(connection, "summary", topics=bag.summary.schema.to_json())
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
         " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
@@ -242,35 +318,22 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
 
 def insert_bags(
     connection: sqlite3.Connection,
-    decoded: DecodedBags,
+    bags: Sequence[ReadBag],
     definitions: str,
     layouts: Layouts,
     *,
     whole: bool,
 ) -> list[int]:
     """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
-    lacking = {bag for table, bag in decoded.tables if lacks_definitions([table])}
-    numbers = [
-        insert_bag(connection, to_store, definitions if place in lacking else "")
-        for place, to_store in enumerate(decoded.bags)
-    ]
-    tables: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
+    rows: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
-    for table, bag in decoded.tables:
-        topic, layout_of[topic] = topic_of(connection, table, layouts)
-        tables[topic].append((table, np.full(len(table), numbers[bag])))
-    packed = {
-        topic: [packed_part(layout_of[topic], of_topic)] for topic, of_topic in tables.items()
-    }
-    return insert_parts(connection, packed, whole=whole)
-
-
-def insert_parts(
-    connection: sqlite3.Connection, parts: Mapping[int, Sequence[PackedPart]], *, whole: bool
-) -> list[int]:
-    """Inserts parts, by the numbers of their topics; returns their ids."""
-    numbered = [(topic, part) for topic, of_topic in parts.items() for part in of_topic]
-    return [_insert_part(connection, topic, part, whole=whole) for topic, part in numbered]
+    for bag in bags:
+        number = insert_bag(connection, bag, definitions if lacks_definitions(bag.tables) else "")
+        for table in bag.tables:
+            topic, layout_of[topic] = topic_of(connection, table, layouts)
+            rows[topic].append((table, np.full(len(table), number)))
+    parts = ((topic, packed_part(layout_of[topic], of_topic)) for topic, of_topic in rows.items())
+    return [_insert_part(connection, topic, part, whole=whole) for topic, part in parts]
 
 
 def _insert_part(
@@ -287,35 +350,28 @@ def _insert_part(
         # Numbers that are rounded to one take no bytes, but are no constant.
         if packed.data or packed.codec.split()[-1] not in {"constant", ZONE_ALONE}:
             first = part.first_of.get(packed.data, path)
-            is_first = first == path
-            columns.append(
-                (number, path, None if is_first else first, packed.data if is_first else None)
-            )
+            own = (None, packed.data) if first == path else (first, None)
+            columns.append((number, path, *own))
     connection.executemany("INSERT INTO part_column VALUES (?, ?, ?, ?)", columns)
+    marks = ", ".join("?" * 10)
     connection.executemany(
-        "INSERT INTO zone VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        f"INSERT INTO zone VALUES ({marks})",
         [
-            (
-                topic,
-                path,
-                number,
-                packed.codec,
-                packed.count,
-                packed.error,
-                _storable(packed.zone.least),
-                _storable(packed.zone.greatest),
-                packed.zone.nulls,
-                packed.zone.words,
-            )
+            (topic, path, number, packed.codec, packed.count, packed.error, *_stored(packed.zone))
             for path, packed in part.columns.items()
         ],
     )
     return number
 
 
-def _storable(bound: int | float | None) -> float | str | None:  # noqa: PYI041 - unlike
-    """Returns the bound of a zone as SQLite can store it: of a uint64 above its integers a text."""
-    return str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
+def _stored(zone: Zone) -> tuple[int | float | str | None, ...]:
+    """Returns a zone as SQLite can store it: bounds of a uint64 above its integers as texts."""
+    bounds: list[int | float | None] = [zone.least, zone.greatest]
+    stored = (
+        str(bound) if isinstance(bound, int) and bound > _MOST_INTEGER else bound
+        for bound in bounds
+    )
+    return (*stored, zone.nulls, zone.words)
 
 
 def zone_of(
@@ -350,27 +406,21 @@ def topic_of(connection: sqlite3.Connection, table: Table, layouts: Layouts) -> 
     channel, (layout, described) = table.channel, layouts.of(table)
     schema = channel.schema
     definition = _number_of(
-        connection,
-        "definition",
-        {"type": schema.name, "encoding": schema.encoding, "text": schema.text},
+        connection, "definition", type=schema.name, encoding=schema.encoding, text=schema.text
     )
     topic = _number_of(
         connection,
         "topic",
-        {
-            "name": channel.topic,
-            "encoding": channel.encoding,
-            "latched": channel.latched,
-            "definition": definition,
-            "layout": described,
-        },
+        name=channel.topic,
+        encoding=channel.encoding,
+        latched=channel.latched,
+        definition=definition,
+        layout=described,
     )
     return topic, layout
 
 
-def _number_of(
-    connection: sqlite3.Connection, table: str, values: Mapping[str, str | bytes | int]
-) -> int:
+def _number_of(connection: sqlite3.Connection, table: str, **values: str | bytes | int) -> int:
     """Returns the id of the row with these values, which is inserted if it is new."""
     given = tuple(values.values())
     where = " AND ".join(f"{name} = ?" for name in values)
@@ -384,16 +434,12 @@ def _number_of(
 
 def delete_bags(connection: sqlite3.Connection, paths: Sequence[str]) -> None:
     """Deletes bags, and the parts that have rows of none that is left."""
-    numbers = [
-        row[0]
-        for row in connection.execute(
-            "SELECT id FROM bag WHERE path IN (SELECT value FROM json_each(?))",
-            (json.dumps(paths),),
-        )
-    ]
-    if not numbers:
+    deleted = connection.execute(
+        "DELETE FROM bag WHERE path IN (SELECT value FROM json_each(?)) RETURNING id",
+        (json.dumps(paths),),
+    ).fetchall()
+    if not deleted:
         return
-    connection.executemany("DELETE FROM bag WHERE id = ?", [(number,) for number in numbers])
     # A part goes with the last of its bags.
     gone = connection.execute(
         "SELECT id, topic FROM part WHERE NOT EXISTS"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -27,8 +26,7 @@ _ANY: Final = -1
 """The code of a zone whose words are not known."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Zones:
+class Zones(NamedTuple):
     """The zones of one column in several parts: what `Zone` is of one.
 
     Attributes:
@@ -91,7 +89,7 @@ class Zones:
 
     def divided(self, by: int) -> Zones:
         """Returns the zones of the values divided by a positive number."""
-        return replace(self, low=self.low / by, high=self.high / by)
+        return self._replace(low=self.low / by, high=self.high / by)
 
     def spans(self, number: float) -> Mask:
         """Returns in which parts a number may be a value."""
@@ -130,8 +128,7 @@ class Zones:
         return flags[self.codes]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PartZones:
+class PartZones(NamedTuple):
     """What is known of some parts of one topic without reading any.
 
     Attributes:

@@ -80,14 +80,14 @@ def naming(fields: Collection[str]) -> tuple[str, ...]:
     return (*LABELS, "name", "id") if is_seen else LABELS
 
 
-def without_low_scores(value: JsonValue, min_score: float) -> JsonValue:
+def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPTH) -> JsonValue:
     """Returns an extracted value without the detections whose score is below a limit.
 
     Null takes their place, so that the others keep theirs; in a detection with several hypotheses
     also the place of each that scores less. What has no score stays. A value without any such
-    detection is returned as it is.
+    detection is returned as it is. They are looked for as by `detections_of`.
     """
-    return _walked(value, "", MAX_DEPTH, min_score, [])
+    return _walked(value, "", depth, min_score, [])
 
 
 def _walked(

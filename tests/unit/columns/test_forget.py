@@ -126,25 +126,6 @@ def test_no_byte_of_a_forgotten_bag_is_left(tmp_path: Path, merged: bool) -> Non
     assert len(world.stored()) == 14
 
 
-def test_no_byte_of_a_bag_is_left_that_retention_deleted_before(tmp_path: Path) -> None:
-    paths = [write_bag(tmp_path, number) for number in range(12)]
-    world = World.of(tmp_path)
-    world.fill()
-    for path in paths[:4]:
-        path.unlink()
-    world.prune()
-    paths[4].unlink()  # and nobody has pruned since
-    file = store_file(tmp_path)
-    assert b"secret0002" in bytes_of(file.parent)
-    forget(file, tmp_path, [])
-    for number in range(5):
-        assert f"secret{number:04d}".encode() not in bytes_of(file.parent) + unpacked(file)
-    assert world.stored() == {"rec/rec_10.mcap", "rec/rec_11.mcap"}
-    world.fill()
-    assert check_all(world) == 7 * 121
-    assert len(world.stored()) == 7
-
-
 def test_copies_that_were_set_aside_go_too(tmp_path: Path) -> None:
     write_bag(tmp_path, 0)
     World.of(tmp_path).fill()

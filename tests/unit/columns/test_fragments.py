@@ -189,15 +189,6 @@ def test_what_follows_from_more_parts_takes_the_place_of_what_followed_from_some
         assert stored.words == str(key.parts)
 
 
-def test_fragments_go_with_their_part(world: World, tmp_path: Path) -> None:
-    assert fragments_in(store_file(tmp_path)) > 0
-    for path in sorted(tmp_path.glob("rec/*.mcap")):
-        path.unlink()
-    write_mcap(tmp_path / "other" / "other_0.mcap", [odom(T0 + 9000 * S, 0, 0)])
-    world.prune()
-    assert fragments_in(store_file(tmp_path)) == 0
-
-
 def test_a_fragment_of_a_part_that_went_meanwhile_is_not_stored(
     world: World, tmp_path: Path
 ) -> None:

@@ -11,9 +11,9 @@ import pytest
 
 from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import decompressed, unpack
-from ros2_memory.columns.parts import packed_part
 from ros2_memory.columns.stored import lazy_columns
 from ros2_memory.columns.table import Column, Elements, Table, Texts, column_bytes, joined
+from ros2_memory.columns.writing import packed_part
 from ros2_memory.storage.base import Channel, Schema
 
 CHANNEL = Channel("/objects", "cdr", Schema("demo_msgs/msg/Objects"))

@@ -14,7 +14,15 @@ from hypothesis import strategies as st
 
 from ros2_memory.columns.numbers import numbers
 from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
-from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, Values, seconds
+from ros2_memory.columns.values import (
+    ROWS,
+    Conversion,
+    Kind,
+    Leaf,
+    UnknownShapeError,
+    Values,
+    seconds,
+)
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, unix_from_ns
 from ros2_memory.counts.numbers import numbers_in
 from ros2_memory.extract import SchemaExtractor
@@ -78,9 +86,11 @@ def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[
     found: list[Counter[tuple[str, object]]] = [Counter() for _ in drawn.messages]
     shape = Shape(drawn.table.definition, drawn.type, extractor)
     for path, leaf, limits in leaves_below(Spot(shape.value)):
-        column = column_of(values, leaf)
-        size = values.size(leaf.level)
-        if column is None or size is None or not values.holds_all(leaf):
+        try:
+            column, size = column_of(values, leaf), values.size(leaf.level)
+        except UnknownShapeError:
+            continue
+        if not values.holds_all(leaf):
             continue
         kept, rows = placed(values, leaf.level, np.arange(size), limits, surely=True)
         for at, row in zip(kept.tolist(), rows.tolist(), strict=True):
@@ -89,13 +99,10 @@ def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[
     return found
 
 
-def column_of(values: Values, leaf: Leaf) -> Sequence[object] | None:
+def column_of(values: Values, leaf: Leaf) -> Sequence[object]:
     if leaf.kind is Kind.TEXT:
-        texts = values.texts(leaf)
-        return None if texts is None else [*texts.values()]
+        return values.texts(leaf).values()
     known = values.numbers(leaf)
-    if known is None:
-        return None
     if known.exactly is not None:
         return known.exactly(np.arange(len(known.values))).tolist()
     return known.values.tolist()
@@ -173,7 +180,6 @@ def turned(parts: list[Quaternion], error: float = 0.0) -> list[list[tuple[float
     found = []
     for made in (Conversion.ROLL, Conversion.PITCH, Conversion.YAW):
         known = values.numbers(Leaf(ROWS, ("x", "y", "z", "w"), Kind.REAL, made))
-        assert known is not None
         off = np.broadcast_to(known.error, known.values.shape)
         exact = known.values if known.exactly is None else known.exactly(np.arange(len(parts)))
         found.append([*zip(known.values.tolist(), off.tolist(), exact.tolist(), strict=True)])

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
-from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from tests.support.bags import make, stamp
 from tests.support.examples import LONG, examples
@@ -250,10 +250,3 @@ def test_an_array_that_is_not_held_is_settled_by_its_ends_or_unsure() -> None:
         .truth(table)
         .unsure.all()
     )
-
-
-def test_a_table_without_a_definition_is_unsure() -> None:
-    table = drawn_of(STRING, [make(STRING, data="cup")]).table
-    assert isinstance(table.columns["data"], Texts)
-    object.__setattr__(table, "definition", None)
-    assert ColumnCondition(Condition(Contains("cup")), EXTRACTOR).truth(table).unsure.all()
