@@ -104,7 +104,7 @@ def count_labels(
         )
     topics = matching_topics(view, topic)
     reader = LabelReader(view, scope, condition)
-    reader.read(topics, lambda label: value == ANY_LABEL or test.matches(label))
+    reader.read(topics, lambda label: value == ANY_LABEL or test.passes(label))
     if reader.since is not None:
         view.notes.add_lack(
             f"not all before {unix_text(reader.since)} is counted: "

@@ -230,7 +230,7 @@ def _label_held(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
 ) -> tuple[TrueIntervals | None, Ns | None]:
     """Returns when a thing with a label was in view; None where no label meets a condition."""
-    view, matches = binned.view, condition.test.matches
+    view, matches = binned.view, Condition(condition.test).matches
     if scope.is_bounded or condition.min_score or len(topics) > 1:
         reader = LabelReader(view, scope, condition)
         reader.read(topics, matches)

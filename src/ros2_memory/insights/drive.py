@@ -18,7 +18,6 @@ from ros2_memory.analysis.motion.standstills import (
     SILENCE_NS,
     Stands,
     Standstill,
-    joined_blocks,
     stands_of,
     standstills_of,
 )
@@ -157,7 +156,7 @@ def _standstills_in(
     """
     slices = _stands_of_slices(view, topic, window.widened(CONTEXT_NS))
     stands = [stand for _, stand in slices][::-1]
-    standing = standstills_of(joined_blocks([stand.blocks for stand in stands]))
+    standing = standstills_of([stand.blocks for stand in stands])
     starts = [standstill.start for standstill in standing]
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     drops = tuple(

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.poses import Floats, Poses, Vectors
-    from ros2_memory.core.arrays import Flags, Ints
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
 
     Corners: TypeAlias = NDArray[np.int32] | Ints
@@ -167,10 +167,8 @@ class Blocks:
     def are_still(self) -> Flags:
         """Returns whether drift and noise explain the boxes."""
         lows, highs = self.corners()
-        are_explained: Flags = _lengths(highs - lows) <= np.minimum(
-            np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64)), LARGEST_M
-        )
-        return are_explained
+        explained_m = np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64))
+        return _lengths(highs - lows) <= np.minimum(explained_m, LARGEST_M)
 
     @property
     def memory_bytes(self) -> int:
@@ -236,17 +234,15 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
         return NO_BLOCKS
     slots = _Slots(poses.times[valid], poses.positions[valid])
     links = slots.links()
-    if not links.any():
-        return NO_BLOCKS
     before, after = np.r_[False, links], np.r_[links, False]
     is_first = after & ~before
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(before & ~after)
-    before, after = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    is_long = slots.lasts[after] - slots.firsts[before] >= SHORTEST_NS
-    is_inner = np.zeros(len(slots), np.bool_)
-    for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
-        is_inner[first + 1 : last] = True
-    blocks = _blocks(slots, np.flatnonzero(is_inner), np.cumsum(is_first))
+    beside = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
+    is_long = slots.lasts[beside[1]] - slots.firsts[beside[0]] >= SHORTEST_NS
+    chains = np.cumsum(is_first)
+    # Each slot with links on both sides is of the newest chain that began.
+    inner = np.flatnonzero(before & after)
+    blocks = _blocks(slots, inner[is_long[chains[inner] - 1]], chains)
     times, _ = blocks.span()
     return rows_of(blocks, (times >= start) & (times < stop))
 
@@ -375,8 +371,7 @@ class _Slots:
 
 
 def _lengths(vectors: Vectors) -> Floats:
-    lengths: Floats = np.sqrt(row_sums(vectors * vectors))
-    return lengths
+    return np.sqrt(row_sums(vectors * vectors))
 
 
 def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
@@ -398,13 +393,9 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     return deviations
 
 
-def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
-    """Returns the blocks of stretches of time that follow each other, maybe none."""
-    return stacked([NO_BLOCKS, *parts])
-
-
-def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
-    """Returns the standstills in blocks of consecutive time, in order."""
+def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
+    """Returns the standstills in blocks of stretches of time that follow each other, in order."""
+    blocks = stacked([NO_BLOCKS, *parts])
     if not len(blocks):
         return ()
     begins_chain = blocks.starts != MIN_NS
