@@ -381,9 +381,14 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
     selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
     the first.
     """
-    nodes: list[JsonValue] = [value]
+    return _along(value, dot_path)[-1]
+
+
+def _along(value: JsonValue, dot_path: str) -> list[list[JsonValue]]:
+    """Returns what is at each beginning of a dot-path: first the value, last its targets."""
+    nodes: list[list[JsonValue]] = [[value]]
     for segment in dot_path.split("."):
-        nodes = [target for node in nodes for target in _descend(node, segment)]
+        nodes.append([target for node in nodes[-1] for target in _descend(node, segment)])
     return nodes
 
 
@@ -668,12 +673,8 @@ def _plain_text(test: Test) -> str | None:
 
 def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
-    segments = dot_path.split(".")
-    return any(
-        target is None or target == []
-        for length in range(len(segments))
-        for target in (at_field(value, ".".join(segments[:length])) if length else [value])
-    )
+    beginnings = chain.from_iterable(_along(value, dot_path)[:-1])
+    return any(target is None or target == [] for target in beginnings)
 
 
 def _has_unknown_part(value: JsonValue) -> bool:

@@ -433,8 +433,7 @@ def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
 def _tallied(first: Ints, other: Ints) -> Ints:
     """Returns the distinct pairs, and how often there is each."""
     rows, nth = distinct_rows((first, other))
-    tally: Ints = np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
-    return tally
+    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
 
 
 def _mm(metres: Floats) -> Ints:

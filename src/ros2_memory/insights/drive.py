@@ -9,13 +9,14 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.clock_steps import Elapsed
-from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
+    DROP_SLOT_NS,
     SHORTEST_NS,
     SILENCE_NS,
+    SpeedDrop,
     Stands,
     Standstill,
     stands_of,
@@ -164,7 +165,8 @@ def _standstills_in(
         for stand in stands
         for drop in stand.drops
         if start <= drop.time <= end
-        and bisect_left(starts, drop.time - SLOT_NS) == bisect_left(starts, drop.time + _BRAKING_NS)
+        and bisect_left(starts, drop.time - DROP_SLOT_NS)
+        == bisect_left(starts, drop.time + _BRAKING_NS)
     )
     last = max((stand.last for stand in stands), default=MIN_NS)
     return tuple(_stops_between(view, standing, start, end, last)), drops

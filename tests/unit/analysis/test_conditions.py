@@ -18,11 +18,10 @@ from ros2_memory.analysis.conditions import (
     Scalar,
     at_field,
     parse_condition,
-    positions,
     refusal_for,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
-from tests.support.strategies import json_values, scalars
+from tests.support.strategies import json_values
 
 if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
@@ -221,6 +220,8 @@ BAD = (None, math.nan, math.inf)
         (None, None, {"pose": {"pose": {"position": {**ONE_TWO, "z": 0.0}}}}, True),
         (None, None, {"transforms": [{"transform": {"translation": ONE_TWO}}]}, True),
         (None, None, [OTHER, ONE_TWO], True),
+        # What is a position itself is not searched for others.
+        (None, None, {**OTHER, "point": ONE_TWO}, False),
         (None, None, {"position": [OTHER, ONE_TWO]}, True),
         (None, None, SCENE, True),
         (None, "detections", SCENE, True),
@@ -246,11 +247,6 @@ def test_positions_are_found_under_the_keys_that_hold_places(
     assert Condition(NearPosition(1.0, 2.0, z, 0.5), field).matches(value) is is_met
 
 
-def test_a_value_that_is_a_position_is_not_searched_for_others() -> None:
-    value: JsonValue = {"x": 0.0, "y": 0.0, "point": {"x": 5.0, "y": 5.0}}
-    assert [place[:2] for place in positions(value)] == [(0.0, 0.0)]
-
-
 # fields
 
 
@@ -273,13 +269,6 @@ def test_a_value_that_is_a_position_is_not_searched_for_others() -> None:
 )
 def test_what_a_path_leads_to(value: JsonValue, path: str, found: list[JsonValue]) -> None:
     assert at_field(value, path) == found
-
-
-@given(scalars)
-def test_a_field_narrows_a_condition_to_its_targets(leaf: JsonValue) -> None:
-    value: JsonValue = {"x": leaf, "label": "the label"}
-    assert Condition(Contains("label"), "label").matches(value)
-    assert not Condition(Contains("label"), "x").matches(value)
 
 
 # parsing

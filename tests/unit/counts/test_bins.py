@@ -162,23 +162,6 @@ def test_the_metres_of_all_bins_are_those_of_the_way(memories: list[Memory], by:
             assert each == pytest.approx(math.fsum(steps), abs=0.5)
 
 
-def test_numbers_have_their_extremes_and_mean_in_each_bin(memories: list[Memory]) -> None:
-    span = TimeRange(BEGIN / S, BEGIN / S + 4 * 3600)
-    for memory in memories:
-        answer = count_range(memory, Call(), "/odom", span, "hour", fields=["position.x"])
-        values: dict[str, list[float]] = {}
-        for number in range(4 * 120 + 1):
-            at = BEGIN + min(number, 4 * 120 - 1) * EVERY
-            values.setdefault(local(at, "hour"), []).append(way(number))
-        # What comes at the very end of the window counts to the bin that ends there.
-        assert sum(each or 0 for each in column(answer, "count").values()) == 481
-        for name, numbers in values.items():
-            assert column(answer, "position.x.max")[name] == max(numbers)
-            assert column(answer, "position.x.mean")[name] == pytest.approx(
-                math.fsum(numbers) / len(numbers)
-            )
-
-
 def test_times_in_which_nothing_was_recorded_have_no_rows(tmp_path: Path) -> None:
     noon = round(datetime(2026, 3, 2, 12, 30).astimezone().timestamp())
     for begin in (noon, noon + 5 * 3600, noon + 3 * 86_400):

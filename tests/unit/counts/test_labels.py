@@ -144,16 +144,6 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 
 
-def test_json_objects_with_a_list_of_detections_in_texts_are_counted(tmp_path: Path) -> None:
-    said = '{"detections": [{"label": "cup", "score": 0.8}, {"label": "fork", "score": 0.4}]}'
-    messages = [text((BEGIN + second) * S, said, topic="/seen") for second in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    asking = {**ANY, "topic": "/seen"}
-    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
-        rows = rows_of(asked(memory, tmp_path, "find_matches", **asking))
-        assert [rows[label]["best_score"] for label in ("cup", "fork")] == [0.8, 0.4]
-
-
 @pytest.mark.parametrize(
     ("said", "rows"),
     [

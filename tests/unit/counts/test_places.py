@@ -97,21 +97,6 @@ def test_what_is_counted_by_place_is_where_the_robot_was(world: Path) -> None:
     assert seen["all"]["count"] == 1
 
 
-def test_numbers_in_a_place_are_those_of_its_messages(memory: Memory, world: Path) -> None:
-    question = {"topic": "/odom", "fields": ["linear_velocity.x"], "by": "place", **DOOR}
-    rows = table(asked(memory, world, "get_topic_in_range", **question))
-    for name in ("west", "east", "start", "all"):
-        assert (rows[name]["linear_velocity.x.min"], rows[name]["linear_velocity.x.max"]) == (
-            0,
-            0.4,
-        )
-    whole = rows["west"]["count"] + rows["east"]["count"]
-    mean = sum(
-        rows[name]["count"] * rows[name]["linear_velocity.x.mean"] for name in ("west", "east")
-    )
-    assert mean / whole == pytest.approx(rows["all"]["linear_velocity.x.mean"], abs=1e-5)
-
-
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
     memory: Memory, world: Path
 ) -> None:

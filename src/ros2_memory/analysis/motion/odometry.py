@@ -386,8 +386,7 @@ def _odd_steps(apart: Ints, steps_m: Floats, fastest_mps: float) -> list[int]:
         np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
     )
     odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
-    steps: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
-    return steps
+    return np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
 
 
 def _poses(times: Ints, positions: Vectors, begin: int, end: int) -> list[TimedPosition]:
@@ -412,19 +411,20 @@ class Motion:
     def add_leg(self, times: Ints, positions: Vectors) -> Floats:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
-        piece = measured((times - times[0]) / NS_PER_S, positions)
+        seconds = (times - times[0]) / NS_PER_S
+        length_m, sum_m, head, tail, still, speed_mps, steps_m = measured(seconds, positions)
         begin = _poses(times, positions, 0, _NEARBY + 1)
         end = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
         period_ns = int(np.median(apart)) if len(apart) else None
-        ends = begin[0], end[-1]
         motion = _motion_of(begin), _motion_of(end)
-        leg = Leg(*ends, len(times), period_ns, *piece[:5], *motion)
+        count, first, last = len(times), begin[0], end[-1]
+        leg = Leg(first, last, count, period_ns, length_m, sum_m, head, tail, still, *motion)
         if len(times) <= SPEED_STEPS:
             steps = zip(map(_step, begin, begin[1:]), apart >= ARRIVAL_JITTER_NS, strict=False)
             speeds = (step_m / elapsed_s for (step_m, elapsed_s), is_known in steps if is_known)
             self.step_mps = max(self.step_mps, *speeds, 0.0)
-        self._go_on(None, leg, piece.speed_mps)
-        return piece.steps_m
+        self._go_on(None, leg, speed_mps)
+        return steps_m
 
     def join(self, later: MotionTotals) -> bool:
         """Takes the legs that come next; returns whether a jump or reset led there."""
@@ -513,4 +513,5 @@ def are_places(positions: Vectors) -> Flags:
     """Returns which coordinates, as rows, are a place: finite, and on Earth."""
     x, y, z = np.abs(positions).T
     # A comparison with NaN is false, so this one refuses all three kinds.
-    return (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
+    marks: Flags = (x < FARTHEST_M) & (y < FARTHEST_M) & (z < FARTHEST_M)
+    return marks

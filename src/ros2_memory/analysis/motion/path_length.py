@@ -193,7 +193,7 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
         steps[begin:end] = creep.length_m / (end - begin)
         before = creep if begin == 0 else before
         after = creep if end == len(plain) else after
-        if 0 < begin and end < len(plain):
+        if begin > 0 and end < len(plain):
             inside_m.append(creep.length_m)
     spread = np.sqrt(row_sums(noise**2))
     head, tail = (
@@ -233,9 +233,10 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flag
         slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
         square = row_sums(slopes**2)
         energy = _moving_mean(square[:, None], _SLOPE_SPAN)[:, 0]
-        share = 12 / (width * (width * width - 1)) * whole
+        of_slope = 12 / (width * (width * width - 1))
+        share = of_slope * whole
         along = row_sums(variance * slopes**2) / np.where(square > 0, square, 1.0)
-        across = 12 / (width * (width * width - 1)) * (whole - along)
+        across = of_slope * (whole - along)
         settled = unsettled & (energy >= _CLEAR * share)
         if width == 2:
             as_plain = settled & (share <= 2 * _PLAIN * energy)
@@ -257,8 +258,7 @@ def _scatters(points: Vectors, places: Vectors, noise: Vectors) -> Flags:
     ratio = row_sums(spread) / np.maximum(row_sums(noise**2), 1e-300)
     low, high = _SPREAD
     around: Flags = (low * low <= ratio) & (ratio <= high * high)
-    both: Flags = around[1:] & around[:-1]
-    return both
+    return around[1:] & around[:-1]
 
 
 def _slopes(points: Vectors, width: int) -> Vectors:

@@ -21,7 +21,7 @@ from ros2_memory.analysis.poses import FrameCodes, Poses
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
+    from ros2_memory.analysis.motion.standstills import SpeedDrop
     from ros2_memory.core.model import Quaternion, Vector3
 
 

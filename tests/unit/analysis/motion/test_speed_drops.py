@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop, speed_drops
+from ros2_memory.analysis.motion.standstills import DROP_SLOT_NS, SpeedDrop, speed_drops
 from tests.unit.analysis.motion.posed import posed, stood_in
 
 S = 10**9
@@ -94,7 +94,7 @@ def test_slices_of_any_length_change_nothing(
 ) -> None:
     poses = driven(*legs, rate=10)
     if silent:
-        poses = [each for each in poses if (each[0] - BEGIN) // SLOT_NS % 17 > 1]
+        poses = [each for each in poses if (each[0] - BEGIN) // DROP_SLOT_NS % 17 > 1]
     rows = [(at, place) for at, place, _ in poses]
     turned = posed(rows, [turn for *_, turn in poses])
     assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]
