@@ -55,7 +55,7 @@ def cut(folder: Path, messages: Sequence[Msg], draw: Random) -> None:
     ordered = sorted(messages, key=lambda each: each.log_time)
     number, recording = 0, 0
     while ordered:
-        size = draw.randint(20, 300)
+        size = draw.randint(60, 400)
         some, ordered = ordered[:size], ordered[size:]
         write_mcap(folder / f"rec_{recording}" / f"rec_{recording}_{number}.mcap", some)
         number += 1
