@@ -111,19 +111,16 @@ class Contains:
 
     def passes(self, leaf: JsonValue) -> bool:
         """Returns whether a leaf is a string that has the needle, or the boolean that it means."""
-        if isinstance(leaf, str):
-            return self._is_in(leaf)
-        return isinstance(leaf, bool) and leaf is self.boolean
-
-    def _is_in(self, text: str) -> bool:
-        folded = text.casefold()
+        if not isinstance(leaf, str):
+            return isinstance(leaf, bool) and leaf is self.boolean
+        folded = leaf.casefold()
         if not self.whole:
             return self.folded is not None and self.folded in folded
         if not self.folded or not _has_words(folded, self.folded):
             return False
         if not any(_has_words(folded, other) for other in self.others):
             return True
-        return any(map(self._is_in, _labels_in_json(text)))
+        return any(map(self.passes, _labels_in_json(leaf)))
 
 
 def _has_words(text: str, words: str) -> bool:
@@ -272,8 +269,9 @@ class Condition:
         targets, test = self.targets(value), self.test
         if isinstance(test, NearPosition):
             return any(starmap(test.is_near, chain.from_iterable(map(positions, targets))))
-        if any(map(test.passes, chain.from_iterable(map(leaves, targets)))):
-            return True
+        for target in targets:
+            if any(map(test.passes, leaves(target))):
+                return True
         if self.field is None or not isinstance(test, Contains):
             return False
         # Elements of nested lists count as such, too, fields of objects in them do not.
