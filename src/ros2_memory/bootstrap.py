@@ -254,7 +254,7 @@ def _watch_of(
     rules: Sequence[Rule],
 ) -> Callable[[MomentKeeper], Triggers]:
     from ros2_memory.recorder.process.topics import load_topics
-    from ros2_memory.triggers.search import SplitSearch
+    from ros2_memory.triggers.rules import SplitSearch
     from ros2_memory.triggers.watch import Triggers
 
     def is_recorded(topic: str) -> bool:

@@ -99,19 +99,26 @@ class PointPose:
 
 @dataclass(frozen=True, slots=True)
 class PlanarPose:
-    """Reads a pose from x, y, perhaps z (m; 0 without one) and a heading (rad)."""
+    """Reads a pose from x, y, perhaps z (m; 0 without one) and a heading (rad).
+
+    Where the heading `is_needed`, a message that has no such field has no pose.
+    """
 
     x: Route
     y: Route
     z: Route
     heading: Route
+    is_needed: bool = False
 
     def of(self, message: object) -> tuple[Vector3, Quaternion | None] | None:
         """Returns position and rotation in a message; None where it has no position."""
         x, y = number(self.x.of(message)), number(self.y.of(message))
         if x is None or y is None:
             return None
-        z, heading = number(self.z.of(message)), number(self.heading.of(message))
+        turned = self.heading.of(message)
+        if turned is ABSENT and self.is_needed:
+            return None
+        z, heading = number(self.z.of(message)), number(turned)
         if heading is None or not math.isfinite(heading):
             return (x, y, z or 0.0), None
         return (x, y, z or 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
@@ -130,12 +137,15 @@ class Plan:
 
 
 _NOWHERE: Final = Route("")
-HEADINGS: Final = ("theta", "yaw", "heading")
+_HEADINGS: Final = ("theta", "yaw", "heading")
 UNMAPPED: Final = Plan(
     fields={},
-    poses=tuple(
-        PointPose(Route(*prefix, "position"), Route(*prefix, "orientation"))
-        for prefix in (("pose", "pose"), ("pose",), ())
+    poses=(
+        *(
+            PointPose(Route(*prefix, "position"), Route(*prefix, "orientation"))
+            for prefix in (("pose", "pose"), ("pose",), ())
+        ),
+        *(PlanarPose(Route("x"), Route("y"), Route("z"), Route(name), True) for name in _HEADINGS),
     ),
     twists=tuple(
         (Route(*prefix, "linear"), Route(*prefix, "angular"))
@@ -245,7 +255,7 @@ class SchemaExtractor:
             if pose is not None:
                 px4_frame = _px4_frame(plan.pose_frame, message, POSE_FRAMES)
                 return Pose(*pose, _text(FRAME.of(message)) or px4_frame)
-        return _planar_pose(message) if plan is UNMAPPED else None
+        return None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
         """Returns the position on the Earth of a message; None where it has none."""
@@ -408,19 +418,9 @@ def _poses(
     if "translation" in names and "rotation" in names:
         return (PointPose(route("translation"), route("rotation")),)
     if "x" in names and "y" in names:
-        heading = next((name for name in HEADINGS if name in names), "heading")
+        heading = next((name for name in _HEADINGS if name in names), "heading")
         return (PlanarPose(route("x"), route("y"), route("z"), route(heading)),)
     return ()
-
-
-def _planar_pose(message: object) -> Pose | None:
-    """Returns the pose of a message that has x, y and a heading (rad) as fields of its own."""
-    names = names_of(message) if not isinstance(message, list) else ()
-    heading = next((name for name in HEADINGS if name in names), None)
-    if heading is None:
-        return None
-    pose = PlanarPose(Route("x"), Route("y"), Route("z"), Route(heading)).of(message)
-    return None if pose is None else Pose(*pose, _text(FRAME.of(message)))
 
 
 def _px4_rotation(node: object) -> Quaternion | None:

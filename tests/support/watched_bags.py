@@ -20,8 +20,7 @@ from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.triggers.rules import Rule
-from ros2_memory.triggers.search import SplitSearch
+from ros2_memory.triggers.rules import Rule, SplitSearch
 from ros2_memory.triggers.watch import Triggers
 from tests.support.bags import Msg, boolean, write_mcap
 from tests.support.clocks import SettableClock

@@ -15,7 +15,7 @@ import re
 import struct
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
+from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -109,32 +109,18 @@ class Contains:
         """Whether it is a row of letters that is found wherever a text has it, and no number."""
         return not self.whole and (self.folded or "").isalpha()
 
-    def matches(self, value: JsonValue) -> bool:
-        """Returns whether a string of the value contains the needle, or a boolean equals it."""
-        for leaf in leaves(value):
-            if isinstance(leaf, str):
-                if self._is_in(leaf):
-                    return True
-            elif isinstance(leaf, bool) and leaf is self.boolean:
-                return True
-        return False
-
-    def _is_in(self, text: str) -> bool:
-        folded = text.casefold()
+    def passes(self, leaf: JsonValue) -> bool:
+        """Returns whether a leaf is a string that has the needle, or the boolean that it means."""
+        if not isinstance(leaf, str):
+            return isinstance(leaf, bool) and leaf is self.boolean
+        folded = leaf.casefold()
         if not self.whole:
             return self.folded is not None and self.folded in folded
         if not self.folded or not _has_words(folded, self.folded):
             return False
         if not any(_has_words(folded, other) for other in self.others):
             return True
-        return any(map(self._is_in, _labels_in_json(text)))
-
-    def has_element(self, target: JsonValue) -> bool:
-        """Returns whether the target of a field is equal, or is a list with such an element.
-
-        Elements of nested lists count too, fields of objects in them do not.
-        """
-        return any(self.equal.is_leaf(leaf) for leaf in leaves(target, in_objects=False))
+        return any(map(self.passes, _labels_in_json(leaf)))
 
 
 def _has_words(text: str, words: str) -> bool:
@@ -175,17 +161,13 @@ class Equals:
         """The numbers that a float is equal to."""
         return tuple(number for meant in self.integers for number in (meant, stored_as(meant)))
 
-    def matches(self, value: JsonValue) -> bool:
-        """Returns whether any leaf at any depth is equal."""
-        return any(self.is_leaf(leaf) for leaf in leaves(value))
-
     @property
     def is_on_texts(self) -> bool:
         """Whether no boolean and no number matches."""
         return self.boolean is None and not self.numbers
 
-    def is_leaf(self, leaf: JsonValue) -> bool:
-        """Returns whether this leaf is equal."""
+    def passes(self, leaf: JsonValue) -> bool:
+        """Returns whether a leaf is equal."""
         if isinstance(leaf, bool):
             return leaf is self.boolean
         if isinstance(leaf, int | float):
@@ -220,15 +202,13 @@ class Beyond:
         """The limit as a float32 field stores it."""
         return stored_as(self.limit)
 
-    def matches(self, value: JsonValue) -> bool:
-        """Returns whether any number at any depth is on that side."""
-        stored = self.stored
-        return any(
-            leaf > self.limit if self.above else leaf < self.limit
-            for leaf in leaves(value)
-            if (isinstance(leaf, float) and leaf != stored)
-            or (isinstance(leaf, int) and not isinstance(leaf, bool))
-        )
+    def passes(self, leaf: JsonValue) -> bool:
+        """Returns whether a leaf is a number on that side."""
+        if isinstance(leaf, bool) or not isinstance(leaf, int | float):
+            return False
+        if isinstance(leaf, float) and leaf == self.stored:
+            return False
+        return leaf > self.limit if self.above else leaf < self.limit
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,10 +224,6 @@ class NearPosition:
     z: float | None
     tolerance_m: float
     frame_id: str | None = None
-
-    def matches(self, value: JsonValue) -> bool:
-        """Returns whether any position in the value is near."""
-        return any(self.is_near(x, y, z) for x, y, z in positions(value))
 
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Returns whether a position (m) is near; its z may be NaN where none is asked."""
@@ -290,12 +266,21 @@ class Condition:
         return min(self.min_score, _float32(self.min_score))
 
     def _passes(self, value: JsonValue) -> bool:
-        if self.field is None:
-            return self.test.matches(value)
-        targets, test = at_field(value, self.field), self.test
-        if isinstance(test, Contains) and any(map(test.has_element, targets)):
-            return True
-        return any(map(test.matches, targets))
+        targets, test = self.targets(value), self.test
+        if isinstance(test, NearPosition):
+            return any(starmap(test.is_near, chain.from_iterable(map(positions, targets))))
+        for target in targets:
+            if any(map(test.passes, leaves(target))):
+                return True
+        if self.field is None or not isinstance(test, Contains):
+            return False
+        # Elements of nested lists count as such, too, fields of objects in them do not.
+        elements = chain.from_iterable(leaves(target, in_objects=False) for target in targets)
+        return any(map(test.equal.passes, elements))
+
+    def targets(self, value: JsonValue) -> list[JsonValue]:
+        """Returns the parts of a value that are tested."""
+        return [value] if self.field is None else at_field(value, self.field)
 
     @property
     def array(self) -> str:
@@ -328,15 +313,11 @@ def matched_texts(condition: Condition, value: JsonValue) -> tuple[str, ...]:
     test = condition.test
     if not isinstance(test, Contains | Equals):
         return ()
-    targets = [value] if condition.field is None else at_field(value, condition.field)
     # `leaves` goes through a value from its end.
-    texts = [
-        leaf
-        for target in targets
-        for leaf in reversed([*leaves(target)])
-        if isinstance(leaf, str) and test.matches(leaf)
-    ]
-    return tuple(dict.fromkeys(texts))
+    parts = chain.from_iterable([*leaves(target)][::-1] for target in condition.targets(value))
+    return tuple(
+        dict.fromkeys(leaf for leaf in parts if isinstance(leaf, str) and test.passes(leaf))
+    )
 
 
 def summarising(field: str | None, value: JsonValue) -> list[Condition]:
@@ -398,9 +379,14 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
     selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
     the first.
     """
-    nodes: list[JsonValue] = [value]
+    return _along(value, dot_path)[-1]
+
+
+def _along(value: JsonValue, dot_path: str) -> list[list[JsonValue]]:
+    """Returns what is at each beginning of a dot-path: first the value, last its targets."""
+    nodes: list[list[JsonValue]] = [[value]]
     for segment in dot_path.split("."):
-        nodes = [target for node in nodes for target in _descend(node, segment)]
+        nodes.append([target for node in nodes[-1] for target in _descend(node, segment)])
     return nodes
 
 
@@ -525,9 +511,9 @@ def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
             node = [part for part in node.values() if isinstance(part, str) and in_objects]
         if isinstance(node, dict):
             if in_objects:
-                waiting.extend(node.values())
+                waiting += node.values()
         elif isinstance(node, list):
-            waiting.extend(node)
+            waiting += node
         else:
             yield node
 
@@ -685,12 +671,8 @@ def _plain_text(test: Test) -> str | None:
 
 def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
-    segments = dot_path.split(".")
-    return any(
-        target is None or target == []
-        for length in range(len(segments))
-        for target in (at_field(value, ".".join(segments[:length])) if length else [value])
-    )
+    beginnings = chain.from_iterable(_along(value, dot_path)[:-1])
+    return any(target is None or target == [] for target in beginnings)
 
 
 def _has_unknown_part(value: JsonValue) -> bool:

@@ -15,20 +15,16 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import merged_times
+from ros2_memory.core.arrays import joined_codes, merged_times
 from ros2_memory.core.text import shortened
 from ros2_memory.messages.detections import detections_of
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from numpy.typing import NDArray
-
-    from ros2_memory.core.arrays import Flags, Ints
+    from ros2_memory.core.arrays import Flags, Floats, Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.timebase import Ns
-
-    Floats: TypeAlias = "NDArray[np.float64]"
 
 LOG: Final = "rcl_interfaces/msg/Log"
 DIAGNOSTICS: Final = "diagnostic_msgs/msg/DiagnosticArray"
@@ -303,15 +299,11 @@ def joined_facts(parts: Sequence[Facts]) -> Facts:
     parts = [part for part in parts if part.rows.size]
     if len(parts) <= 1:
         return parts[0] if parts else NOTHING
-    code_of: dict[Word, int] = {}
-    codes = []
-    for part in parts:
-        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
-        codes.append(np.array(new, np.int64)[part.codes])
+    codes, words = joined_codes((part.codes, part.words) for part in parts)
     rows = np.concatenate([part.rows for part in parts])
     order = np.argsort(rows, kind="stable")
     values = np.concatenate([part.values for part in parts])
-    return Facts(rows[order], np.concatenate(codes)[order], values[order], tuple(code_of))
+    return Facts(rows[order], codes[order], values[order], words)
 
 
 class Stated(NamedTuple):

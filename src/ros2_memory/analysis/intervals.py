@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -111,11 +112,8 @@ class IntervalTable(NamedTuple):
     def spans(self) -> dict[str, tuple[Ints, Ints]]:
         """Returns by label the first and the last time of each of its intervals, in order."""
         rows = _unpacked(self.rows)
-        rows_of_label = [rows[rows["label"] == place] for place in range(len(self.labels))]
-        return {
-            label: (its["first"], its["last"])
-            for label, its in zip(self.labels, rows_of_label, strict=True)
-        }
+        by_label = {label: rows[rows["label"] == at] for at, label in enumerate(self.labels)}
+        return {label: (its["first"], its["last"]) for label, its in by_label.items()}
 
     def most_lasting(self, at_most: int) -> IntervalTable:
         """Returns the longest intervals, in order of time; of equally long ones the earliest."""
@@ -146,10 +144,8 @@ class IntervalTable(NamedTuple):
 
     def without(self, labels: Collection[str]) -> IntervalTable:
         """Returns the intervals of all other labels."""
-        places = [place for place, label in enumerate(self.labels) if label in labels]
-        if not places:
-            return self
-        return self._select(~np.isin(_unpacked(self.rows)["label"], places))
+        kept = np.array([label not in labels for label in self.labels], np.bool_)
+        return self if kept.all() else self._select(kept[_unpacked(self.rows)["label"]])
 
     def scoring(self, least: float) -> IntervalTable:
         """Returns the intervals with a best score of so much at least, or without any."""
@@ -163,12 +159,6 @@ class IntervalTable(NamedTuple):
         for start, stop in spans:
             chosen |= (rows["first"] <= stop) & (rows["last"] >= start)
         return self._select(chosen)
-
-    def under_one_label(self, label: str) -> IntervalTable:
-        """Returns the intervals of all labels under one label; these may overlap."""
-        rows = _unpacked(self.rows).copy()
-        rows["label"] = 0
-        return IntervalTable((label,) if rows.size else (), rows.tobytes())
 
     def longest(self, at_most: int) -> tuple[VisibleInterval, ...]:
         """Returns the longest intervals, the longest first; of equal ones the earliest first."""
@@ -249,7 +239,10 @@ def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTab
     if not rows.size:
         return IntervalTable()
     part = np.repeat(np.arange(len(tables)), [table.size for table in tables])
-    labels, label = _shared_labels(tables, part, rows["label"])
+    codes, words = joined_codes((_unpacked(table.rows)["label"], table.labels) for table in tables)
+    labels = tuple(sorted(words))
+    place = {label: at for at, label in enumerate(labels)}
+    label = np.array([place[word] for word in words], np.intp)[codes]
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
     first, ends, reach = rows["first"], rows["ends"], _running_end(label, rows["last"])
@@ -280,22 +273,6 @@ def _merge_runs(rows: IntervalRows, reach: Ints, goes_on: Flags) -> bytes:
     return intervals[np.lexsort((intervals["label"], intervals["first"]))].tobytes()
 
 
-def _shared_labels(
-    tables: Sequence[IntervalTable], part: NDArray[np.intp], label: NDArray[np.uint32]
-) -> tuple[tuple[str, ...], NDArray[np.intp]]:
-    """Returns the labels of all tables, sorted, and for each row the index of its label in them."""
-    labels = tuple(sorted({label for table in tables for label in table.labels}))
-    place = {label: at for at, label in enumerate(labels)}
-    places: list[int] = []
-    begins: dict[tuple[str, ...], int] = {}
-    for table in tables:
-        if table.labels not in begins:
-            begins[table.labels] = len(places)
-            places += [place[label] for label in table.labels]
-    begin = np.array([begins[table.labels] for table in tables], np.intp)
-    return labels, np.array(places, np.intp)[begin[part] + label]
-
-
 def _running_end(label: NDArray[np.intp], last: Ints) -> Ints:
     """Returns the latest end of each row and of those before it of its label; sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
@@ -305,8 +282,7 @@ def _running_end(label: NDArray[np.intp], last: Ints) -> Ints:
     rank[by_time] = np.arange(len(last))
     # Labels are whole tables apart, so that the running maximum starts again at each label.
     far = label * len(last)
-    latest: Ints = last[by_time[np.maximum.accumulate(rank + far) - far]]
-    return latest
+    return last[by_time[np.maximum.accumulate(rank + far) - far]]
 
 
 def _longest_pause(rows: IntervalRows) -> Ints:
@@ -315,8 +291,7 @@ def _longest_pause(rows: IntervalRows) -> Ints:
     # An object seen once has no known rate: it may have been missed for a moment, at most.
     usual = USUAL_PERIODS * spans // np.maximum(rows["count"].astype(np.int64) - 1, 1)
     pause = np.where(rows["count"] > 1, np.maximum(usual, SHORT_NS), FLICKER_NS)
-    longest: Ints = np.minimum(pause, SILENCE_NS)
-    return longest
+    return np.minimum(pause, SILENCE_NS)
 
 
 def _by_length(rows: IntervalRows) -> NDArray[np.intp]:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.core.arrays import Floats, Vectors
     from ros2_memory.storage.base import IntArray
-
-    Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
-    Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 
 class FrameCodes(NamedTuple):
@@ -89,25 +88,17 @@ def joined_poses(parts: Sequence[Poses]) -> Poses:
     parts = [part for part in parts if len(part)]
     if len(parts) < 2:
         return parts[0] if parts else NO_POSES
+    codes, words = joined_codes(part.frames for part in parts)
     whole = Poses(
         np.concatenate([part.times for part in parts]),
         np.concatenate([part.positions for part in parts]),
         np.concatenate([part.turns for part in parts]),
-        _joined_frames([part.frames for part in parts]),
+        FrameCodes(codes.astype(np.uint32), words),
         np.concatenate([part.speeds for part in parts]),
     )
     if (whole.times[1:] >= whole.times[:-1]).all():
         return whole
     return whole.rows(np.argsort(whole.times, kind="stable"))
-
-
-def _joined_frames(parts: Sequence[FrameCodes]) -> FrameCodes:
-    code_of: dict[str, int] = {}
-    codes = []
-    for part in parts:
-        new = [code_of.setdefault(word, len(code_of)) for word in part.words]
-        codes.append(np.array(new, np.uint32)[part.codes])
-    return FrameCodes(np.concatenate(codes), tuple(code_of))
 
 
 def headings(turns: Vectors) -> Floats:

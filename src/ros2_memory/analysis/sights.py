@@ -65,94 +65,37 @@ _NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
 
 
-class Spot(IntEnum):
-    """Columns of `Sights.spots`.
+Spot = IntEnum("Spot", "SLICE TOPIC LABEL N X Y Z DEV FIRST LAST BEST TOGETHER", start=0)
+"""Columns of `Sights.spots`.
 
-    `DEV` is the root mean square distance of the detections in the plane; `BEST` is -1 without
-    scores; `TOGETHER` is how many of the label at least three messages had at once, or all had.
-    """
+`DEV` is the root mean square distance of the detections in the plane; `BEST` is -1 without scores;
+`TOGETHER` is how many of the label at least three messages had at once, or all had.
+"""
 
-    SLICE = 0
-    TOPIC = 1
-    LABEL = 2
-    N = 3
-    X = 4
-    Y = 5
-    Z = 6
-    DEV = 7
-    FIRST = 8
-    LAST = 9
-    BEST = 10
-    TOGETHER = 11
+Look = IntEnum("Look", "SLICE TOPIC X Y YAW PAN N FIRST LAST Z", start=0)
+"""Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
 
+Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`. `PAN` is
+how far the detector was turned from the robot's heading, to `CELL_DECIDEG`.
+"""
 
-class Look(IntEnum):
-    """Columns of `Sights.looks`: the mean pose in one cell, and the number of messages.
+Hit = IntEnum("Hit", "SPOT LOOK N", start=0)
+"""Columns of `Sights.hits`: how many messages of a look have a detection of a spot."""
 
-    Messages for which the robot's pose is not known have a look of their own, with `NO_YAW`. `PAN`
-    is how far the detector was turned from the robot's heading, to `CELL_DECIDEG`.
-    """
+Score = IntEnum("Score", "SPOT BIN N", start=0)
+"""Columns of `Sights.scores`: how many detections of a spot have a score in a bin."""
 
-    SLICE = 0
-    TOPIC = 1
-    X = 2
-    Y = 3
-    YAW = 4
-    PAN = 5
-    N = 6
-    FIRST = 7
-    LAST = 8
-    Z = 9
+Beside = IntEnum("Beside", "SPOT LABEL N", start=0)
+"""Columns of `Sights.beside`: detections of a spot that had another label beside them."""
 
+Unplaced = IntEnum("Unplaced", "SLICE TOPIC LABEL N FIRST LAST", start=0)
+"""Columns of `Sights.unplaced`: detections of a label without a place."""
 
-class Hit(IntEnum):
-    """Columns of `Sights.hits`: how many messages of a look have a detection of a spot."""
+Fix = IntEnum("Fix", "SLICE TIME X Y YAW SIGMA", start=0)
+"""Columns of `Sights.fixes`: where odometry was in the map, and how exactly that was known.
 
-    SPOT = 0
-    LOOK = 1
-    N = 2
-
-
-class Score(IntEnum):
-    """Columns of `Sights.scores`: how many detections of a spot have a score in a bin."""
-
-    SPOT = 0
-    BIN = 1
-    N = 2
-
-
-class Beside(IntEnum):
-    """Columns of `Sights.beside`: detections of a spot that had another label beside them."""
-
-    SPOT = 0
-    LABEL = 1
-    N = 2
-
-
-class Unplaced(IntEnum):
-    """Columns of `Sights.unplaced`: detections of a label without a place."""
-
-    SLICE = 0
-    TOPIC = 1
-    LABEL = 2
-    N = 3
-    FIRST = 4
-    LAST = 5
-
-
-class Fix(IntEnum):
-    """Columns of `Sights.fixes`: where odometry was in the map, and how exactly that was known.
-
-    `SIGMA` is what the localiser says, for a point `AHEAD_MM` before the robot; -1 if it does not.
-    """
-
-    SLICE = 0
-    TIME = 1
-    X = 2
-    Y = 3
-    YAW = 4
-    SIGMA = 5
-
+`SIGMA` is what the localiser says, for a point `AHEAD_MM` before the robot; -1 if it does not.
+"""
 
 AHEAD_MM: Final = 2_000
 """Things are about so far away: so much do errors of heading weigh."""
@@ -490,8 +433,7 @@ def _labels_beside(detections: _Detections) -> tuple[Ints, Ints]:
 def _tallied(first: Ints, other: Ints) -> Ints:
     """Returns the distinct pairs, and how often there is each."""
     rows, nth = distinct_rows((first, other))
-    tally: Ints = np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
-    return tally
+    return np.column_stack((rows, np.bincount(nth, minlength=len(rows))))
 
 
 def _mm(metres: Floats) -> Ints:

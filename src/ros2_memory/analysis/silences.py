@@ -190,38 +190,22 @@ def _silences_of(
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
         while past < len(on) and on[past][1] <= start:
             past += 1
-        absence = _absence(start, stop, on[past:], limit, gaps)
-        if absence.pieces:
-            goes_on = start == last_heard and not absence.is_parted
-            (first, _), (_, last) = absence.pieces[0], absence.pieces[-1]
-            yield Silence(topic, first, last, absence.length, goes_on)
-
-
-class _Absence(NamedTuple):
-    """The times between two messages of a topic in which it is missed, and how long they are.
-
-    `is_parted`: the robot was off for more than `LONGEST_OFF_NS` meanwhile; what follows is none.
-    """
-
-    pieces: Sequence[Span]
-    length: Ns
-    is_parted: bool
-
-
-def _absence(start: Ns, stop: Ns, on: Sequence[Span], limit: Ns, gaps: Sequence[Span]) -> _Absence:
-    pieces: list[Span] = []
-    length, until, is_parted = 0, start, False
-    for on_from, on_to in on:
-        is_parted = on_from - until > LONGEST_OFF_NS
-        if on_from >= stop or is_parted:
-            break
-        until = on_to
-        first, last = max(on_from, start), min(on_to, stop)
-        recorded = last - first - length_in(gaps, first, last)
-        if recorded > limit:
-            pieces.append((first, last))
-            length += recorded
-    return _Absence(pieces, length, is_parted)
+        missed: list[Span] = []
+        length, until, is_parted = 0, start, False
+        for on_from, on_to in on[past:]:
+            # What follows so long a time is another robot's, perhaps.
+            is_parted = on_from - until > LONGEST_OFF_NS
+            if on_from >= stop or is_parted:
+                break
+            until = on_to
+            first, last = max(on_from, start), min(on_to, stop)
+            recorded = last - first - length_in(gaps, first, last)
+            if recorded > limit:
+                missed.append((first, last))
+                length += recorded
+        if missed:
+            goes_on = start == last_heard and not is_parted
+            yield Silence(topic, missed[0][0], missed[-1][1], length, goes_on)
 
 
 def length_in(gaps: Sequence[Span], first: Ns, last: Ns) -> Ns:

@@ -14,13 +14,13 @@ import numpy as np
 
 from ros2_memory.analysis.facts import ERROR, LABEL, REPORT, STATES
 from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, visible_in
+from ros2_memory.core.arrays import joined_codes
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from ros2_memory.analysis.facts import Stated, Word
-    from ros2_memory.core.arrays import Ints
+    from ros2_memory.analysis.facts import Stated
 
 MAX_PER_BAG: Final = 64
 """Intervals, changes and errors of one topic in one bag that a lake holds; the rest is counted."""
@@ -180,34 +180,22 @@ def joined_events(parts: Sequence[TopicEvents]) -> TopicEvents | None:
 def _states_and_changes(stated: Stated) -> tuple[tuple[KnownState, ...], tuple[Change, ...]]:
     """Returns what each state was first and last, and its changes."""
     facts = stated.facts.of_kinds(STATES)
-    if not facts.rows.size:
-        return (), ()
-    ids: dict[tuple[str, ...], int] = {}
-    of_code = np.array([ids.setdefault(word[:2], len(ids)) for word in facts.words], np.int64)
-    name = of_code[facts.codes]
-    order = np.argsort(name, kind="stable")
-    begins = np.flatnonzero(np.diff(name[order], prepend=-1))
+    names, _ = joined_codes([(facts.codes, [word[:2] for word in facts.words])])
+    order = np.argsort(names, kind="stable")
     values = facts.values.astype(np.int64)
-    is_change = np.diff(values[order], prepend=0) != 0
-    is_change[begins] = False
-    times = stated.times[facts.rows]
-
-    def listed(nth: Ints) -> list[tuple[Word, Ns, int]]:
-        words = [facts.words[code] for code in facts.codes[nth].tolist()]
-        return [*zip(words, times[nth].tolist(), values[nth].tolist(), strict=True)]
-
-    first = order[begins]
-    last = values[order[np.append(begins[1:], order.size) - 1]][np.argsort(first)].tolist()
-    states = zip(listed(np.sort(first)), last, strict=True)
-    return (
-        tuple(
-            KnownState(*word[:2], at, value, end, word.text) for (word, at, value), end in states
-        ),
-        tuple(
-            Change(*word[:2], at, value, word.text)
-            for word, at, value in listed(np.sort(order[is_change]))
-        ),
-    )
+    is_new = (np.diff(names[order], prepend=-1) != 0) | (np.diff(values[order], prepend=0) != 0)
+    news = np.sort(order[is_new])
+    columns = facts.codes[news], stated.times[facts.rows[news]], values[news]
+    states: dict[tuple[str, str], KnownState] = {}
+    changes: list[Change] = []
+    for code, at, value in zip(*(column.tolist() for column in columns), strict=True):
+        kind, name, text = facts.words[code]
+        if (kind, name) in states:
+            changes.append(Change(kind, name, at, value, text))
+            states[kind, name] = states[kind, name]._replace(last=value)
+        else:
+            states[kind, name] = KnownState(kind, name, at, value, value, text)
+    return tuple(states.values()), tuple(changes)
 
 
 def _joined_states(

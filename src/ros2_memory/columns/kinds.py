@@ -8,8 +8,7 @@ from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
 from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
-from ros2_memory.analysis.motion.speed_drops import SpeedDrop
-from ros2_memory.analysis.motion.standstills import Blocks, Stands
+from ros2_memory.analysis.motion.standstills import Blocks, SpeedDrop, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import FrameCodes, Poses
 from ros2_memory.analysis.topic_events import (

@@ -19,7 +19,6 @@ from ros2_memory.columns.values import UnknownShapeError
 from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.extract import (
     FRAME,
-    HEADINGS,
     POSE_FRAMES,
     UNMAPPED,
     Plan,
@@ -27,13 +26,13 @@ from ros2_memory.extract import (
     PointPose,
     SchemaExtractor,
 )
-from ros2_memory.messages.conversions import Route, Segments
 from ros2_memory.storage.base import SEQUENCE, Definition, IntArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.values import Floats
+    from ros2_memory.messages.conversions import Segments
 
     Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
@@ -173,20 +172,13 @@ def _columns_of(plan: Plan, definition: Definition) -> _Columns:
 
 def _pose(plan: Plan, definition: Definition) -> _Columns | None:
     """Returns the paths of the first route by which messages of a type have a pose."""
-    routes = [*plan.poses]
-    if plan is UNMAPPED:
-        names = [entry.name for entry in definition.fields]
-        heading = next((name for name in HEADINGS if name in names), None)
-        if heading is not None:
-            routes.append(PlanarPose(*map(Route, ("x", "y", "z", heading))))
-    for route in routes:
-        pose = (
-            _planar(route, definition)
-            if isinstance(route, PlanarPose)
-            else _point(route, definition)
-        )
-        if pose is not None:
-            return pose
+    for route in plan.poses:
+        if isinstance(route, PlanarPose):
+            paths = _planar(route, definition)
+        else:
+            paths = _point(route, definition)
+        if paths is not None:
+            return paths
     return None
 
 
@@ -205,9 +197,9 @@ def _point(route: PointPose, definition: Definition) -> _Columns | None:
 
 def _planar(route: PlanarPose, definition: Definition) -> _Columns | None:
     routes = (route.x, route.y, route.z, route.heading)
-    fields = (_field_at(definition, axis.segments) for axis in routes)
+    fields = [_field_at(definition, axis.segments) for axis in routes]
     x, y, z, heading = (entry.path if entry and entry.is_number else "" for entry in fields)
-    if not x or not y:
+    if not x or not y or (route.is_needed and fields[-1] is None):
         return None
     return _Columns((x, y, z) if z else (x, y), (heading,) if heading else ())
 

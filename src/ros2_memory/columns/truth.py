@@ -185,7 +185,7 @@ class _LeafTest(NamedTuple):
         test: what is asked.
         leaf: on which leaf.
         limits: where that stands in the value.
-        is_element: whether `Contains.has_element` looks at it.
+        is_element: whether it is what a field leads to, or an element of that.
         least_score: for texts that are JSON.
     """
 
@@ -217,9 +217,9 @@ class _LeafTest(NamedTuple):
 
     def passes(self, value: bool | str) -> bool:
         """Returns whether a boolean or a text passes."""
-        if self.test.matches(value):
+        if self.test.passes(value):
             return True
-        return isinstance(self.test, Contains) and self.is_element and self.test.has_element(value)
+        return isinstance(self.test, Contains) and self.is_element and self.test.equal.passes(value)
 
     def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
         """Returns whether some value may pass, as far as it is known without reading any."""

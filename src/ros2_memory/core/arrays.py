@@ -10,16 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Hashable, Iterable, Sequence
 
     from _typeshed import DataclassInstance
 
 T = TypeVar("T", bound="DataclassInstance")
 Scalar = TypeVar("Scalar", bound="np.generic[object]")
+Word = TypeVar("Word", bound="Hashable")
 Ints: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
 
+Codes: TypeAlias = "Ints | NDArray[np.uint32]"
+
 Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
+Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 _MOST_KEYS: Final = 2**62
 _EVERY_BYTE: Final = (1,)
@@ -72,6 +76,16 @@ def stacked(tables: Sequence[T]) -> T:
     names = [column.name for column in fields(first)]
     columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in names}
     return replace(first, **columns)
+
+
+def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, tuple[Word, ...]]:
+    """Returns codes one after the other, by one list of words in place of one for each part."""
+    code_of: dict[Word, int] = {}
+    codes = [np.empty(0, np.int64)]
+    for old, words in parts:
+        recoded = [code_of.setdefault(word, len(code_of)) for word in words]
+        codes.append(np.array(recoded, np.int64)[old])
+    return np.concatenate(codes), tuple(code_of)
 
 
 def merged_times(parts: Sequence[Ints]) -> tuple[Ints, Ints, list[Ints]]:

@@ -199,27 +199,6 @@ def _bin_name(number: int, by: ClockBin) -> str:
     return _WEEKDAYS[number] if by == "weekday" else f"{number:02d}:00"
 
 
-@dataclass(frozen=True, slots=True)
-class TrueIntervals:
-    """Intervals in which something was true, in order.
-
-    Attributes:
-        starts: when each began.
-        stops: when it ended.
-        begun: whether it is known that each began then; else it held before, or that is not known.
-    """
-
-    starts: Ints
-    stops: Ints
-    begun: Flags
-
-    @classmethod
-    def of(cls, spans: Sequence[tuple[Ns, Ns, bool]]) -> TrueIntervals:
-        """Returns intervals of their starts, stops, and whether each is known to begin there."""
-        starts, stops, begun = zip(*spans, strict=True) if spans else ((), (), ())
-        return cls(np.array(starts, np.int64), np.array(stops, np.int64), np.array(begun, np.bool_))
-
-
 def first_of_days(bins: TimeBins, times: ArrayLike) -> list[tuple[int, Ns]]:
     """Returns the local days that have some of these times, in order, each with its first one.
 
@@ -398,15 +377,19 @@ class BinnedWindow:
         counts = self.bins.membership(times).sum(axis=0)
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
-    def add_held(self, held: TrueIntervals) -> None:
+    def add_held(self, held: Sequence[tuple[Ns, Ns, bool]]) -> None:
         """Adds how often something began, its first and last time, and how long it held.
 
         That is without gaps, in which it may have held on, or begun and ended.
+
+        Args:
+            held: from when to when, in order, and whether it is known to have begun then; else it
+                held before, or that is not known.
         """
-        inside = (held.stops >= self.counted.start) & (held.starts < self.counted.stop)
-        starts = held.starts[inside].clip(*self._counted_bounds)
-        stops = held.stops[inside].clip(*self._counted_bounds)
-        begins = starts[held.begun[inside]]
+        starts, stops, begun = np.array(held, np.int64).reshape(-1, 3).T
+        inside = (stops >= self.counted.start) & (starts < self.counted.stop)
+        starts, stops = (times[inside].clip(*self._counted_bounds) for times in (starts, stops))
+        begins = starts[begun[inside] > 0]
         self.add_counts("count", begins)
         lasting = united(zip(starts.tolist(), stops.tolist(), strict=True))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))

@@ -1,4 +1,4 @@
-"""How often and how long a condition held in each bin of a window.
+"""How often and how long a condition held in each bin of a window, or each label or value did.
 
 What counts as once:
 
@@ -10,41 +10,86 @@ What counts as once:
   a least score, by its detections.
 - Any other condition, also a text that is no label, holds in sightings, as `find_matches` returns
   them; these are read.
+- By value, what a topic held from one message to the next that says otherwise.
 """
 
 from __future__ import annotations
 
+import heapq
+import json
+from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+
+import numpy as np
 
 from ros2_memory.analysis.conditions import Condition, Contains, Equals
 from ros2_memory.analysis.facts import FLAG, has_errors, has_events
-from ros2_memory.analysis.intervals import IntervalPart, IntervalTable, joined, united
+from ros2_memory.analysis.intervals import (
+    FLICKER_NS,
+    IntervalPart,
+    IntervalTable,
+    VisibleInterval,
+    joined,
+    united,
+    visible_in,
+)
 from ros2_memory.analysis.topic_events import TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.text import listed
-from ros2_memory.counts.bins import BinnedWindow, By, TrueIntervals
-from ros2_memory.counts.held import ANY_LABEL, BY_LABEL, LabelReader, count_labels, count_values
+from ros2_memory.core.spans import united as united_spans
+from ros2_memory.core.spans import without
+from ros2_memory.core.text import Quoted, counted, listed, named, shortened
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.counts.bins import BinnedWindow, By
+from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.context import READING_S, Call, Memory
-from ros2_memory.history.coverage import reached
-from ros2_memory.history.held_values import held_at, held_until, is_text
-from ros2_memory.history.no_data import matching_topics, require_recorded
+from ros2_memory.history.coverage import (
+    note_edges,
+    note_unread,
+    reached,
+    recorded_reach,
+    recording_gaps,
+    seconds,
+    unix_text,
+)
+from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
+from ros2_memory.history.held_values import Held, HeldValues, held_at, held_until, is_text
+from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
 from ros2_memory.history.reverse_search import condition_of
-from ros2_memory.history.robots import note_robots_on
+from ros2_memory.history.robots import note_robots, note_robots_on
+from ros2_memory.history.scan import blocks, scan
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
+from ros2_memory.results import BinColumn, Bins
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
+    from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.results import Bins
 
+    _TrueSpans: TypeAlias = list[tuple[Ns, Ns, bool]]
+    """From when to when something was true, and whether it is known to have begun then."""
+
+BY_LABEL: Final = "label"
+ANY_LABEL: Final = ""
+"""What `contains` takes for every label."""
+_MOST_LABELS: Final = 60
+_TEXT: Final = "std_msgs/msg/String"
+_COLUMNS: Final[tuple[tuple[str, BinColumn], ...]] = (
+    ("count", "count"),
+    ("seconds", "duration"),
+    ("first", "time"),
+    ("last", "time"),
+    ("best_score", "number"),
+    ("most_at_once", "count"),
+)
 _TRUTHS = {"true": True, "false": False}
 
 
@@ -100,8 +145,7 @@ def count_matches(
     if isinstance(condition.test, Contains | Equals):
         held, since = _held_by_events(binned, topics, condition, value, scope)
     if held is None:
-        spans, since = read_sightings(view, topic, condition, scope)
-        held = TrueIntervals.of(spans)
+        held, since = read_sightings(view, topic, condition, scope)
     binned.count_since(since)
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
@@ -137,7 +181,7 @@ def _held_by_events(
     condition: Condition,
     value: JsonValue,
     scope: Scope,
-) -> tuple[TrueIntervals | None, Ns | None]:
+) -> tuple[_TrueSpans | None, Ns | None]:
     """Returns when a boolean or a label held in a scope, and since when that is known.
 
     None where the condition is on neither.
@@ -161,14 +205,12 @@ def _held_by_events(
         return None, None
     _note_uncounted(view, topic, parts)
     counted, end = _in_scope(spans, scope)
-    return TrueIntervals.of(counted), since if end is None else end
+    return counted, since if end is None else end
 
 
-def _in_scope(
-    spans: Sequence[tuple[Ns, Ns, bool]], scope: Scope
-) -> tuple[list[tuple[Ns, Ns, bool]], Ns | None]:
+def _in_scope(spans: _TrueSpans, scope: Scope) -> tuple[_TrueSpans, Ns | None]:
     """Returns the parts of spans in a scope, and since when they are known, if time is over."""
-    counted: list[tuple[Ns, Ns, bool]] = []
+    counted: _TrueSpans = []
     try:
         for start, stop, is_begun in reversed(spans):
             parts = scope.parts_of(start, stop)
@@ -228,13 +270,13 @@ def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> Non
 
 def _label_held(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
-) -> tuple[TrueIntervals | None, Ns | None]:
+) -> tuple[_TrueSpans | None, Ns | None]:
     """Returns when a thing with a label was in view; None where no label meets a condition."""
-    view, matches = binned.view, condition.test.matches
+    view, matches = binned.view, Condition(condition.test).matches
     if scope.is_bounded or condition.min_score or len(topics) > 1:
         reader = LabelReader(view, scope, condition)
         reader.read(topics, matches)
-        visible, since = united(reader.visible), reader.since
+        visible, since = reader.visible, reader.since
     else:
         events, since = _events_in_order(view, topics[0], binned.counted)
         parts = [
@@ -259,9 +301,8 @@ def _label_held(
             f"{listed(texts)} has detections as JSON: by counts their labels, and no other texts"
         )
     # Each label's first: only of one label it is known whether a message lay between.
-    intervals = united([visible.under_one_label("")]).intervals()
-    held = [(interval.first, interval.last, True) for interval in intervals]
-    return TrueIntervals.of(held), since
+    of_any = ((interval.first, interval.last) for interval in visible.intervals())
+    return [(first, last, True) for first, last in united_spans(of_any, FLICKER_NS)], since
 
 
 def _flag_held(
@@ -272,7 +313,7 @@ def _flag_held(
     before: bool | None,
     *,
     wanted: bool,
-) -> list[tuple[Ns, Ns, bool]] | None:
+) -> _TrueSpans | None:
     """Returns when a boolean held, in order; None where it is not clear which boolean is meant.
 
     `before`: whether it held when the window began, where an earlier message says so.
@@ -326,11 +367,9 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     ]
 
 
-def _without_gaps(
-    start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]
-) -> list[tuple[Ns, Ns, bool]]:
+def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]) -> _TrueSpans:
     """Returns a time without the gaps in it; what comes after a gap is not known to begin there."""
-    parts: list[tuple[Ns, Ns, bool]] = []
+    parts: _TrueSpans = []
     for begin, end in gaps:
         if end < start or begin >= stop:
             continue
@@ -338,3 +377,265 @@ def _without_gaps(
             parts.append((start, begin, is_begun))
         start, is_begun = end, False
     return [*parts, (start, stop, is_begun)] if start < stop or not parts else parts
+
+
+def count_labels(
+    view: View,
+    topic: str,
+    condition: Condition,
+    value: JsonValue,
+    scope: Scope,
+    *,
+    asked: TimeWindow,
+) -> Bins:
+    """Returns a row for each label that meets a condition, those seen most often first.
+
+    Args:
+        view: what is searched.
+        topic: the detectors' topic, or a glob.
+        condition: on the labels; its least score holds for each detection.
+        value: of the condition; `ANY_LABEL` takes every label.
+        scope: when detections count.
+        asked: the window that was asked for, of which notes say what the memory does not have.
+
+    Raises:
+        InvalidArgumentsError: the condition is not on texts, or names a field.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    test = condition.test
+    if not isinstance(test, Contains | Equals) or condition.field is not None:
+        raise InvalidArgumentsError(
+            "by label takes labels of detections: give condition_type contains or equals, the "
+            f'label as value ("{ANY_LABEL}" for all), and no field'
+        )
+    topics = matching_topics(view, topic)
+    reader = LabelReader(view, scope, condition)
+    reader.read(topics, lambda label: value == ANY_LABEL or test.passes(label))
+    if reader.since is not None:
+        view.notes.add_lack(
+            f"not all before {unix_text(reader.since)} is counted: "
+            f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
+        )
+    window = scope.window if reader.since is None else replace(scope.window, start=reader.since)
+    intervals, elapsed = reader.visible.intervals(), elapsed_in(view, window)
+    of_label: defaultdict[str, list[VisibleInterval]] = defaultdict(list)
+    for interval in intervals:
+        of_label[interval.label].append(interval)
+    rows = [
+        (named(label), _row(own, elapsed, reader.most_at_once[label]))
+        for label, own in of_label.items()
+    ]
+    rows.sort(key=lambda row: (-(row[1][0] or 0), row[0]))
+    note_robots_on(view, topics, window)
+    note_unread(view, asked, nothing=not rows, search=True)
+    note_edges(view, asked)
+    if unknown := elapsed.among(scope.unknown):
+        view.notes.add(
+            f"for {seconds(unknown)} it is not known whether what was seen counts: without poses, "
+            "or without messages of the other topic"
+        )
+    texts = [topic for topic in topics if view.timeline.types_of(topic) == (_TEXT,)]
+    if texts and not rows:
+        view.notes.add(
+            f"{listed(texts)} has texts: by label counts those that are JSON, an object with a "
+            "label or a list of such, alone or in an object, and nothing deeper; leave by out to "
+            "search texts"
+        )
+    if len(rows) > _MOST_LABELS:
+        view.notes.add(f"the {_MOST_LABELS} of {len(rows)} labels that were seen most often")
+    start, end = asked.asked()
+    first, last = recorded_reach(view.snapshot, asked) or (start, end)
+    return Bins(
+        by=BY_LABEL,
+        about=tuple(topics),
+        start=min(max(start, reader.since or first), end),
+        end=max(min(end, last), start),
+        columns=_COLUMNS,
+        rows=tuple(rows[:_MOST_LABELS]),
+        all=_row(intervals, elapsed, reader.most_at_once_of_all),
+        notes=view.notes.sentences(),
+    )
+
+
+class LabelReader:
+    """Reads what counts, the newest first: detections in a scope, of a condition's least score.
+
+    Attributes:
+        visible: when labels were in view.
+        most_at_once: of each label, how many one message has at most.
+        most_at_once_of_all: of all labels together.
+        since: back to when all was read, where the time was over before; else None.
+    """
+
+    def __init__(self, view: View, scope: Scope, condition: Condition) -> None:
+        self.visible = IntervalTable()
+        self.most_at_once: Counter[str] = Counter()
+        self.most_at_once_of_all = 0
+        self.since: Ns | None = None
+        self._view = view
+        self._scope = scope
+        self._least_score = condition.least_score if condition.min_score > 0 else -np.inf
+
+    def read(self, topics: Sequence[str], wanted: Callable[[str], bool]) -> None:
+        """Reads the detections of topics whose labels are wanted."""
+        reading = self._view.call.partial_after(READING_S)
+        reached: Ns | None = None
+        found: list[dict[str, list[IntervalPart]]] = []
+        try:
+            for window in self._scope.narrowed():
+                found.append(defaultdict(list))
+                sources = (_detection_blocks(self._view, topic, window) for topic in topics)
+                for topic, detected in heapq.merge(*sources, key=lambda of: -of[1].log_times[-1]):
+                    part = self._read_block(detected, wanted)
+                    found[-1][topic].append(part)
+                    reached = part.first if len(topics) == 1 else part.last
+                    if reading.expired():
+                        raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
+        except QueryTimeoutError:
+            if reached is None:
+                raise
+            self.since = reached
+        self.visible = united(
+            [joined(parts[::-1]).visible for of_window in found for parts in of_window.values()]
+        )
+
+    def _read_block(self, detected: Detected, wanted: Callable[[str], bool]) -> IntervalPart:
+        """Returns when wanted labels were in view in a block, by detections that count.
+
+        How many of each one message has is taken up into `most_at_once`.
+        """
+        times, detections = detected.log_times, detected.found
+        is_wanted = np.array([wanted(word) for word in detections.labels.words], np.bool_)
+        counts = is_wanted[detections.labels.codes] & ~(detections.scores < self._least_score)
+        if self._scope.is_bounded:
+            # The newest first, as it reads what the other topic said.
+            holds = [self._scope.holds_at(time) for time in times[::-1].tolist()]
+            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+        rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+        labels = detections.labels.words
+        if rows.size:
+            pairs, counts_at_once = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
+            for code, at_once in zip(pairs[1].tolist(), counts_at_once.tolist(), strict=True):
+                self.most_at_once[labels[code]] = max(self.most_at_once[labels[code]], at_once)
+            self.most_at_once_of_all = max(self.most_at_once_of_all, int(np.bincount(rows).max()))
+        visible = visible_in(times, rows, codes, detections.scores[counts], labels)
+        return IntervalPart(int(times[0]), int(times[-1]), visible)
+
+
+def _detection_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[str, Detected]]:
+    """Yields the messages of a topic in blocks that do not overlap, the newest first."""
+    reader = DetectionRows(view)
+    left_out = 0
+    for overlapping in blocks(scan(view, topic, window, newest_first=True), newest_first=True):
+        detected = joined_detected([reader.of(rows) for rows in overlapping])
+        left_out += sum(map(len, overlapping)) - detected.log_times.size
+        if detected.log_times.size:
+            yield topic, detected
+    if left_out:
+        view.notes.add_lack(f"messages of {topic} that could not be decoded: {left_out}")
+
+
+def _row(
+    intervals: Sequence[VisibleInterval], elapsed: Elapsed, most_at_once: int
+) -> tuple[float | None, ...]:
+    """Returns the values of `_COLUMNS` for intervals; for how long any of them lasted."""
+    spans = united_spans((interval.first, interval.last) for interval in intervals)
+    return (
+        len(intervals),
+        elapsed.among(spans),
+        spans[0][0] if spans else None,
+        spans[-1][1] if spans else None,
+        max((interval.best for interval in intervals if interval.best is not None), default=None),
+        most_at_once,
+    )
+
+
+_MOST_VALUES: Final = 100
+_LONGEST_VALUE: Final = 120
+
+
+def count_values(
+    view: View,
+    topic: str,
+    asked: TimeWindow,
+    *,
+    fields: Sequence[str] = (),
+    condition: Condition | None = None,
+) -> Bins:
+    """Returns a row for each value that held at some time of a window, that of the longest first.
+
+    What lies outside of the window, or in a gap, counts to no length. An empty text is no value.
+
+    Args:
+        view: the call's.
+        topic: its name.
+        asked: the window.
+        fields: the field of the messages that is meant, if it is not all that they have.
+        condition: what values have to meet, if there is one.
+
+    Raises:
+        InvalidArgumentsError: more than one field is named, or there is no single value.
+        NoDataError: the topic said nothing in the window.
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    if len(fields) > 1:
+        raise InvalidArgumentsError("by value counts one field: name one in fields")
+    values = HeldValues(view, topic, *fields, asked="by value", until=asked.stop)
+    start, end = asked.asked()
+    first, last = recorded_reach(view.snapshot, asked) or (start, end)
+    start, stop = max(start, first), min(end, last) + 1
+    try:
+        values_held = values.during(start, stop)
+    except QueryTimeoutError as error:
+        # What is newer is known all the same.
+        values_held = values.known[::-1]
+        if not values_held:
+            raise
+        start = values.reached
+        view.notes.add_lack(f"only what is after {unix_text(start)} is counted: {error}")
+    if not values_held:
+        raise no_data_between(view, (topic,), asked)
+    outside = [(MIN_NS, start), *recording_gaps(view, TimeWindow(start, stop)), (stop, MAX_NS)]
+    rows = _value_rows(values_held, elapsed_in(view, asked), united_spans(outside), condition)
+    if len(rows) > _MOST_VALUES:
+        more = counted(len(rows) - _MOST_VALUES, "value")
+        view.notes.add(f"{more} that held for a shorter time are left out; all counts them, too")
+    note_unread(view, asked)
+    note_edges(view, asked)
+    note_robots(view, topic, asked)
+    return Bins(
+        by="value",
+        about=(topic,),
+        start=start,
+        end=stop - 1,
+        columns=(("count", "count"), ("seconds", "duration"), ("first", "time"), ("last", "time")),
+        rows=tuple(rows[:_MOST_VALUES]),
+        all=(
+            sum(count for _, (count, *_) in rows),
+            sum(length for _, (_, length, *_) in rows),
+            min((first for _, (*_, first, _) in rows), default=None),
+            max((last for _, (*_, last) in rows), default=None),
+        ),
+        notes=view.notes.sentences(),
+    )
+
+
+def _value_rows(
+    values: Sequence[Held], elapsed: Elapsed, outside: Spans, condition: Condition | None
+) -> list[tuple[str, tuple[int, Ns, Ns, Ns]]]:
+    """Returns for each value that counts how often and how long it held, that of the longest first.
+
+    Its length leaves out some times. With it when it first began, and when it last ended.
+    """
+    by_word: defaultdict[str, list[Held]] = defaultdict(list)
+    for held in values:
+        by_word[held.word].append(held)
+    rows = []
+    for times in by_word.values():
+        value = times[0].value
+        if times[0].is_blank or (condition and not condition.matches({"value": times[0].exact})):
+            continue
+        name = shortened(value if isinstance(value, str) else json.dumps(value), _LONGEST_VALUE)
+        length = elapsed.among(without([(held.start, held.stop) for held in times], outside))
+        rows.append((Quoted(name), (len(times), length, times[0].start, times[-1].stop)))
+    return sorted(rows, key=lambda row: (-row[1][1], row[1][2]))

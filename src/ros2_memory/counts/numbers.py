@@ -11,7 +11,6 @@ import math
 import sys
 from bisect import bisect_right
 from collections import defaultdict
-from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -25,7 +24,7 @@ from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, Un
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
-from ros2_memory.counts.held import count_values
+from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
@@ -37,9 +36,7 @@ from ros2_memory.history.view import TimeRange, View, open_span
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from ros2_memory.columns.outline import Totals
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.results import BinColumn, Bins
     from ros2_memory.storage.base import Definition, IntArray
 
@@ -73,6 +70,11 @@ class Extreme(NamedTuple):
     first: Ns
     last: Ns
 
+    @classmethod
+    def known(cls, number: float, at: Ns) -> Extreme:
+        """Returns a number that is known, times the sign, and so is its message."""
+        return cls(number, number, at, at)
+
     @property
     def is_settled(self) -> bool:
         """Whether the number and its first message are known."""
@@ -104,21 +106,7 @@ class Part(NamedTuple):
     greatest: Extreme
 
 
-class _OutlineNumbers(NamedTuple):
-    """What an outline states of a column: its totals, and its least and greatest number."""
-
-    totals: Totals
-    ends: tuple[Extreme, Extreme]
-
-
-class _Least(NamedTuple):
-    """The least number, times the sign, and the log time of the first message that holds it."""
-
-    number: float
-    first: Ns
-
-
-_NO_NUMBER: Final = _Least(math.inf, MAX_NS)
+_NO_NUMBER: Final = Extreme.known(math.inf, MAX_NS)
 
 
 class PieceNumbers:
@@ -198,13 +186,11 @@ class PieceNumbers:
         )
         least = _NO_NUMBER
         for extreme in candidates:
-            if extreme.low > least.number:
+            if extreme.low > least.low:
                 break
-            if extreme.low == least.number and extreme.first >= least.first:
-                continue
-            exact = self._exact_extreme(field, sign, extreme)
-            least = min(least, _Least(exact.high, exact.first))
-        return (least.number * sign, least.first) if candidates else None
+            if extreme.low < least.low or extreme.first < least.first:
+                least = min(least, self._exact_extreme(field, sign, extreme))
+        return (least.low * sign, least.first) if candidates else None
 
     def _add_newer_than(self, at: Ns) -> None:
         """Adds what no table that is left overlaps; ends the scan where the time is over."""
@@ -222,17 +208,15 @@ class PieceNumbers:
         is_cut = piece != bisect_right(self._edges, rows.last)
         if rows.index is not None or is_cut or rows.first < since:
             return False
-        outlines = [self._outline_numbers(rows, field) for field in range(len(self._fields))]
-        stated = [outline for outline in outlines if outline is not None]
+        outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
+        stated = [part for part in outlines if part is not None]
         if len(stated) < len(outlines):
             return False
-        for field, (totals, ends) in enumerate(stated):
-            total = totals.total * SUM_SCALE
-            part = Part(rows.first, rows.last, totals.size, total, *ends)
+        for field, part in enumerate(stated):
             self._parts[field, piece].append(part)
         return True
 
-    def _outline_numbers(self, rows: Rows, field: int) -> _OutlineNumbers | None:
+    def _outlined(self, rows: Rows, field: int) -> Part | None:
         """Returns the numbers of a field by the outline of a table; None where it has none."""
         table = rows.table
         if not isinstance(table, StoredTable) or table.definition is None:
@@ -248,7 +232,7 @@ class PieceNumbers:
             return None
         least = Extreme(zone.low, zone.low, *totals.least)
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
-        return _OutlineNumbers(totals, (least, greatest))
+        return Part(rows.first, rows.last, totals.size, totals.total * SUM_SCALE, least, greatest)
 
     def _add(self, rows: Rows, since: Ns) -> None:
         """Adds the numbers of a table from a log time on."""
@@ -278,7 +262,7 @@ class PieceNumbers:
     ) -> None:
         """Adds the numbers of each field in some rows to pieces, which are as `_pieces` yields."""
         outlines = [
-            self._outline_numbers(rows, field) if rows.index is None else None
+            self._outlined(rows, field) if rows.index is None else None
             for field in range(len(numbers_of_fields))
         ]
         for piece, start, stop in pieces:
@@ -312,29 +296,22 @@ class PieceNumbers:
         if self._most_read is not None and self._read > self._most_read:
             raise TooManyError
         for bag, positions in rows.bag_rows():
-            samples_by_time = [
-                (message.time, sample)
-                for message in messages_of(self._view, rows.some(positions))
-                if (sample := self._sample(message)) is not None
-            ]
-            if not samples_by_time:
-                continue
-            times = np.array([time for time, _ in samples_by_time], np.int64)
-            table = Table(rows.table.channel, times, times, times)
-            read = Rows(BagUnit(bag, table, 0), lambda: None)
-            samples = [
-                [sample[nth] for _, sample in samples_by_time] for nth in range(len(self._fields))
-            ]
-            numbers_of_fields = [*map(_numbers_of_samples, samples)]
-            self._add_to_pieces(read, numbers_of_fields, self._pieces(read, since))
-
-    def _sample(self, stored: StoredMessage) -> list[list[float]] | None:
-        """Returns the numbers of each field in a message; None where it cannot be decoded."""
-        message = self._view.bags.decode(stored, self.failures)
-        if message is None:
-            return None
-        at = partial(self._view.extractor.exact_at, message, stored.type)
-        return [[*numbers_in(at(field))] for field in self._fields]
+            decoded_times: list[Ns] = []
+            samples: list[list[list[float]]] = [[] for _ in self._fields]
+            for stored in messages_of(self._view, rows.some(positions)):
+                message = self._view.bags.decode(stored, self.failures)
+                if message is None:
+                    continue
+                decoded_times.append(stored.time)
+                for field, of_field in zip(self._fields, samples, strict=True):
+                    value = self._view.extractor.exact_at(message, stored.type, field)
+                    of_field.append([*numbers_in(value)])
+            if decoded_times:
+                times = np.array(decoded_times, np.int64)
+                table = Table(rows.table.channel, times, times, times)
+                read = Rows(BagUnit(bag, table, 0), lambda: None)
+                numbers_of_fields = [*map(_numbers_of_samples, samples)]
+                self._add_to_pieces(read, numbers_of_fields, self._pieces(read, since))
 
     def _exact_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme:
         """Returns an extreme with its number and message known; by the bags where it is open."""
@@ -350,8 +327,7 @@ class PieceNumbers:
                     "out of time before bags were read for the exact least and greatest numbers: "
                     f"those of {self._fields[field]} may be off in their last digits"
                 )
-            number, first = extreme.middle, extreme.first
-            self._exact_extremes[key] = exact or Extreme(number, number, first, first)
+            self._exact_extremes[key] = exact or Extreme.known(extreme.middle, extreme.first)
         return self._exact_extremes[key]
 
     def _extreme_in_bags(self, field: int, sign: int, extreme: Extreme) -> Extreme | None:
@@ -360,60 +336,39 @@ class PieceNumbers:
         is_number_known = extreme.low == extreme.high and least.first == MAX_NS
         if is_number_known and len(undecided) == 1 == len(undecided[0]):
             # Of all messages only this one can have the number.
-            at = int(undecided[0].times[0])
-            return Extreme(extreme.low, extreme.low, at, at)
+            return Extreme.known(extreme.low, int(undecided[0].times[0]))
         for rows in sorted(undecided, key=lambda rows: int(rows.times[0])):
-            if least.number <= extreme.low and least.first <= int(rows.times[0]):
+            if least.low <= extreme.low and least.first <= int(rows.times[0]):
                 break
             if self._reading.expired():
                 raise QueryTimeoutError("the rest is left out")
             for _, decoded in decoded_rows(self._view, rows):
                 stored = numbers(decoded.table, self._fields[field], self._view.extractor)
                 if stored is not None:
-                    counting = _numbers_that_count(stored, decoded)
-                    least = min(least, _least_of(decoded, counting, sign))
-        if least.first == MAX_NS:
-            return None
-        return Extreme(least.number, least.number, least.first, least.first)
+                    least = min(least, _least(decoded, _numbers_that_count(stored, decoded), sign))
+        return None if least == _NO_NUMBER else least
 
     def _least_in_columns(
         self, field: int, sign: int, extreme: Extreme
-    ) -> tuple[_Least, list[Rows]]:
+    ) -> tuple[Extreme, list[Rows]]:
         """Returns an extreme as far as columns have exact numbers, and rows that bags decide."""
         least = _NO_NUMBER
         undecided: list[Rows] = []
         for rows in scan(self._view, self._topic, TimeWindow(extreme.first, extreme.last + 1)):
             stored = numbers(rows.table, self._fields[field], self._view.extractor)
             if stored is not None and (not stored.error or stored.exactly is not None):
-                least = min(least, _least_of(rows, _numbers_that_count(stored, rows), sign))
-            else:
-                undecided += _by_bag(rows, _candidates(rows, stored, sign, extreme))
+                least = min(least, _least(rows, _numbers_that_count(stored, rows), sign))
+                continue
+            may_hold = np.arange(len(rows))
+            if stored is not None:
+                counting = _numbers_that_count(stored, rows)
+                off = counting.error if counting.errors is None else counting.errors
+                may_hold = counting.rows[sign * counting.numbers - off <= extreme.high]
+            for _, of_bag in rows.bag_rows():
+                positions = np.intersect1d(of_bag, may_hold)
+                if positions.size:
+                    undecided.append(rows.some(positions))
         return least, undecided
-
-
-def _candidates(rows: Rows, stored: FieldNumbers | None, sign: int, extreme: Extreme) -> IntArray:
-    """Returns which of some rows may hold an extreme, ascending."""
-    if stored is None:
-        return np.arange(len(rows))
-    field_numbers = _numbers_that_count(stored, rows)
-    off = field_numbers.error if field_numbers.errors is None else field_numbers.errors
-    return np.unique(field_numbers.rows[sign * field_numbers.numbers - off <= extreme.high])
-
-
-def _by_bag(rows: Rows, positions_wanted: IntArray) -> Iterator[Rows]:
-    """Yields some of the rows, those of each bag by themselves."""
-    for _, positions_of_bag in rows.bag_rows():
-        wanted_of_bag = np.intersect1d(positions_of_bag, positions_wanted, assume_unique=True)
-        if wanted_of_bag.size:
-            yield rows.some(wanted_of_bag)
-
-
-def _least_of(rows: Rows, field_numbers: FieldNumbers, sign: int) -> _Least:
-    """Returns the least exact number of a field in some rows."""
-    if not field_numbers.rows.size:
-        return _NO_NUMBER
-    number, row = _least_with_row(field_numbers, np.arange(field_numbers.rows.size), sign)
-    return _Least(number, int(rows.times[row]))
 
 
 def _numbers_that_count(field_numbers: FieldNumbers, rows: Rows) -> FieldNumbers:
@@ -436,9 +391,7 @@ def _extreme_of_column(
     """Returns the extreme of the numbers from one index to another, as the column decides it."""
     begin, end = bounds
     if not field_numbers.error or field_numbers.exactly is not None:
-        number, row = _least_with_row(field_numbers, np.arange(begin, end), sign)
-        at = int(rows.times[row])
-        return Extreme(number, number, at, at)
+        return _least(rows, field_numbers, sign, bounds)
     signed = sign * field_numbers.numbers[begin:end]
     off = field_numbers.error if field_numbers.errors is None else field_numbers.errors[begin:end]
     low, high = float((signed - off).min()), float((signed + off).min())
@@ -451,7 +404,7 @@ def _part_of(
     field_numbers: FieldNumbers,
     bounds: tuple[int, int],
     span: tuple[Ns, Ns],
-    outline: _OutlineNumbers | None,
+    outline: Part | None,
 ) -> Part:
     """Returns some of the numbers of a field, in messages of a span (ns, inclusive), as a part."""
     (begin, end), (first, last) = bounds, span
@@ -461,7 +414,7 @@ def _part_of(
         # Those of the whole table are exact, where they lie here.
         extremes = [
             stated if first <= stated.first <= stated.last <= last else computed
-            for computed, stated in zip(extremes, outline.ends, strict=True)
+            for computed, stated in zip(extremes, (outline.least, outline.greatest), strict=True)
         ]
     return Part(first, last, end - begin, total, *extremes)
 
@@ -483,10 +436,13 @@ def numbers_in(value: JsonValue) -> Iterator[float]:
             yield leaf
 
 
-def _least_with_row(
-    field_numbers: FieldNumbers, positions: IntArray, sign: int
-) -> tuple[float, int]:
-    """Returns the least exact number, times the sign, and its first row."""
+def _least(
+    rows: Rows, field_numbers: FieldNumbers, sign: int, bounds: tuple[int, int] | None = None
+) -> Extreme:
+    """Returns the least exact number of all, or of those from one index to another."""
+    positions = np.arange(*(bounds or (0, field_numbers.rows.size)))
+    if not positions.size:
+        return _NO_NUMBER
     values = field_numbers.numbers[positions]
     if field_numbers.error and field_numbers.exactly is not None:
         off = (
@@ -496,8 +452,9 @@ def _least_with_row(
         positions = positions[candidates]
         values = field_numbers.exactly(positions)
     nth = int(values.argmin() if sign == LEAST else values.argmax())
-    number: float = values[nth].item()
-    return sign * number, int(field_numbers.rows[positions[nth]])
+    return Extreme.known(
+        sign * values[nth].item(), int(rows.times[field_numbers.rows[positions[nth]]])
+    )
 
 
 _CELL: Final[tuple[tuple[str, BinColumn], ...]] = (

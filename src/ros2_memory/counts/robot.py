@@ -200,7 +200,7 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
     binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))
 
 
-def _entry_times(stays: Sequence[Inside]) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
+def _entry_times(stays: Sequence[Inside]) -> Ints:
     return np.array([stay.start for stay in stays if stay.entered], np.int64)
 
 

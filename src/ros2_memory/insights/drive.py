@@ -9,16 +9,16 @@ from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.analysis.clock_steps import Elapsed
-from ros2_memory.analysis.motion.speed_drops import SLOT_NS, SpeedDrop
 from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     CONTEXT_NS,
     CREEP_MPS,
+    DROP_SLOT_NS,
     SHORTEST_NS,
     SILENCE_NS,
+    SpeedDrop,
     Stands,
     Standstill,
-    joined_blocks,
     stands_of,
     standstills_of,
 )
@@ -157,7 +157,7 @@ def _standstills_in(
     """
     slices = _stands_of_slices(view, topic, window.widened(CONTEXT_NS))
     stands = [stand for _, stand in slices][::-1]
-    standing = standstills_of(joined_blocks([stand.blocks for stand in stands]))
+    standing = standstills_of([stand.blocks for stand in stands])
     starts = [standstill.start for standstill in standing]
     start, end = window.start + START_SLACK_NS, window.stop - 1 - AT_OR_BEFORE_SLACK_NS
     drops = tuple(
@@ -165,7 +165,8 @@ def _standstills_in(
         for stand in stands
         for drop in stand.drops
         if start <= drop.time <= end
-        and bisect_left(starts, drop.time - SLOT_NS) == bisect_left(starts, drop.time + _BRAKING_NS)
+        and bisect_left(starts, drop.time - DROP_SLOT_NS)
+        == bisect_left(starts, drop.time + _BRAKING_NS)
     )
     last = max((stand.last for stand in stands), default=MIN_NS)
     return tuple(_stops_between(view, standing, start, end, last)), drops

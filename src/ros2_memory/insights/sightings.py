@@ -529,7 +529,7 @@ def _sought_detection(detections: Sequence[Detection], condition: Condition) -> 
             if detection.place is not None and test.is_near(*detection.place)
         ]
     else:
-        about = [detection for detection in detections if test.matches(detection.label)]
+        about = [detection for detection in detections if test.passes(detection.label)]
     if not about and len(detections) == 1:
         about = list(detections)
     return max(about, key=_by_place_and_score, default=None)

@@ -232,7 +232,7 @@ class _BagRows:
         if not are_places(self._poses.positions).any():
             return driven
         stands = stands_of(self._poses, MIN_NS, MAX_NS)
-        standstills = standstills_of(stands.blocks)
+        standstills = standstills_of([stands.blocks])
         topic, events = self._pose_topic, self._rows["events"]
         for start, end, box in standstills:
             x, y, _ = box.centre

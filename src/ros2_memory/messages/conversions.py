@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence, Sized
 from enum import Enum, auto
 from functools import lru_cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -279,28 +279,20 @@ def number(node: object) -> float | None:
 
 def triple(node: object) -> Vector3 | None:
     """Returns three numbers in an array or tuple; None for anything else."""
-    numbers = _numbers(node, 3)
-    if not numbers:
-        return None
-    x, y, z = numbers
-    return x, y, z
+    return cast("Vector3 | None", _numbers(node, 3))
 
 
 def quadruple(node: object) -> Quaternion | None:
     """Returns four numbers in an array or tuple; None for anything else."""
-    numbers = _numbers(node, 4)
-    if not numbers:
-        return None
-    first, second, third, fourth = numbers
-    return first, second, third, fourth
+    return cast("Quaternion | None", _numbers(node, 4))
 
 
-def _numbers(node: object, count: int) -> list[float]:
-    """Returns the numbers of an array or tuple of this length; none where it holds others."""
+def _numbers(node: object, count: int) -> tuple[float | None, ...] | None:
+    """Returns the numbers of an array or tuple of this length; None where it holds others."""
     if not isinstance(node, list | tuple | np.ndarray) or len(node) != count:
-        return []
-    numbers = [number(part) for part in node]
-    return [part for part in numbers if part is not None] if None not in numbers else []
+        return None
+    numbers = tuple(map(number, node))
+    return None if None in numbers else numbers
 
 
 def rotation(node: object) -> Quaternion | None:
@@ -350,8 +342,8 @@ def nanoseconds(node: object) -> Ns | None:
 def _image(message: object, data: object) -> object:
     encoding = field_of(message, "encoding")
     channels = channels_of(str(encoding))
-    shape = [*_shape(message), channels] if channels is not None else _shape(message)
-    return Summary({**_bytes(data), "encoding": _or_null(encoding), "shape": shape})
+    shape = _shape(message) + ([] if channels is None else [channels])
+    return _summary(data, encoding=encoding, shape=shape)
 
 
 def _shape(message: object, *path: str) -> list[int]:
@@ -370,16 +362,16 @@ def channels_of(encoding: str) -> int | None:
 
 
 def _compressed_image(message: object, data: object) -> object:
-    return Summary({**_bytes(data), "encoding": _or_null(field_of(message, "format"))})
+    return _summary(data, encoding=field_of(message, "format"))
 
 
 def _point_cloud(message: object, data: object) -> object:
     shape = _shape(message)
-    return Summary({**_bytes(data), "points": math.prod(shape), "shape": shape})
+    return _summary(data, points=math.prod(shape), shape=shape)
 
 
 def _occupancy_grid(message: object, data: object) -> object:
-    return Summary({**_bytes(data), "shape": _shape(message, "info")})
+    return _summary(data, shape=_shape(message, "info"))
 
 
 def _magnetic_field(_message: object, field: object) -> object:
@@ -388,12 +380,9 @@ def _magnetic_field(_message: object, field: object) -> object:
     return field if numbers is None else dict(zip("xyz", numbers, strict=True))
 
 
-def _bytes(data: object) -> dict[str, object]:
-    return {"bytes": len(data) if isinstance(data, Sized) else 0}
-
-
-def _or_null(node: object) -> object:
-    return None if node is ABSENT else node
+def _summary(data: object, **fields: object) -> Summary[object]:
+    fields = {name: None if field is ABSENT else field for name, field in fields.items()}
+    return Summary({"bytes": len(data) if isinstance(data, Sized) else 0, **fields})
 
 
 _KINDS: Final[Mapping[str, tuple[ValueKind, str]]] = {

@@ -115,12 +115,7 @@ def evenly(count: int, at_most: int) -> list[int]:
 
     The first and the last value are kept, and the distances between neighbours differ by at most
     one. If only one may be kept it is the last: the newest.
-
-    Raises:
-        ValueError: `at_most` is below 1.
     """
-    if at_most < 1:
-        raise ValueError(f"at most {at_most} values cannot be kept; at least 1 is")
     if count <= at_most:
         return list(range(count))
     if at_most == 1:

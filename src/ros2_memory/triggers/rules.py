@@ -1,6 +1,6 @@
-"""A rule: what makes it fire, and what is then kept. Pure.
+"""Rules over closed splits: what makes one fire, what is then kept, and the search for it.
 
-When it fires is a fold over messages in order of time, with its state carried on.
+When a rule fires is a fold over messages in order of time, with its state carried on.
 
 A match begins with a message that meets the condition, and ends as a sighting does: with a message
 of the topic that does not, or where the topic is silent for longer than `SILENCE_NS`; on a latched
@@ -11,27 +11,55 @@ A rule fires once in each match: when it begins, or once it has held for as long
 A silence begins with the last message of a topic that had one since the last gap.
 
 How the stream is cut into calls changes nothing: `reach` says only how far it is known.
+
+Only bags with topics that a rule names are opened, and only messages of these are decoded; a rule
+over silences needs their times alone.
 """
 
 from __future__ import annotations
 
+import hashlib
+import heapq
+import time
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+from ros2_memory.analysis.conditions import refusal_for
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.bag_dir.state_files import RunRecord
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.bag_dir.layout import named_start
+from ros2_memory.bag_dir.state_files import LatchedMark, RuleRecord, RunRecord, TriggerState
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
+from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.retention.disk import FailingFiles
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, MutableMapping
+    from collections.abc import (
+        Callable,
+        Collection,
+        Iterable,
+        Iterator,
+        Mapping,
+        MutableMapping,
+        Sequence,
+    )
 
     from ros2_memory.analysis.conditions import Condition
+    from ros2_memory.extract import SchemaExtractor
+    from ros2_memory.storage.base import BagReader, Record
 
 
 GLOB_MARKS: Final = "*?["
 """What makes a topic of a rule a glob."""
+LEAST_NEAR_NS: Final[Ns] = 60 * NS_PER_S
+"""Recordings that take over from each other overlap by less."""
+_SPLITS_NEAR: Final = 3
+_BURST_NS: Final[Ns] = 5 * NS_PER_S
+"""In so much time a new subscriber receives what its publishers repeat."""
+_MARKED_RECORDINGS: Final = 3
+"""Recordings whose latched messages are remembered: the newest ones, which can still overlap."""
 
 
 class Firing(NamedTuple):
@@ -140,3 +168,293 @@ class Rule:
             return None
         run.fired = True
         return Firing(self.name, topic, run.first, run.first + self.hold)
+
+
+class SearchPart(NamedTuple):
+    """A part of one recording that can be searched: its closed bags that touch a window."""
+
+    recording: str
+    window: TimeWindow
+    bags: tuple[BagFile, ...]
+
+
+class SearchChain(NamedTuple):
+    """Parts of recordings that took over from each other, in order.
+
+    `goes_on`: the first of them goes on from what was searched before, without a gap.
+    """
+
+    parts: tuple[SearchPart, ...]
+    goes_on: bool
+
+
+def chains_to_search(
+    closed: Mapping[str, Sequence[BagFile]],
+    live: Collection[str],
+    searched: Mapping[str, Ns],
+    previous: Callable[[str], str | None],
+    split_ns: Ns,
+) -> list[SearchChain]:
+    """Returns what can be searched of recordings.
+
+    Args:
+        closed: their closed bags, by recording, in the order in which the recordings began.
+        live: those that are being written.
+        searched: until when each was searched.
+        previous: gives the recording that one took over from; None where it took over from none.
+        split_ns: how long one bag is.
+    """
+    ends = {name: max((bag.end for bag in bags), default=MIN_NS) for name, bags in closed.items()}
+    written = {name: ends[name] if closed.get(name) else None for name in live}
+    limits = horizons(ends, written, split_ns)
+    chains: list[SearchChain] = []
+    last: str | None = None
+    for name, bags in closed.items():
+        start = searched.get(name, MIN_NS)
+        window = TimeWindow(start, max(start, min(limits[name], ends[name] + 1)))
+        touched = tuple(bag for bag in bags if window.overlaps(bag.start, bag.end))
+        if window.empty or not touched:
+            continue
+        part = SearchPart(name, window, touched)
+        from_before = name in searched
+        other = None if from_before else previous(name)
+        if last is not None and (from_before or other == last):
+            chains[-1] = SearchChain((*chains[-1].parts, part), chains[-1].goes_on)
+        else:
+            chains.append(SearchChain((part,), from_before or other in searched))
+        last = name
+    return chains
+
+
+def horizons(ends: Mapping[str, Ns], live: Mapping[str, Ns | None], split_ns: Ns) -> dict[str, Ns]:
+    """Returns until when nothing can come any more that affects recordings; MAX_NS for all times.
+
+    Args:
+        ends: where what is closed of each recording ends.
+        live: the same of those that are being written; None where nothing of one is closed.
+        split_ns: how long one bag is.
+    """
+    begun = {name: named_start(name) if end is None else end for name, end in live.items()}
+    reached = {name: end - OUT_OF_ORDER_NS for name, end in begun.items() if end is not None}
+    near = max(LEAST_NEAR_NS, _SPLITS_NEAR * split_ns)
+    return {
+        name: min(
+            (
+                until
+                for other, until in reached.items()
+                if other == name or abs(until - end) <= near
+            ),
+            default=MAX_NS,
+        )
+        for name, end in ends.items()
+    }
+
+
+class _Event(NamedTuple):
+    """A message of a topic, in a recording; without a record only its time counts."""
+
+    time: Ns
+    topic: str
+    recording: str
+    record: Record | None
+
+
+class SplitSearch:
+    """Searches on behalf of some rules.
+
+    Args:
+        reader: gives the messages that count, and decodes them.
+        extractor: gives the values that conditions are tested on.
+        rules: what to search for.
+        monotonic: a clock that never steps, in seconds.
+    """
+
+    def __init__(
+        self,
+        reader: BagReader,
+        extractor: SchemaExtractor,
+        rules: Sequence[Rule],
+        *,
+        monotonic: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._failing = FailingFiles(monotonic)
+        self._reader = reader
+        self._extractor = extractor
+        self._rules = [rule for rule in rules if rule.topic is not None]
+        self._watching: dict[str, tuple[Rule, ...]] = {}
+        self._tested: set[tuple[str, str]] = set()
+
+    def search(
+        self, chain: SearchChain, state: TriggerState, is_over: Callable[[], bool]
+    ) -> tuple[list[Firing], Ns | None]:
+        """Searches a chain and changes the state; returns what fired, in order.
+
+        With it the log time at which the search stopped since its time was over; None where all is
+        searched.
+
+        Raises:
+            BagUnreachableError: the disk fails to read a bag, and may recover; the state is
+                useless then.
+        """
+        for rule in self._rules:
+            record = state.rules.setdefault(rule.name, RuleRecord())
+            if not chain.goes_on:
+                record.runs.clear()  # the recorder did not run on
+        fired: list[Firing] = []
+        stopped: Ns | None = None
+        previous: Ns | None = None
+        bags = (
+            self._events(bag, part, state)
+            for part in chain.parts
+            for bag in part.bags
+            if any(self._rules_of(topic.topic) for topic in bag.summary.topics)
+        )
+        for event in heapq.merge(*bags, key=lambda event: event.time):
+            if not event.topic:
+                continue
+            if previous is not None and event.time > previous and is_over():
+                stopped = event.time
+                break
+            previous = event.time
+            fired += self._firings_at(event, state)
+        until = max(part.window.stop for part in chain.parts)
+        searched = until if stopped is None else min(stopped, until)
+        for rule in self._rules:
+            fired += rule.reach(state.rules[rule.name].runs, searched)
+        return fired, stopped
+
+    def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
+        record, rules = event.record, self._rules_of(event.topic)
+        latched = record is not None and record.channel.latched
+        if record is not None and latched:
+            rules = tuple(rule for rule in rules if rule.condition is not None)
+            if _receive(record, event.recording, state):
+                return
+        value: JsonValue | UndecodableError = None
+        if record is not None and any(rule.condition is not None for rule in rules):
+            try:
+                value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+            except UndecodableError as error:
+                value = error
+        for rule in rules:
+            matches: bool | None = False
+            if rule.condition is not None and record is not None:
+                matches = self._test(rule, rule.condition, event.topic, value, state)
+            runs = state.rules[rule.name].runs
+            fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)
+            if fired is not None:
+                yield fired
+
+    def _test(
+        self,
+        rule: Rule,
+        condition: Condition,
+        topic: str,
+        value: JsonValue | UndecodableError,
+        state: TriggerState,
+    ) -> bool | None:
+        """Returns whether a value meets a condition; None where it could not be decoded.
+
+        Notes why messages cannot make the rule fire; whether any could, once for each topic.
+        """
+        record = state.rules[rule.name]
+        if isinstance(value, UndecodableError):
+            record.problem = f"not all could be searched: {value}"
+            return None
+        matches = condition.matches(value)
+        if (rule.name, topic) not in self._tested:
+            self._tested.add((rule.name, topic))
+            if not matches and condition.can_be_refused:
+                refusal = refusal_for(condition, value)
+                record.problem = None if refusal is None else f"{topic}: {refusal}"
+        return matches
+
+    def _rules_of(self, topic: str) -> tuple[Rule, ...]:
+        if topic not in self._watching:
+            rules = (rule for rule in self._rules if rule.selects([topic]))
+            self._watching[topic] = tuple(rules)
+        return self._watching[topic]
+
+    def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:
+        """Yields the messages of a bag in a window, in order of log time.
+
+        Before them an event without a topic, at which the bag has not been opened yet. What cannot
+        be read of it is reported as a problem of the rules.
+        """
+        yield _Event(max(bag.start, part.window.start), "", part.recording, None)
+        topics = [topic.topic for topic in bag.summary.topics]
+        watched = {topic: rules for topic in topics if (rules := self._rules_of(topic))}
+        try:
+            yield from self._messages(bag, part, watched)
+        except BagError as error:
+            if self._failing.may_recover(bag.path, error):
+                raise
+            problem = f"not all could be searched: {bag.path.name}: {error.reason}"
+            for rule in {rule.name for rules in watched.values() for rule in rules}:
+                state.rules[rule].problem = problem
+
+    def _messages(
+        self, bag: BagFile, part: SearchPart, watched: Mapping[str, Sequence[Rule]]
+    ) -> Iterator[_Event]:
+        """Yields the messages of topics that rules watch; their times alone where these suffice.
+
+        Raises:
+            BagError: the bag cannot be read.
+        """
+        latched = {topic.topic for topic in bag.summary.topics if topic.latched}
+        read: list[str] = []
+        times: list[tuple[Ns, str]] = []
+        for topic, rules in watched.items():
+            if topic in latched or any(rule.condition is not None for rule in rules):
+                read.append(topic)
+                continue
+            for batch in self._reader.batches(bag.path, [topic], part.window, bare=[topic]):
+                times += ((time, topic) for time in batch.log_times.tolist())
+        records = self._reader.records(bag.path, read, part.window) if read else ()
+        with_records = (
+            _Event(record.log_time, record.channel.topic, part.recording, record)
+            for record in records
+        )
+        bare = (_Event(time, topic, part.recording, None) for time, topic in sorted(times))
+        yield from heapq.merge(with_records, bare, key=lambda event: event.time)
+
+
+def _receive(record: Record, recording: str, state: TriggerState) -> bool:
+    """Remembers a latched message; returns whether another recording received it before."""
+    mark = state.latched.setdefault(record.channel.topic, LatchedMark())
+    payload = hashlib.blake2b(record.payload, digest_size=8).hexdigest()
+    mark.begun.setdefault(recording, record.log_time)
+    is_repeat = _is_repeat(record, recording, payload, mark)
+    if not is_repeat:
+        mark.payload = payload
+    # Put in again, so that the recordings used last come last.
+    latest = mark.published.pop(recording, record.publish_time)
+    mark.published[recording] = max(latest, record.publish_time)
+    while len(mark.published) > _MARKED_RECORDINGS:
+        oldest = next(iter(mark.published))
+        del mark.published[oldest]
+        mark.begun.pop(oldest, None)
+    return is_repeat
+
+
+def _is_repeat(record: Record, recording: str, payload: str, mark: LatchedMark) -> bool:
+    """Returns whether a latched message was published before this recording received it.
+
+    Every recording receives those of a topic again. What it receives in its first seconds and was
+    published long before is one, whether a recorder saw it or not. Where a format keeps no publish
+    time, the first message in a recording is one if it is like the last one.
+    """
+    logged, published = record.log_time, record.publish_time
+    if published in {0, logged}:
+        return recording not in mark.published and payload == mark.payload
+    is_late = published < logged - SILENCE_NS
+    if is_late and logged - mark.begun[recording] < _BURST_NS:
+        return True
+    # Elsewhere, times later than now are from before the clock was set back: they prove nothing,
+    # unless this message has one, too, as under a simulated log clock.
+    latest = logged + SILENCE_NS
+    return any(
+        published <= elsewhere and (elsewhere <= latest or published > latest)
+        for other, elsewhere in mark.published.items()
+        if other != recording
+    )

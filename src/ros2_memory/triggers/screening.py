@@ -60,7 +60,7 @@ from ros2_memory.triggers.exclusion import (
     add_message,
     excluded_intervals,
 )
-from ros2_memory.triggers.search import horizons
+from ros2_memory.triggers.rules import horizons
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence

@@ -28,8 +28,7 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
-from ros2_memory.triggers.rules import GLOB_MARKS, Firing, Rule
-from ros2_memory.triggers.search import SplitSearch, chains_to_search
+from ros2_memory.triggers.rules import GLOB_MARKS, Firing, Rule, SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

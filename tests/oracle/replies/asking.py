@@ -39,7 +39,7 @@ from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
 from ros2_memory.serving.page.routes import page_routes
-from ros2_memory.triggers.search import SplitSearch, chains_to_search
+from ros2_memory.triggers.rules import SplitSearch, chains_to_search
 from tests.support.composed import composed_once
 
 if TYPE_CHECKING:

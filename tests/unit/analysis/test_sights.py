@@ -104,13 +104,6 @@ def test_labels_beside_a_detection_are_counted_in_a_crowd_too() -> None:
     assert sorted(names) == ["cup", "mug"]
 
 
-def test_messages_of_one_slice_of_the_clock_are_looked_at_together_and_no_others() -> None:
-    messages = [Message("/a", nth * SECOND, HERE, [mug(1.0)]) for nth in range(7, 24)]
-    found = sights_of_messages(messages)
-    assert found.spots[:, [Spot.SLICE, Spot.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
-    assert found.looks[:, [Look.SLICE, Look.N]].tolist() == [[0, 3], [1, 10], [2, 4]]
-
-
 coordinates = st.floats(-20, 20, allow_nan=False)
 things = st.builds(
     PlacedDetection,

@@ -1,21 +1,42 @@
-"""What was seen, by label: held to the messages that the test wrote."""
+"""What counts, and how long it held; by label, as the messages say that the test wrote."""
 
 from __future__ import annotations
 
+import json
+import math
 from itertools import pairwise
 from pathlib import Path
 from random import Random
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rosbags.typesys import get_types_from_msg
 
-from tests.support.bags import detections, text, write_mcap
+from ros2_memory.core.timebase import NS_PER_S
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    detections,
+    make,
+    odom,
+    text,
+    typestore,
+    write_mcap,
+    write_splits,
+)
 from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, with_store
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.rooms import BEGIN, PLACES, ROOMS, SEEN, S, World, asked_of, bounds, draw, write
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
+    from pathlib import Path
+
+    from ros2_memory.history.context import Memory
 
 ANY = {"topic": SEEN, "condition_type": "contains", "value": "", "by": "label"}
 
@@ -144,16 +165,6 @@ def test_what_is_no_condition_on_labels_is_refused(tmp_path: Path, given: dict[s
     assert "by label takes labels of detections: give condition_type contains" in reply["detail"]
 
 
-def test_json_objects_with_a_list_of_detections_in_texts_are_counted(tmp_path: Path) -> None:
-    said = '{"detections": [{"label": "cup", "score": 0.8}, {"label": "fork", "score": 0.4}]}'
-    messages = [text((BEGIN + second) * S, said, topic="/seen") for second in range(5)]
-    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    asking = {**ANY, "topic": "/seen"}
-    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
-        rows = rows_of(asked(memory, tmp_path, "find_matches", **asking))
-        assert [rows[label]["best_score"] for label in ("cup", "fork")] == [0.8, 0.4]
-
-
 @pytest.mark.parametrize(
     ("said", "rows"),
     [
@@ -170,3 +181,165 @@ def test_texts_that_show_nothing_are_named(tmp_path: Path, said: str, rows: int)
     reply = asked(memory_of(tmp_path), tmp_path, "find_matches", topic="/chatter", **every)
     assert len(reply["rows"]) == rows
     assert any("/chatter has texts" in note for note in reply["notes"]) == (not rows)
+
+
+T: Final = 1_790_000_000
+SCENE: Final = "/vision/scene/scene_objects"
+X: Final = "pose.pose.position.x"
+
+
+def counted(folder: Path, messages: Iterable[Msg], topic: str, **given: object) -> dict[str, Any]:
+    ordered = sorted(messages, key=lambda each: each.log_time)
+    write_mcap(folder / "run" / "run_0.mcap", ordered)
+    condition = {"topic": topic, "start": T, "end": T + 300, "by": "day", **given}
+    reply = asked(memory_of(folder), folder, "find_matches", **condition)
+    return dict(zip(reply["columns"][1:], reply["all"], strict=True))
+
+
+def test_a_boolean_in_a_list_counts_beside_one_that_is_in_none(tmp_path: Path) -> None:
+    store = typestore()
+    store.register(get_types_from_msg("bool pressed\n", "acme_msgs/msg/Button"))
+    panel = "bool enabled\nacme_msgs/Button[] buttons\n"
+    store.register(get_types_from_msg(panel, "acme_msgs/msg/Panel"))
+    button = store.types["acme_msgs/msg/Button"]
+    messages = [
+        Msg(
+            "/panel",
+            "acme_msgs/msg/Panel",
+            (T + nth) * NS_PER_S,
+            make("acme_msgs/msg/Panel", enabled=False, buttons=[button(pressed=20 <= nth < 40)]),
+        )
+        for nth in range(60)
+    ]
+    found = counted(tmp_path, messages, "/panel", condition_type="equals", value=True)
+    assert (found["count"], found["seconds"]) == (1, 20.0)
+
+
+def test_a_number_that_is_contained_counts_by_its_value(tmp_path: Path) -> None:
+    kind = "std_msgs/msg/Int32"
+    messages = [
+        Msg("/level", kind, (T + nth) * NS_PER_S, make(kind, data=3 if nth > 100 else 1))
+        for nth in range(200)
+    ]
+    condition = {"condition_type": "contains", "value": 3, "field": "data"}
+    found = counted(tmp_path, messages, "/level", by="value", **condition)
+    assert found["count"] == 1
+
+
+def test_what_two_topics_show_at_once_lasts_once(tmp_path: Path) -> None:
+    messages = [
+        detections((T + nth) * NS_PER_S + late, ["person"], topic=topic)
+        for nth in range(100)
+        for topic, late in (("/cam1/objects", 0), ("/cam2/objects", 10**8))
+    ]
+    condition = {"condition_type": "contains", "value": "person"}
+    found = counted(tmp_path, messages, "/cam*/objects", **condition)
+    assert 99 <= found["seconds"] <= found["recorded_s"] + 1
+
+
+def test_a_number_that_is_none_at_last_is_a_value_like_others(tmp_path: Path) -> None:
+    charges = [0.5, 0.5, math.nan, 0.7, 0.7, math.nan]
+    messages = [battery((T + n) * NS_PER_S, charge) for n, charge in enumerate(charges)]
+    condition = {"condition_type": "above", "value": 0.1, "field": "percentage", "by": "value"}
+    found = counted(tmp_path, messages, "/battery_state", **condition)
+    assert (found["count"], found["seconds"]) == (2, 4.0)
+    window = {"topic": "/battery_state", "fields": ["percentage"], "start": T, "end": T + 9}
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
+    assert [change["value"] for change in reply["changes"]] == [0.5, None, 0.7, None]
+    reply = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
+    assert {row[0]: row[1] for row in reply["rows"]} == {"0.5": 1, "0.7": 1, "null": 2}
+
+
+def label_counts(memory: Memory, topic: str, value: object, **given: object) -> list[object]:
+    kind = "equals" if isinstance(value, bool) else "contains"
+    sought = {"topic": topic, "condition_type": kind, "value": value, "by": "hour", **given}
+    answer = asked(memory, memory.index.bag_dir, "find_matches", **sought)
+    whole = dict(zip(answer["columns"][1:], answer["all"], strict=True))
+    return [whole["count"], whole["seconds"]]
+
+
+@each_way
+def test_what_is_once_does_not_depend_on_a_scope_that_always_holds(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """A cup that every fourth message misses; a boolean that is said each 15 s."""
+    messages = [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
+    messages += [boolean((T + at) * NS_PER_S, data=True, topic="/on") for at in range(120)]
+    labels = [[] if at % 4 == 3 else ["cup"] for at in range(120)]
+    messages += [detections((T + at) * NS_PER_S, seen) for at, seen in enumerate(labels)]
+    messages += [
+        boolean((T + at) * NS_PER_S, at % 40 >= 20, "/docked") for at in (*range(0, 120, 15), 119)
+    ]
+    write_splits(tmp_path, messages, 30)
+    memory = memory_of(tmp_path, recalls=recalls)
+    everywhere = {"where": {"x": [-9, 9], "y": [-9, 9]}}
+    always = {"while": {"topic": "/on", "condition_type": "equals", "value": True}}
+    for topic, value in ((SCENE, "cup"), ("/docked", True), ("/docked", False)):
+        counts = label_counts(memory, topic, value)
+        for scope in (everywhere, always, {"min_score": 0.1}):
+            assert label_counts(memory, topic, value, **scope) == counts, (topic, scope)
+    assert label_counts(memory, SCENE, "cup") == [1, 118]
+    half = {"while": {"topic": "/odom", "condition_type": "below", "value": 0.7, "field": X}}
+    assert label_counts(memory, "/docked", True, **half) == [2, 25]
+
+
+@each_way
+def test_a_text_beside_json_detections_counts_by_hour_as_it_is_found(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    objects = [{"label": "cup", "score": 0.8}]
+    rooms = ["hall" if at < 60 else "kitchen" for at in range(120)]
+    messages = [
+        text((T + at) * NS_PER_S, json.dumps({"room": room, "objects": objects}), "/vlm")
+        for at, room in enumerate(rooms)
+    ]
+    messages += [odom((T + at) * NS_PER_S, at / 100, 0.0) for at in range(120)]
+    write_splits(tmp_path, messages, 30)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert label_counts(memory, "/vlm", '"room": "hall"') == [1, 60]
+    assert label_counts(memory, "/vlm", "cup") == [1, 119]
+
+
+@each_way
+def test_labels_in_json_are_compared_one_by_one(tmp_path: Path, *, recalls: bool) -> None:
+    both, butter = ["Knife", "butter knife"], ["butter knife"]
+    seen = [both if at < 20 else butter for at in range(40)]
+    messages = [
+        text((T + at) * NS_PER_S, json.dumps({"objects": [{"label": label} for label in labels]}))
+        for at, labels in enumerate(seen)
+    ]
+    write_splits(tmp_path, messages, 10)
+    memory = memory_of(tmp_path, recalls=recalls)
+    for kind, value in (("equals", "knife"), ("contains_word", "knife -butter")):
+        sought = {"topic": "/chatter", "condition_type": kind, "value": value}
+        answer = asked(memory, tmp_path, "find_matches", **sought)
+        assert [each["count"] for each in answer["sightings"]] == [20]
+        newest = asked(memory, tmp_path, "find_last_match", **sought)
+        assert newest["timestamp"] == T + 19
+
+
+@each_way
+def test_a_topic_that_changed_its_type_counts_what_it_said_as_either(
+    tmp_path: Path, *, recalls: bool
+) -> None:
+    """A text for 100 s, then a boolean; true for 10 s of 20, and nothing or false in between."""
+    said = [
+        text((T + at) * NS_PER_S, "true" if at % 20 < 10 else "no", "/on")
+        for at in range(0, 100, 2)
+    ]
+    said += [boolean((T + at) * NS_PER_S, at % 20 < 10, "/on") for at in range(100, 200, 2)]
+    said += [odom((T + at) * NS_PER_S, 1.0, 0.0, topic="/on") for at in range(200, 220, 2)]
+    write_splits(tmp_path, said, 40)
+    memory = memory_of(tmp_path, recalls=recalls)
+    window = {"topic": "/on", "start": T, "end": T + 198}
+    on = {**window, "condition_type": "contains", "value": "true"}
+    found = asked(memory, tmp_path, "find_matches", **on, limit=20)
+    counted = asked(memory, tmp_path, "find_matches", **on, by="day")
+    whole = dict(zip(counted["columns"][1:], counted["all"], strict=True))
+    assert found["total"] == 10
+    assert (whole["count"], whole["seconds"]) == (10, 100)
+    changes = asked(memory, tmp_path, "get_topic_in_range", **window, changes=True)
+    assert [row["value"] for row in changes["changes"]] == ["true", "no"] * 5 + [True, False] * 5
+    values = asked(memory, tmp_path, "get_topic_in_range", **window, by="value")
+    assert values["all"][0] == 20

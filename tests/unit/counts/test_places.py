@@ -1,19 +1,27 @@
-"""Counting in named places, and of visits in days and hours."""
+"""Metres, visits and what else is counted, by hour and by place."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from random import Random
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.counts.robot import count_path
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.view import TimeRange
 from ros2_memory.places.visits import visits
+from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.moving_map import BEGIN, S, write_moving_map
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 WEST = Place("west", "map", Rectangle(-3.0, 2.0, -3.0, 6.0))
 EAST = Place("east", "map", Rectangle(2.0, 8.0, -3.0, 6.0))
@@ -97,21 +105,6 @@ def test_what_is_counted_by_place_is_where_the_robot_was(world: Path) -> None:
     assert seen["all"]["count"] == 1
 
 
-def test_numbers_in_a_place_are_those_of_its_messages(memory: Memory, world: Path) -> None:
-    question = {"topic": "/odom", "fields": ["linear_velocity.x"], "by": "place", **DOOR}
-    rows = table(asked(memory, world, "get_topic_in_range", **question))
-    for name in ("west", "east", "start", "all"):
-        assert (rows[name]["linear_velocity.x.min"], rows[name]["linear_velocity.x.max"]) == (
-            0,
-            0.4,
-        )
-    whole = rows["west"]["count"] + rows["east"]["count"]
-    mean = sum(
-        rows[name]["count"] * rows[name]["linear_velocity.x.mean"] for name in ("west", "east")
-    )
-    assert mean / whole == pytest.approx(rows["all"]["linear_velocity.x.mean"], abs=1e-5)
-
-
 def test_a_place_in_another_one_counts_to_both_and_a_note_says_so(
     memory: Memory, world: Path
 ) -> None:
@@ -129,3 +122,38 @@ def test_what_cannot_be_counted_by_place_is_refused(memory: Memory, world: Path)
     assert "give where in place of x and y" in two["detail"]
     none = asked(in_places(memory), world, "visits", by="day")
     assert "no place is named" in none["detail"]
+
+
+HOUR = 1_784_001_600 * S  # a whole hour of UTC
+
+
+def test_a_jump_in_the_bag_in_which_a_bin_ends_adds_no_metres(tmp_path: Path) -> None:
+    """Drives 1 m/s for 20 s around the full hour, and jumps by 500 m 5 s after it."""
+    messages = []
+    for step in range(400):
+        at = HOUR - 10 * S + step * S // 20
+        messages.append(odom(at, step / 20 + (500 if step >= 300 else 0), 0.0))
+    write_mcap(tmp_path / "bag.mcap", messages)
+    span = TimeRange(HOUR / S - 100, HOUR / S + 100)
+    found = count_path(memory_of(tmp_path), Call(), span, "hour")
+    column = [name for name, _ in found.columns].index("metres")
+    metres = [row[column] for _, row in found.rows if row[column]]
+    assert metres == pytest.approx([10.0, 9.9], abs=0.2)
+    assert found.all[column] == pytest.approx(19.9, abs=0.2)
+
+
+def test_hours_without_a_recording_have_no_row_whatever_was_driven_before(tmp_path: Path) -> None:
+    drawn = Random(5)
+    x = 0.0
+    for recording in range(3):
+        messages = []
+        for step in range(200):
+            x += drawn.random() * 0.05
+            at = HOUR + recording * 5 * 3600 * S + 1234 * S + step * S // 10
+            messages.append(odom(at, x, drawn.random() * 0.01))
+        write_mcap(tmp_path / f"{recording}.mcap", messages)
+    span = TimeRange(HOUR / S, HOUR / S + 50_000)
+    found = count_path(memory_of(tmp_path), Call(), span, "hour")
+    begins = [HOUR / S + 1234 + 5 * 3600 * nth for nth in range(3)]
+    hours = [datetime.fromtimestamp(at, UTC).astimezone().strftime("%H:00") for at in begins]
+    assert [name[-5:] for name, _ in found.rows] == hours

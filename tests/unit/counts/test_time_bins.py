@@ -113,14 +113,6 @@ def test_a_day_has_23_or_25_hours_where_clocks_are_changed() -> None:
     assert "02:00" not in hours(time_bins(skipped, "hour", berlin))
 
 
-def test_weekdays_and_hours_of_several_days_are_one_bin() -> None:
-    fortnight = TimeWindow(at("2026-03-02"), at("2026-03-16"))
-    assert hours(time_bins(fortnight, "weekday", zone("UTC"))) == dict.fromkeys(
-        ["Monday", "Tuesday", "Wednesday", "Thursday", "Friday", "Saturday", "Sunday"], 48
-    )
-    assert hours(time_bins(fortnight, "hour", zone("UTC")))["08:00"] == 14
-
-
 def test_more_bins_than_a_reply_has_room_for_are_refused() -> None:
     begin, day = at("2026-03-02"), 86_400 * S
     assert (

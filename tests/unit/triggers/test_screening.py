@@ -44,306 +44,278 @@ VOLATILE = McapLayout(latched=frozenset())
 FULL = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
 
 
+@pytest.fixture
+def bags(tmp_path: Path) -> ScreenedBags:
+    return ScreenedBags(tmp_path / "bags")
+
+
 def halves(begin: int, stop: int) -> list[float]:
     return [n + 0.5 for n in range(begin, stop)]
 
 
-class TestServing:
-    def test_a_split_is_served_when_the_next_one_was_read(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(0, value=False), *words(0, 10)])
+def test_a_split_is_served_when_the_next_one_was_read(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(0, value=False), *words(0, 10)])
+    bags.step()
+    assert bags.served() == []
+    bags.split(name, words(10, 20))
+    bags.step()
+    assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
+    bags.end()
+    assert bags.seconds() == halves(0, 20)
+    assert not read_gate(bags.bag_dir).holds_some(name)
+
+
+def test_what_it_excludes_is_cut_with_its_margin(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(-3, value=False), *words(0, 10)])
+    bags.split(name, [mode(10.2, value=True), *words(10, 20)])
+    bags.split(name, words(20, 30))
+    bags.split(name, [mode(35, value=False), *words(30, 40)])
+    bags.end()
+    assert bags.seconds() == [*halves(0, 9), *halves(36, 40)]
+    assert bags.seconds("/privacy_mode") == [-3.0]
+    [found] = [each for each in excluded_between(bags.bag_dir, T0, MAX_NS) if each.held]
+    assert ((found.start - T0) / S, (found.stop - T0) / S) == (9.2, 36.0)
+
+
+def test_a_recording_from_before_is_left_alone(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    (bags.bag_dir / SCREENED_FILE).unlink()
+    bags.screening = bags.new()
+    bags.split(name, [mode(0, value=True), *words(0, 10)])
+    bags.step()
+    assert bags.seconds() == halves(0, 10)
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_a_topic_that_is_never_heard(tmp_path: Path, keeps: bool) -> None:
+    bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=not keeps))
+    bags.split(bags.begin(0), words(0, 10))
+    bags.end()
+    assert bags.seconds() == (halves(0, 10) if keeps else [])
+    assert len(bags.served()) == 1
+
+
+def test_a_topic_that_falls_silent(bags: ScreenedBags) -> None:
+    said = [mode(n, value=False) for n in range(5)]
+    bags.split(bags.begin(0), [*said, *words(0, 10)], VOLATILE)
+    bags.end()
+    assert bags.seconds() == halves(0, 6)
+
+
+@pytest.mark.parametrize(
+    ("said", "problem"),
+    [
+        (word(5, "/privacy_mode"), "/privacy_mode: the values hold no boolean"),
+        (replace(mode(5, value=False), body=b""), "the rule privacy: "),
+    ],
+    ids=["another type", "not decoded"],
+)
+def test_a_message_that_cannot_show_it_is_unknown_and_reported(
+    bags: ScreenedBags, said: Msg, problem: str
+) -> None:
+    bags.split(bags.begin(0), [mode(-2, value=False), said, *words(0, 10)])
+    bags.end()
+    assert bags.seconds() == halves(0, 4)
+    assert problem in (bags.screening.problem() or "")
+
+
+def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected(
+    tmp_path: Path,
+) -> None:
+    def rule(field: str) -> ExclusionRule:
+        condition = parse_condition("above", 5, 0.5, field)
+        return privacy(topic="/odom", condition=condition, stale=100 * S)
+
+    def driven(begin: int, stop: int) -> list[Msg]:
+        return [odom(T0 + n * S, float(n), 0.0) for n in range(begin, stop)]
+
+    bags = ScreenedBags(tmp_path / "bags", rule("pose.position.x"))
+    name = bags.begin(0)
+    bags.split(name, [*driven(0, 10), *words(0, 10)])
+    with structlog.testing.capture_logs() as logs:
         bags.step()
-        assert bags.served() == []
-        bags.split(name, words(10, 20))
-        bags.step()
-        assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
+        bags.split(name, [*driven(10, 20), *words(10, 20)])
+        bags.end(name)
+        old = bags.begin(20)
+        bags.split(old, [*driven(20, 30), *words(20, 30)])
         bags.end()
-        assert bags.seconds() == halves(0, 20)
-        assert not read_gate(bags.bag_dir).holds_some(name)
-
-    def test_what_it_excludes_is_cut_with_its_margin(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-3, value=False), *words(0, 10)])
-        bags.split(name, [mode(10.2, value=True), *words(10, 20)])
-        bags.split(name, words(20, 30))
-        bags.split(name, [mode(35, value=False), *words(30, 40)])
-        bags.end()
-        assert bags.seconds() == [*halves(0, 9), *halves(36, 40)]
-        assert bags.seconds("/privacy_mode") == [-3.0]
-        [found] = [each for each in excluded_between(bags.bag_dir, T0, MAX_NS) if each.held]
-        assert ((found.start - T0) / S, (found.stop - T0) / S) == (9.2, 36.0)
-
-    def test_a_recording_from_before_is_left_alone(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        (bags.bag_dir / SCREENED_FILE).unlink()
-        bags.screening = bags.new()
-        bags.split(name, [mode(0, value=True), *words(0, 10)])
-        bags.step()
-        assert bags.seconds() == halves(0, 10)
-
-    @pytest.mark.parametrize("keeps", [False, True])
-    def test_a_topic_that_is_never_heard(self, tmp_path: Path, keeps: bool) -> None:
-        bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=not keeps))
-        bags.split(bags.begin(0), words(0, 10))
-        bags.end()
-        assert bags.seconds() == (halves(0, 10) if keeps else [])
-        assert len(bags.served()) == 1
-
-    def test_a_topic_that_falls_silent(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        said = [mode(n, value=False) for n in range(5)]
-        bags.split(bags.begin(0), [*said, *words(0, 10)], VOLATILE)
-        bags.end()
-        assert bags.seconds() == halves(0, 6)
-
-    @pytest.mark.parametrize(
-        ("said", "problem"),
-        [
-            (word(5, "/privacy_mode"), "/privacy_mode: the values hold no boolean"),
-            (replace(mode(5, value=False), body=b""), "the rule privacy: "),
-        ],
-        ids=["another type", "not decoded"],
+    assert bags.served() == []
+    assert (
+        "have no field 'pose.position.x'; their fields are: " in bags.screening.failing_rules()[0]
     )
-    def test_a_message_that_cannot_show_it_is_unknown_and_reported(
-        self, tmp_path: Path, said: Msg, problem: str
-    ) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        bags.split(bags.begin(0), [mode(-2, value=False), said, *words(0, 10)])
+    assert "3 splits are not served" in (bags.screening.problem() or "")
+    failed = [each for each in logs if each["event"] == "exclusion_rule_fails"]
+    # Every ten minutes; a step is a minute.
+    assert [each["log_level"] for each in failed] == ["error"]
+    bags.now_s += 600
+    with structlog.testing.capture_logs() as logs:
+        bags.step()
+    assert [each["event"] for each in logs].count("exclusion_rule_fails") == 1
+    # As the message has it, and as the schema map names it.
+    bags.rules = (rule("pose.pose.position.x"),)
+    bags.screening = bags.new()
+    bags.end()
+    assert bags.seconds() == halves(0, 5)
+    assert (bags.screening.failing_rules(), bags.screening.problem()) == ((), None)
+
+
+def test_what_holds_at_the_end_holds_after_a_restart(tmp_path: Path) -> None:
+    bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=False))
+    bags.split(bags.begin(0), [mode(2, value=True), *words(0, 10)])
+    bags.end()
+    bags.screening = bags.new()
+    new = bags.begin(30)
+    bags.split(new, [mode(32, value=False), *words(30, 40)])
+    bags.end()
+    assert bags.seconds() == [0.5, *halves(33, 40)]
+
+
+def test_latched_messages_from_before_stay(bags: ScreenedBags) -> None:
+    old = bags.begin(0)
+    map_then = mode(0, value=False)
+    first = [word(1, "/map"), map_then, mode(5, value=True), word(6, "/map"), *words(0, 10)]
+    bags.split(old, first)
+    new = bags.begin(10)
+    bags.end(old)
+    again = [
+        type(each)(each.topic, each.type, T0 + 11 * S, each.body, each.log_time)
+        for each in (word(1, "/map"), word(6, "/map"))
+    ]
+    bags.split(new, [*again, mode(11, value=True, published=5), *words(11, 20)])
+    bags.end()
+    # Before the first second nothing was known.
+    assert bags.seconds("/map") == [1.0, 11.0]
+
+
+def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    # Nothing is known of the mode yet: what the next recording receives again may be served.
+    bags.split(name, [word(1, "/map"), *words(0, 10)])
+    bags.split(name, [mode(12, value=False), *words(10, 20)])
+    bags.step()
+    assert bags.screening.excluded_latched() == set()
+    bags.split(name, [mode(22, value=True), word(25, "/map"), *words(20, 30)])
+    bags.split(name, [mode(32, value=False), *words(30, 40)])
+    bags.split(name, words(40, 50))
+    bags.step()
+    assert bags.screening.excluded_latched() == {"/map"}
+    bags.split(name, [word(55, "/map"), *words(50, 60)])
+    bags.end()
+    assert bags.screening.excluded_latched() == set()
+    assert bags.seconds("/map") == [55.0]
+
+
+def test_a_full_disk_holds_splits_back(bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = bags.begin(0)
+    split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+
+    with monkeypatch.context() as patched:
+        patched.setattr(McapWriter, "cut", FULL)
         bags.end()
-        assert bags.seconds() == halves(0, 4)
-        assert problem in (bags.screening.problem() or "")
-
-    def test_a_rule_for_a_field_that_is_not_there_cuts_nothing_until_it_is_corrected(
-        self, tmp_path: Path
-    ) -> None:
-        def rule(field: str) -> ExclusionRule:
-            condition = parse_condition("above", 5, 0.5, field)
-            return privacy(topic="/odom", condition=condition, stale=100 * S)
-
-        def driven(begin: int, stop: int) -> list[Msg]:
-            return [odom(T0 + n * S, float(n), 0.0) for n in range(begin, stop)]
-
-        bags = ScreenedBags(tmp_path / "bags", rule("pose.position.x"))
-        name = bags.begin(0)
-        bags.split(name, [*driven(0, 10), *words(0, 10)])
-        with structlog.testing.capture_logs() as logs:
-            bags.step()
-            bags.split(name, [*driven(10, 20), *words(10, 20)])
-            bags.end(name)
-            old = bags.begin(20)
-            bags.split(old, [*driven(20, 30), *words(20, 30)])
-            bags.end()
         assert bags.served() == []
-        assert (
-            "have no field 'pose.position.x'; their fields are: "
-            in bags.screening.failing_rules()[0]
-        )
-        assert "3 splits are not served" in (bags.screening.problem() or "")
-        failed = [each for each in logs if each["event"] == "exclusion_rule_fails"]
-        # Every ten minutes; a step is a minute.
-        assert [each["log_level"] for each in failed] == ["error"]
-        bags.now_s += 600
-        with structlog.testing.capture_logs() as logs:
+        problem = bags.screening.problem() or ""
+        assert "1 split is not served" in problem
+        assert f"{name}/{split.name}: No space left on device" in problem
+        assert [each.name for each in split.parent.iterdir()] == [split.name]
+    bags.end()
+    assert (bags.seconds(), bags.screening.problem()) == (halves(0, 4), None)
+
+
+def test_a_split_that_cannot_be_read_stays_held_back(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    spoil_chunk(bags.split(name, [mode(12, value=True), *words(10, 20)]), 0)
+    bags.split(name, words(20, 30))
+    bags.end()
+    # Since it may have said that the condition holds, the next one is unknown.
+    assert bags.seconds() == halves(0, 9)
+    assert f"{name}_1.mcap" in (bags.screening.problem() or "")
+    assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
+
+
+def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
+    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    bad = bags.split(name, [mode(10, value=False), *words(10, 20)])
+    bags.split(name, [mode(20, value=False), *words(20, 30)])
+    fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+    fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
+    bags.live.clear()
+    for _ in range(24):
+        with pytest.raises(BagUnreachableError):
             bags.step()
-        assert [each["event"] for each in logs].count("exclusion_rule_fails") == 1
-        # As the message has it, and as the schema map names it.
-        bags.rules = (rule("pose.pose.position.x"),)
-        bags.screening = bags.new()
-        bags.end()
-        assert bags.seconds() == halves(0, 5)
-        assert (bags.screening.failing_rules(), bags.screening.problem()) == ((), None)
-
-
-class TestRotations:
-    def test_the_state_carries_over_them(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        old = bags.begin(0)
-        bags.split(old, [mode(0, value=False), mode(5, value=True), *words(0, 10)])
-        new = bags.begin(9)
-        bags.split(old, words(10, 13))
-        again = mode(11, value=True, published=5)
-        bags.split(new, [again, mode(15, value=False), *words(11, 20)])
-        bags.step()
-        bags.end(old)
-        bags.split(new, words(20, 30))
-        bags.end()
-        assert bags.seconds() == [*halves(0, 4), *halves(16, 30)]
-
-    def test_what_holds_at_the_end_holds_after_a_restart(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags", privacy(excludes_unknown=False))
-        bags.split(bags.begin(0), [mode(2, value=True), *words(0, 10)])
-        bags.end()
-        bags.screening = bags.new()
-        new = bags.begin(30)
-        bags.split(new, [mode(32, value=False), *words(30, 40)])
-        bags.end()
-        assert bags.seconds() == [0.5, *halves(33, 40)]
-
-    def test_a_publisher_that_does_not_come_back_is_unknown(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        old = bags.begin(0)
-        bags.split(old, [mode(-2, value=False), *words(0, 10)])
-        new = bags.begin(8)
-        bags.split(new, words(8, 20))
-        bags.split(new, words(20, 30))
-        bags.end(old)
-        bags.end()
-        assert bags.seconds() == sorted([*halves(0, 10), 8.5, 9.5, 10.5, 11.5])
-
-    def test_latched_messages_from_before_stay(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        old = bags.begin(0)
-        map_then = mode(0, value=False)
-        first = [word(1, "/map"), map_then, mode(5, value=True), word(6, "/map"), *words(0, 10)]
-        bags.split(old, first)
-        new = bags.begin(10)
-        bags.end(old)
-        again = [
-            type(each)(each.topic, each.type, T0 + 11 * S, each.body, each.log_time)
-            for each in (word(1, "/map"), word(6, "/map"))
-        ]
-        bags.split(new, [*again, mode(11, value=True, published=5), *words(11, 20)])
-        bags.end()
-        # Before the first second nothing was known.
-        assert bags.seconds("/map") == [1.0, 11.0]
-
-    def test_a_latched_topic_is_excluded_until_a_newer_message_is_not(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        # Nothing is known of the mode yet: what the next recording receives again may be served.
-        bags.split(name, [word(1, "/map"), *words(0, 10)])
-        bags.split(name, [mode(12, value=False), *words(10, 20)])
-        bags.step()
-        assert bags.screening.excluded_latched() == set()
-        bags.split(name, [mode(22, value=True), word(25, "/map"), *words(20, 30)])
-        bags.split(name, [mode(32, value=False), *words(30, 40)])
-        bags.split(name, words(40, 50))
-        bags.step()
-        assert bags.screening.excluded_latched() == {"/map"}
-        bags.split(name, [word(55, "/map"), *words(50, 60)])
-        bags.end()
-        assert bags.screening.excluded_latched() == set()
-        assert bags.seconds("/map") == [55.0]
-
-
-class TestFaults:
-    def test_a_full_disk_holds_splits_back(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
-
-        with monkeypatch.context() as patched:
-            patched.setattr(McapWriter, "cut", FULL)
-            bags.end()
-            assert bags.served() == []
-            problem = bags.screening.problem() or ""
-            assert "1 split is not served" in problem
-            assert f"{name}/{split.name}: No space left on device" in problem
-            assert [each.name for each in split.parent.iterdir()] == [split.name]
-        bags.end()
-        assert (bags.seconds(), bags.screening.problem()) == (halves(0, 4), None)
-
-    def test_a_split_that_cannot_be_read_stays_held_back(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
-        spoil_chunk(bags.split(name, [mode(12, value=True), *words(10, 20)]), 0)
-        bags.split(name, words(20, 30))
-        bags.end()
-        # Since it may have said that the condition holds, the next one is unknown.
-        assert bags.seconds() == halves(0, 9)
-        assert f"{name}_1.mcap" in (bags.screening.problem() or "")
-        assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
-
-    def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
-        bad = bags.split(name, [mode(10, value=False), *words(10, 20)])
-        bags.split(name, [mode(20, value=False), *words(20, 30)])
-        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
-        fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
-        bags.live.clear()
-        for _ in range(24):
-            with pytest.raises(BagUnreachableError):
-                bags.step()
-            assert bags.served() == []
-            bags.now_s += 3540
-        bags.end()
-        assert [path.name for path in bags.served()] == [f"{name}_0.mcap", f"{name}_2.mcap"]
-        assert f"{bad.name}: it cannot be opened" in (bags.screening.problem() or "")
-
-    def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(
-        self, tmp_path: Path
-    ) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(0, value=False), mode(2, value=True), *words(0, 10)])
-        theirs = write_mcap(bags.bag_dir / name / "theirs_0.mcap", words(0, 10))
-        before = theirs.read_bytes()
-        bags.end()
-        assert theirs.read_bytes() == before
-        assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
-        assert f"{name}/theirs_0.mcap" in (bags.screening.problem() or "")
-
-    def test_a_state_that_cannot_be_written_changes_nothing(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
-        before = split.read_bytes()
-
-        with monkeypatch.context() as patched:
-            patched.setattr(SCREENED, "write", FULL)
-            with pytest.raises(OSError, match="No space"):
-                bags.end()
-            with pytest.raises(RecorderError, match=r"screened\.json: No space"):
-                bags.begin(20)
-        assert (split.read_bytes(), bags.served()) == (before, [])
-        bags.end()
-        assert bags.seconds() == halves(0, 4)
-
-    def test_a_damaged_state_serves_nothing_and_begins_nothing(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 10)])
-        bags.end()
-        (bags.bag_dir / SCREENED_FILE).write_text("{")
         assert bags.served() == []
-        bags.screening = bags.new()
-        with pytest.raises(RecorderError, match="delete this file"):
+        bags.now_s += 3540
+    bags.end()
+    assert [path.name for path in bags.served()] == [f"{name}_0.mcap", f"{name}_2.mcap"]
+    assert f"{bad.name}: it cannot be opened" in (bags.screening.problem() or "")
+
+
+def test_a_bag_of_others_in_a_recording_is_neither_changed_nor_served(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(0, value=False), mode(2, value=True), *words(0, 10)])
+    theirs = write_mcap(bags.bag_dir / name / "theirs_0.mcap", words(0, 10))
+    before = theirs.read_bytes()
+    bags.end()
+    assert theirs.read_bytes() == before
+    assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
+    assert f"{name}/theirs_0.mcap" in (bags.screening.problem() or "")
+
+
+def test_a_state_that_cannot_be_written_changes_nothing(
+    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = bags.begin(0)
+    split = bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)])
+    before = split.read_bytes()
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SCREENED, "write", FULL)
+        with pytest.raises(OSError, match="No space"):
+            bags.end()
+        with pytest.raises(RecorderError, match=r"screened\.json: No space"):
             bags.begin(20)
+    assert (split.read_bytes(), bags.served()) == (before, [])
+    bags.end()
+    assert bags.seconds() == halves(0, 4)
 
-    def test_a_clock_that_is_set_back_leaves_nothing_sure(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        name = bags.begin(0)
-        bags.split(name, [mode(-2, value=False), *words(0, 30)])
-        bags.split(name, [mode(12, value=True), *words(10, 20)])
-        bags.split(name, words(15, 25))
-        bags.split(name, words(40, 50))
-        bags.end()
-        # It held from 12 s on by one of the two clocks, and is not known to have ended.
-        assert bags.seconds() == halves(0, 9)
 
-    def test_a_recording_that_never_began_is_forgotten(self, tmp_path: Path) -> None:
-        bags = ScreenedBags(tmp_path / "bags")
-        failed, name = bags.begin(0), bags.begin(1)
-        bags.split(name, [mode(1, value=False), *words(2, 10)])
-        bags.live.discard(failed)
-        bags.split(name, words(10, 20))
-        bags.step()
-        assert len(bags.served()) == 1
-        state = SCREENED.read(bags.bag_dir)
-        assert state is not None
-        assert [*state.recordings] == [name]
+def test_a_damaged_state_serves_nothing_and_begins_nothing(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 10)])
+    bags.end()
+    (bags.bag_dir / SCREENED_FILE).write_text("{")
+    assert bags.served() == []
+    bags.screening = bags.new()
+    with pytest.raises(RecorderError, match="delete this file"):
+        bags.begin(20)
+
+
+def test_a_clock_that_is_set_back_leaves_nothing_sure(bags: ScreenedBags) -> None:
+    name = bags.begin(0)
+    bags.split(name, [mode(-2, value=False), *words(0, 30)])
+    bags.split(name, [mode(12, value=True), *words(10, 20)])
+    bags.split(name, words(15, 25))
+    bags.split(name, words(40, 50))
+    bags.end()
+    # It held from 12 s on by one of the two clocks, and is not known to have ended.
+    assert bags.seconds() == halves(0, 9)
+
+
+def test_a_recording_that_never_began_is_forgotten(bags: ScreenedBags) -> None:
+    failed, name = bags.begin(0), bags.begin(1)
+    bags.split(name, [mode(1, value=False), *words(2, 10)])
+    bags.live.discard(failed)
+    bags.split(name, words(10, 20))
+    bags.step()
+    assert len(bags.served()) == 1
+    state = SCREENED.read(bags.bag_dir)
+    assert state is not None
+    assert [*state.recordings] == [name]
 
 
 STEPS = st.lists(st.tuples(st.integers(1, 4), st.sampled_from([None, True, False])), max_size=6)
@@ -401,9 +373,8 @@ EXPECTED = [*halves(0, 4), *halves(14, 24)]
 
 @pytest.mark.parametrize("moment", range(POINTS + 1))
 def test_a_kill_at_any_point_serves_nothing_unscreened(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: int
+    bags: ScreenedBags, monkeypatch: pytest.MonkeyPatch, moment: int
 ) -> None:
-    bags = ScreenedBags(tmp_path / "bags")
     killed = 0
 
     def step() -> None:
@@ -471,8 +442,7 @@ def test_however_a_recording_is_cut_into_splits(
     assert bags.seconds() == [at for at in [0.0, *halves(0, 20)] if stays(at)]
 
 
-def test_metadata_counts_what_is_left(tmp_path: Path) -> None:
-    bags = ScreenedBags(tmp_path / "bags")
+def test_metadata_counts_what_is_left(bags: ScreenedBags) -> None:
     name = bags.begin(0)
     bags.split(name, [mode(-2, value=False), mode(5, value=True), *words(0, 10)], LATCHED)
     metadata = bags.bag_dir / name / METADATA_FILE

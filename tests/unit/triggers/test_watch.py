@@ -32,356 +32,358 @@ def watched(tmp_path: Path, *rules: Rule, **limits: object) -> WatchedBags:
     return WatchedBags(tmp_path / "bags", rules or [rule()], **limits)
 
 
+@pytest.fixture
+def robot(tmp_path: Path) -> WatchedBags:
+    return watched(tmp_path)
+
+
 def seconds(begin: int, stop: int, true_at: Collection[int] = ()) -> list[Msg]:
     return [flag(n, n in true_at) for n in range(begin, stop)]
 
 
-class TestMoments:
-    def test_a_match_becomes_a_moment_named_after_its_rule(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        for begin in (0, 10, 20):
-            robot.split(seconds(begin, begin + 10, {6}))
-        robot.clock.at = T0 + 40 * S
+def test_a_match_becomes_a_moment_named_after_its_rule(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    for begin in (0, 10, 20):
+        robot.split(seconds(begin, begin + 10, {6}))
+    robot.clock.at = T0 + 40 * S
+    robot.look()
+    assert robot.spans() == [(1, 9)]
+    [moment] = robot.moments()
+    assert moment.folder.name.endswith("-bumper")
+    assert (moment.moment.rule, moment.moment.matches) == ("bumper", 1)
+    assert (moment.moment.pending, moment.moment.missing) == (False, ())
+    assert (robot.record().fired, robot.record().moments) == (1, 1)
+
+
+def test_what_comes_after_it_follows_when_it_is_closed(robot: WatchedBags) -> None:
+    name = robot.begin(T0)
+    robot.split(seconds(0, 10, {7}))
+    robot.clock.at = T0 + 9 * S
+    robot.look()
+    [moment] = robot.moments()
+    assert (moment.moment.pending, len(moment.files)) == (True, 1)
+    # A recorder that was killed meanwhile goes on with it.
+    robot.house = robot.new_house()
+    robot.split(seconds(10, 20), name)
+    robot.split(seconds(20, 30), name)
+    robot.clock.at = T0 + 31 * S
+    robot.house.keep_moments()
+    [moment] = robot.moments()
+    assert (moment.moment.pending, len(moment.files)) == (False, 2)
+    assert moment.moment.missing == ()
+
+
+def test_what_was_never_recorded_of_it_is_said(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 8, {1, 7}))
+    robot.clock.at = T0 + 60 * S
+    robot.close_all()
+    [moment] = robot.moments()
+    assert (moment.moment.request.start - T0, moment.moment.matches) == (-4 * S, 2)
+    assert [each.split(" from ")[0] for each in moment.moment.missing] == [
+        "nothing is recorded",
+        "nothing is recorded",
+    ]
+
+
+def test_adjacent_matches_join_and_others_do_not(robot: WatchedBags) -> None:
+    name = robot.begin(T0)
+    robot.split(seconds(0, 30, {6, 9, 12}), name)
+    robot.clock.at = T0 + 30 * S
+    robot.look()
+    assert robot.spans() == [(1, 15)]
+    robot.split(seconds(30, 60, {32, 45}), name)
+    robot.close_all()
+    assert robot.spans() == [(1, 15), (27, 35), (40, 48)]
+    assert [each.moment.matches for each in robot.moments()] == [3, 1, 1]
+
+
+def test_a_later_match_extends_a_moment_that_is_stored(robot: WatchedBags) -> None:
+    name = robot.begin(T0)
+    robot.split(seconds(0, 10, {6}), name)
+    robot.look()
+    robot.split(seconds(10, 20, {11}), name)
+    robot.split(seconds(20, 30), name)
+    robot.clock.at = T0 + 30 * S
+    robot.look()
+    assert robot.spans() == [(1, 14)]
+    [moment] = robot.moments()
+    assert (moment.moment.matches, len(moment.files), moment.moment.pending) == (2, 2, False)
+    assert robot.record().moments == 1
+
+
+def test_a_rule_begins_with_what_is_recorded_from_now_on(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10, {6}))
+    robot.beat(state=RecorderState.STOPPED)
+    (robot.bag_dir / TRIGGERS_FILE).unlink()
+    robot.house = robot.new_house()
+    robot.look()
+    robot.begin(T0 + 20 * S)
+    robot.split(seconds(20, 30, {26}))
+    robot.close_all()
+    assert robot.spans() == [(21, 29)]
+
+
+def test_what_each_recording_receives_again_fires_once(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    said = Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, boolean(0, True).body, T0 + 5 * S - 1)
+    robot.split([text(T0, "a"), said, text(T0 + 9 * S, "b")], layout=LATCHED)
+    for at in (10, 20, 30):
+        old, new = robot.names[-1], robot.begin(T0 + at * S)
+        robot.hand_over(old, new, T0 + at * S, f"{old}_0.mcap")
+        again = Msg(said.topic, said.type, T0 + at * S + 1, said.body, said.publish_time)
+        robot.split([again, text(T0 + (at + 5) * S, "c")], layout=LATCHED)
         robot.look()
-        assert robot.spans() == [(1, 9)]
-        [moment] = robot.moments()
-        assert moment.folder.name.endswith("-bumper")
-        assert (moment.moment.rule, moment.moment.matches) == ("bumper", 1)
-        assert (moment.moment.pending, moment.moment.missing) == (False, ())
-        assert (robot.record().fired, robot.record().moments) == (1, 1)
-
-    def test_what_comes_after_it_follows_when_it_is_closed(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        name = robot.begin(T0)
-        robot.split(seconds(0, 10, {7}))
-        robot.clock.at = T0 + 9 * S
-        robot.look()
-        [moment] = robot.moments()
-        assert (moment.moment.pending, len(moment.files)) == (True, 1)
-        # A recorder that was killed meanwhile goes on with it.
-        robot.house = robot.new_house()
-        robot.split(seconds(10, 20), name)
-        robot.split(seconds(20, 30), name)
-        robot.clock.at = T0 + 31 * S
-        robot.house.keep_moments()
-        [moment] = robot.moments()
-        assert (moment.moment.pending, len(moment.files)) == (False, 2)
-        assert moment.moment.missing == ()
-
-    def test_what_was_never_recorded_of_it_is_said(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        robot.split(seconds(0, 8, {1, 7}))
-        robot.clock.at = T0 + 60 * S
-        robot.close_all()
-        [moment] = robot.moments()
-        assert (moment.moment.request.start - T0, moment.moment.matches) == (-4 * S, 2)
-        assert [each.split(" from ")[0] for each in moment.moment.missing] == [
-            "nothing is recorded",
-            "nothing is recorded",
-        ]
-
-    def test_adjacent_matches_join_and_others_do_not(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        name = robot.begin(T0)
-        robot.split(seconds(0, 30, {6, 9, 12}), name)
-        robot.clock.at = T0 + 30 * S
-        robot.look()
-        assert robot.spans() == [(1, 15)]
-        robot.split(seconds(30, 60, {32, 45}), name)
-        robot.close_all()
-        assert robot.spans() == [(1, 15), (27, 35), (40, 48)]
-        assert [each.moment.matches for each in robot.moments()] == [3, 1, 1]
-
-    def test_a_later_match_extends_a_moment_that_is_stored(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        name = robot.begin(T0)
-        robot.split(seconds(0, 10, {6}), name)
-        robot.look()
-        robot.split(seconds(10, 20, {11}), name)
-        robot.split(seconds(20, 30), name)
-        robot.clock.at = T0 + 30 * S
-        robot.look()
-        assert robot.spans() == [(1, 14)]
-        [moment] = robot.moments()
-        assert (moment.moment.matches, len(moment.files), moment.moment.pending) == (2, 2, False)
-        assert robot.record().moments == 1
-
-    def test_a_rule_begins_with_what_is_recorded_from_now_on(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        robot.split(seconds(0, 10, {6}))
-        robot.beat(state=RecorderState.STOPPED)
-        (robot.bag_dir / TRIGGERS_FILE).unlink()
-        robot.house = robot.new_house()
-        robot.look()
-        robot.begin(T0 + 20 * S)
-        robot.split(seconds(20, 30, {26}))
-        robot.close_all()
-        assert robot.spans() == [(21, 29)]
+    robot.close_all()
+    assert robot.record().fired == 1
 
 
-class TestLatchedTopics:
-    def test_what_each_recording_receives_again_fires_once(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        said = Msg(
-            "/bumper", "std_msgs/msg/Bool", T0 + 5 * S, boolean(0, True).body, T0 + 5 * S - 1
+def test_what_was_published_long_before_fires_nothing(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    old = Msg("/bumper", "std_msgs/msg/Bool", T0 + S, boolean(0, True).body, T0 - 60 * S)
+    robot.split([text(T0, "a"), old, text(T0 + 9 * S, "b")], layout=LATCHED)
+    robot.close_all()
+    assert robot.record().fired == 0
+
+
+def test_a_topic_that_falls_silent(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
+    name = robot.begin(T0)
+    robot.split(seconds(0, 10), name)
+    robot.split([text(T0 + n * S, "x") for n in range(10, 20)], name)
+    robot.look()
+    robot.split([text(T0 + n * S, "x") for n in range(20, 30)], name)
+    robot.close_all()
+    assert robot.fired_at() == [T0 + 14 * S]
+    assert robot.spans() == [(4, 17)]
+
+
+def test_a_recorder_that_was_off_is_no_silence(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.beat(state=RecorderState.STOPPED)
+    robot.look()
+    robot.begin(T0 + 60 * S)
+    robot.split(seconds(60, 70))
+    robot.close_all()
+    assert robot.record("quiet").fired == 0
+
+
+def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(tmp_path: Path) -> None:
+    robot = WatchedBags(tmp_path / "bags", [rule(hold=S)], unrecorded={"/bumper"})
+    assert [each["rule"] for each in robot.log if each["event"] == "rule_not_recorded"]
+    assert "/bumper is not recorded" in (robot.record("bumper").problem or "")
+    robot.unrecorded.clear()
+    robot.house = robot.new_house()
+    robot.look()
+    assert robot.record("bumper").problem is None
+
+
+def test_a_recording_that_ended_unasked(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule("restart", **RESTART))
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.clock.at = T0 + 9 * S
+    robot.house.note_restart(T0 + 8 * S, "died")
+    robot.house.keep_moments()
+    assert robot.spans() == [(4, 12)]
+
+
+def test_a_recorder_that_was_killed(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule("restart", **RESTART))
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.clock.at = T0 + 9 * S
+    robot.beat(robot.names[-1])
+    robot.clock.at = T0 + 30 * S
+    robot.house = robot.new_house()
+    robot.house.repair()
+    robot.look()
+    assert robot.spans() == [(4, 33)]
+    # One that was stopped ended as it should.
+    robot.beat(state=RecorderState.STOPPED)
+    robot.house = robot.new_house()
+    robot.house.repair()
+    robot.look()
+    assert robot.record("restart").fired == 1
+
+
+def test_a_noisy_rule_leaves_the_other_its_share(tmp_path: Path) -> None:
+    noisy = rule("noisy", before=0, after=0, max_bytes=6_000)
+    quiet = rule("quiet", topic="/door", max_bytes=6_000)
+    robot = watched(tmp_path, noisy, quiet, moments_bytes=12_000)
+    name = robot.begin(T0)
+    for begin in range(0, 100, 10):
+        robot.split(
+            [
+                *seconds(begin, begin + 10, range(5, 100, 10)),
+                *(flag(begin + n + 0.5, begin + n == 95, "/door") for n in range(10)),
+            ],
+            name,
         )
-        robot.split([text(T0, "a"), said, text(T0 + 9 * S, "b")], layout=LATCHED)
-        for at in (10, 20, 30):
-            old, new = robot.names[-1], robot.begin(T0 + at * S)
-            robot.hand_over(old, new, T0 + at * S, f"{old}_0.mcap")
-            again = Msg(said.topic, said.type, T0 + at * S + 1, said.body, said.publish_time)
-            robot.split([again, text(T0 + (at + 5) * S, "c")], layout=LATCHED)
+        robot.look()
+    robot.clock.at = T0 + 200 * S
+    robot.close_all()
+    one, other = robot.record("noisy"), robot.record("quiet")
+    assert (one.fired, other.fired) == (10, 1)
+    assert 0 < one.moments < 10
+    assert one.moments + one.refused == 10
+    assert "max_gb of the rule noisy" in (one.problem or "")
+    assert len(robot.logged("trigger_not_kept")) == 1
+    assert (other.moments, other.refused, other.problem) == (1, 0, None)
+    kept = [sum(each.files.values()) for each in robot.moments() if each.moment.rule == "noisy"]
+    assert sum(kept) <= 6_000
+
+
+def test_a_rule_that_fires_too_often_says_so_once(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule(before=0, after=0, max_per_hour=3))
+    name = robot.begin(T0)
+    for begin in range(0, 60, 10):
+        robot.split(seconds(begin, begin + 10, range(0, 60, 2)), name)
+        robot.look()
+    robot.close_all()
+    record = robot.record()
+    assert (record.fired, record.moments, record.refused) == (30, 3, 27)
+    [said] = robot.logged("trigger_not_kept")
+    assert "max_per_hour: 3" in said["reason"]
+
+
+def test_a_rule_that_matches_all_the_time_says_so_once(robot: WatchedBags) -> None:
+    name = robot.begin(T0)
+    for begin in range(0, 4000, 1000):
+        robot.split([flag(n, True) for n in range(begin, begin + 1000, 8)], name)
+        robot.look()
+    robot.close_all()
+    assert (robot.record().fired, robot.record().always_since) == (1, T0)
+    assert len(robot.logged("trigger_matches_always")) == 1
+
+
+def test_age_deletes_nothing_that_a_rule_may_need(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule(before=50 * S), max_age_h=20 / 3600)
+    name = robot.begin(T0)
+    splits = [robot.split(seconds(begin, begin + 10), name) for begin in range(0, 100, 10)]
+    robot.clock.at = T0 + 100 * S
+    robot.look()
+    robot.look()
+    # Until 98 s everything was searched, and 50 s before that may be needed.
+    assert [each.exists() for each in splits] == [False] * 4 + [True] * 6
+
+
+def test_the_budget_deletes_it_and_that_is_said(tmp_path: Path) -> None:
+    robot = watched(tmp_path, rule(before=3600 * S), max_bytes=10_000)
+    name = robot.begin(T0)
+    for begin in range(0, 100, 10):
+        robot.split(seconds(begin, begin + 10), name)
+    robot.look()
+    robot.look()
+    assert robot.logged("needed_bags_deleted")
+    assert "were deleted to make room" in (robot.record().problem or "")
+
+
+def test_a_full_disk_keeps_the_firing_until_there_is_room(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 10, {6}))
+    robot.clock.at = T0 + 30 * S
+
+    full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
+    with monkeypatch.context() as broken:
+        broken.setattr(saved_moments, "make_moment_folder", full)
+        broken.setattr(json_files, "write_durably", full)
+        robot.close_all()
+        robot.look()
+    assert not robot.moments()
+    [said] = robot.logged("trigger_not_kept")
+    assert "No space left" in said["reason"]
+    robot.look()
+    assert robot.spans() == [(1, 9)]
+    assert (robot.record().fired, robot.record().moments) == (1, 1)
+
+
+def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    bad = robot.split(seconds(0, 10, {2}))
+    robot.split(seconds(10, 20, {16}))
+    robot.clock.at = T0 + 40 * S
+    fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
+    fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
+    robot.close_all()
+    assert robot.logged("moments_not_minded")
+    for hour in range(1, 25):
+        assert robot.spans() == []
+        robot.now_s = hour * 3600.0
+        robot.look()
+    assert robot.spans() == [(11, 19)]
+
+
+def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
+
+    failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    monkeypatch.setattr(TRIGGERS, "read", failing)
+    robot.house = robot.new_house()
+    name = robot.begin(T0)
+    for begin in range(0, 50, 10):
+        robot.split(seconds(begin, begin + 10), name)
+    robot.split(seconds(500, 510), name)
+    robot.look()
+    assert [told["reason"] for told in robot.logged("moments_not_minded")]
+    assert len([*robot.bag_dir.glob("rec_*/*.mcap")]) == 4  # of 6; by age there would be one
+
+
+def test_a_state_that_is_damaged_is_said_to_be_lost(robot: WatchedBags) -> None:
+    (robot.bag_dir / TRIGGERS_FILE).write_text('{"format": 1, "rules": 7}')
+    robot.house = robot.new_house()
+    robot.look()
+    [said] = robot.logged("trigger_state_lost")
+    assert "rules" in said["reason"]
+    assert robot.record().problem == said["reason"]
+
+
+@pytest.mark.parametrize("field", ["missing", "x"])
+def test_a_condition_that_nothing_can_meet_is_named(tmp_path: Path, field: str) -> None:
+    given = rule()
+    assert given.condition is not None
+    asked = rule(condition=type(given.condition)(given.condition.test, field))
+    robot = watched(tmp_path, asked)
+    robot.begin(T0)
+    robot.split(seconds(0, 10))
+    robot.close_all()
+    assert f"'{field}'" in (robot.record().problem or "")
+
+
+def test_messages_that_cannot_be_decoded_are_named(robot: WatchedBags) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 3), layout=McapLayout(definitions=False))
+    robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
+    robot.close_all()
+    assert "/bumper" in (robot.record().problem or "")
+
+
+def test_a_kill_between_moment_and_state_doubles_nothing(
+    robot: WatchedBags, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    robot.begin(T0)
+    robot.split(seconds(0, 30, {6, 9, 20}))
+    robot.clock.at = T0 + 60 * S
+
+    robot.beat(state=RecorderState.STOPPED)
+    with monkeypatch.context() as broken:
+        broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
+        with pytest.raises(SystemExit):
             robot.look()
-        robot.close_all()
-        assert robot.record().fired == 1
-
-    def test_what_was_published_long_before_fires_nothing(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        old = Msg("/bumper", "std_msgs/msg/Bool", T0 + S, boolean(0, True).body, T0 - 60 * S)
-        robot.split([text(T0, "a"), old, text(T0 + 9 * S, "b")], layout=LATCHED)
-        robot.close_all()
-        assert robot.record().fired == 0
-
-
-class TestOtherKinds:
-    def test_a_topic_that_falls_silent(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
-        name = robot.begin(T0)
-        robot.split(seconds(0, 10), name)
-        robot.split([text(T0 + n * S, "x") for n in range(10, 20)], name)
-        robot.look()
-        robot.split([text(T0 + n * S, "x") for n in range(20, 30)], name)
-        robot.close_all()
-        assert robot.fired_at() == [T0 + 14 * S]
-        assert robot.spans() == [(4, 17)]
-
-    def test_a_recorder_that_was_off_is_no_silence(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("quiet", hold=5 * S, **SILENT))
-        robot.begin(T0)
-        robot.split(seconds(0, 10))
-        robot.beat(state=RecorderState.STOPPED)
-        robot.look()
-        robot.begin(T0 + 60 * S)
-        robot.split(seconds(60, 70))
-        robot.close_all()
-        assert robot.record("quiet").fired == 0
-
-    def test_a_rule_on_a_topic_that_is_not_recorded_has_a_problem(self, tmp_path: Path) -> None:
-        robot = WatchedBags(tmp_path / "bags", [rule(hold=S)], unrecorded={"/bumper"})
-        assert [each["rule"] for each in robot.log if each["event"] == "rule_not_recorded"]
-        assert "/bumper is not recorded" in (robot.record("bumper").problem or "")
-        robot.unrecorded.clear()
-        robot.house = robot.new_house()
-        robot.look()
-        assert robot.record("bumper").problem is None
-
-    def test_a_recording_that_ended_unasked(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("restart", **RESTART))
-        robot.begin(T0)
-        robot.split(seconds(0, 10))
-        robot.clock.at = T0 + 9 * S
-        robot.house.note_restart(T0 + 8 * S, "died")
-        robot.house.keep_moments()
-        assert robot.spans() == [(4, 12)]
-
-    def test_a_recorder_that_was_killed(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule("restart", **RESTART))
-        robot.begin(T0)
-        robot.split(seconds(0, 10))
-        robot.clock.at = T0 + 9 * S
-        robot.beat(robot.names[-1])
-        robot.clock.at = T0 + 30 * S
-        robot.house = robot.new_house()
-        robot.house.repair()
-        robot.look()
-        assert robot.spans() == [(4, 33)]
-        # One that was stopped ended as it should.
-        robot.beat(state=RecorderState.STOPPED)
-        robot.house = robot.new_house()
-        robot.house.repair()
-        robot.look()
-        assert robot.record("restart").fired == 1
-
-
-class TestQuotas:
-    def test_a_noisy_rule_leaves_the_other_its_share(self, tmp_path: Path) -> None:
-        noisy = rule("noisy", before=0, after=0, max_bytes=6_000)
-        quiet = rule("quiet", topic="/door", max_bytes=6_000)
-        robot = watched(tmp_path, noisy, quiet, moments_bytes=12_000)
-        name = robot.begin(T0)
-        for begin in range(0, 100, 10):
-            robot.split(
-                [
-                    *seconds(begin, begin + 10, range(5, 100, 10)),
-                    *(flag(begin + n + 0.5, begin + n == 95, "/door") for n in range(10)),
-                ],
-                name,
-            )
-            robot.look()
-        robot.clock.at = T0 + 200 * S
-        robot.close_all()
-        one, other = robot.record("noisy"), robot.record("quiet")
-        assert (one.fired, other.fired) == (10, 1)
-        assert 0 < one.moments < 10
-        assert one.moments + one.refused == 10
-        assert "max_gb of the rule noisy" in (one.problem or "")
-        assert len(robot.logged("trigger_not_kept")) == 1
-        assert (other.moments, other.refused, other.problem) == (1, 0, None)
-        kept = [sum(each.files.values()) for each in robot.moments() if each.moment.rule == "noisy"]
-        assert sum(kept) <= 6_000
-
-    def test_a_rule_that_fires_too_often_says_so_once(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule(before=0, after=0, max_per_hour=3))
-        name = robot.begin(T0)
-        for begin in range(0, 60, 10):
-            robot.split(seconds(begin, begin + 10, range(0, 60, 2)), name)
-            robot.look()
-        robot.close_all()
-        record = robot.record()
-        assert (record.fired, record.moments, record.refused) == (30, 3, 27)
-        [said] = robot.logged("trigger_not_kept")
-        assert "max_per_hour: 3" in said["reason"]
-
-    def test_a_rule_that_matches_all_the_time_says_so_once(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        name = robot.begin(T0)
-        for begin in range(0, 4000, 1000):
-            robot.split([flag(n, True) for n in range(begin, begin + 1000, 8)], name)
-            robot.look()
-        robot.close_all()
-        assert (robot.record().fired, robot.record().always_since) == (1, T0)
-        assert len(robot.logged("trigger_matches_always")) == 1
-
-
-class TestRetention:
-    def test_age_deletes_nothing_that_a_rule_may_need(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule(before=50 * S), max_age_h=20 / 3600)
-        name = robot.begin(T0)
-        splits = [robot.split(seconds(begin, begin + 10), name) for begin in range(0, 100, 10)]
-        robot.clock.at = T0 + 100 * S
-        robot.look()
-        robot.look()
-        # Until 98 s everything was searched, and 50 s before that may be needed.
-        assert [each.exists() for each in splits] == [False] * 4 + [True] * 6
-
-    def test_the_budget_deletes_it_and_that_is_said(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path, rule(before=3600 * S), max_bytes=10_000)
-        name = robot.begin(T0)
-        for begin in range(0, 100, 10):
-            robot.split(seconds(begin, begin + 10), name)
-        robot.look()
-        robot.look()
-        assert robot.logged("needed_bags_deleted")
-        assert "were deleted to make room" in (robot.record().problem or "")
-
-
-class TestFaults:
-    def test_a_full_disk_keeps_the_firing_until_there_is_room(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        robot.split(seconds(0, 10, {6}))
-        robot.clock.at = T0 + 30 * S
-
-        full = Mock(side_effect=OSError(errno.ENOSPC, "No space left on device"))
-        with monkeypatch.context() as broken:
-            broken.setattr(saved_moments, "make_moment_folder", full)
-            broken.setattr(json_files, "write_durably", full)
-            robot.close_all()
-            robot.look()
-        assert not robot.moments()
-        [said] = robot.logged("trigger_not_kept")
-        assert "No space left" in said["reason"]
-        robot.look()
-        assert robot.spans() == [(1, 9)]
-        assert (robot.record().fired, robot.record().moments) == (1, 1)
-
-    def test_a_split_that_the_disk_never_gives_stops_the_rules_for_a_day(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        bad = robot.split(seconds(0, 10, {2}))
-        robot.split(seconds(10, 20, {16}))
-        robot.clock.at = T0 + 40 * S
-        fault = BagUnreachableError(str(bad), "it cannot be opened or read: Input/output error")
-        fail_reading(monkeypatch, "records", lambda path: fault if path == bad else None)
-        robot.close_all()
-        assert robot.logged("moments_not_minded")
-        for hour in range(1, 25):
-            assert robot.spans() == []
-            robot.now_s = hour * 3600.0
-            robot.look()
-        assert robot.spans() == [(11, 19)]
-
-    def test_where_its_state_cannot_be_read_the_budget_deletes_and_age_does_not(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        robot = watched(tmp_path, max_bytes=10_000, max_age_h=0.02)
-
-        failing = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
-        monkeypatch.setattr(TRIGGERS, "read", failing)
-        robot.house = robot.new_house()
-        name = robot.begin(T0)
-        for begin in range(0, 50, 10):
-            robot.split(seconds(begin, begin + 10), name)
-        robot.split(seconds(500, 510), name)
-        robot.look()
-        assert [told["reason"] for told in robot.logged("moments_not_minded")]
-        assert len([*robot.bag_dir.glob("rec_*/*.mcap")]) == 4  # of 6; by age there would be one
-
-    def test_a_state_that_is_damaged_is_said_to_be_lost(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        (robot.bag_dir / TRIGGERS_FILE).write_text('{"format": 1, "rules": 7}')
-        robot.house = robot.new_house()
-        robot.look()
-        [said] = robot.logged("trigger_state_lost")
-        assert "rules" in said["reason"]
-        assert robot.record().problem == said["reason"]
-
-    @pytest.mark.parametrize("field", ["missing", "x"])
-    def test_a_condition_that_nothing_can_meet_is_named(self, tmp_path: Path, field: str) -> None:
-        given = rule()
-        assert given.condition is not None
-        asked = rule(condition=type(given.condition)(given.condition.test, field))
-        robot = watched(tmp_path, asked)
-        robot.begin(T0)
-        robot.split(seconds(0, 10))
-        robot.close_all()
-        assert f"'{field}'" in (robot.record().problem or "")
-
-    def test_messages_that_cannot_be_decoded_are_named(self, tmp_path: Path) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        robot.split(seconds(0, 3), layout=McapLayout(definitions=False))
-        robot.split([Msg("/bumper", "std_msgs/msg/Bool", T0 + 5 * S, b"")])
-        robot.close_all()
-        assert "/bumper" in (robot.record().problem or "")
-
-    def test_a_kill_between_moment_and_state_doubles_nothing(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        robot = watched(tmp_path)
-        robot.begin(T0)
-        robot.split(seconds(0, 30, {6, 9, 20}))
-        robot.clock.at = T0 + 60 * S
-
-        robot.beat(state=RecorderState.STOPPED)
-        with monkeypatch.context() as broken:
-            broken.setattr(TRIGGERS, "write", Mock(side_effect=SystemExit))
-            with pytest.raises(SystemExit):
-                robot.look()
-        assert len(robot.moments()) == 2
-        robot.house = robot.new_house()
-        robot.look()
-        assert robot.spans() == [(1, 12), (15, 23)]
-        assert (robot.record().fired, robot.record().moments) == (3, 2)
+    assert len(robot.moments()) == 2
+    robot.house = robot.new_house()
+    robot.look()
+    assert robot.spans() == [(1, 12), (15, 23)]
+    assert (robot.record().fired, robot.record().moments) == (3, 2)
 
 
 def test_what_was_published_by_a_clock_that_was_ahead_makes_nothing_a_repeat(

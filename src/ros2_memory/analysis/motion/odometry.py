@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import pairwise
 from statistics import median_low
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
@@ -19,9 +18,6 @@ from ros2_memory.analysis.motion.path_length import (
     FEWEST,
     SPEED_STEPS,
     End,
-    Flags,
-    Floats,
-    Vectors,
     measured,
 )
 from ros2_memory.core.arrays import row_sums
@@ -31,6 +27,7 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
 
 ARRIVAL_JITTER_NS: Final[Ns] = 100 * NS_PER_MS
@@ -74,7 +71,6 @@ _MAX_RESETS: Final = 1000
 _UNCERTAIN: Final = 4.0
 """Standard deviations by which a step must exceed its neighbours to be longer than them."""
 
-Times: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Link: TypeAlias = Literal["driven", "gap", "jump", "reset"]
 """What is between two consecutive poses; only `driven` counts as distance."""
 
@@ -115,42 +111,33 @@ def link(
     step, cannot have driven.
     """
     elapsed = after.time - before.time
+    step_m, elapsed_s = _step(before, after)
+    from_origin_m = math.hypot(*after.position)
     is_gap = elapsed > GAP_NS and usual_ns is not None and elapsed > GAP_PERIODS * usual_ns
-    is_jump = _is_jump(before, after, fastest_mps)
-    if (is_gap or is_jump) and _leads_to_origin(before, after):
-        return "reset"
-    if is_jump:
-        return "jump"
-    if is_gap:
-        return "gap"
-    if near is not None and usual_ns is not None and _is_restart(before, after, usual_ns, near):
-        return "reset"
-    return "driven"
-
-
-def _is_jump(before: TimedPosition, after: TimedPosition, fastest_mps: float) -> bool:
-    # A burst shortens the time between two poses to nothing, which is no jump.
-    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
-    return distance(before.position, after.position) > fastest_mps * elapsed_s * (1 + 1e-9)
-
-
-def _leads_to_origin(before: TimedPosition, after: TimedPosition) -> bool:
-    step_m = distance(before.position, after.position)
-    return step_m > MOVED_M and math.hypot(*after.position) <= MOVED_M
-
-
-def _is_restart(
-    before: TimedPosition, after: TimedPosition, usual_ns: Ns, near: NearbyMotion
-) -> bool:
-    step_m = distance(before.position, after.position)
-    if step_m <= max(_RESTART_M, _LONGER * near.step_m):
-        return False
-    if math.hypot(*after.position) > max(_AT_ORIGIN_M, 2 * near.step_m):
-        return False
-    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
+    is_jump = _is_jump(step_m, elapsed_s, fastest_mps)
+    if is_gap or is_jump:
+        if step_m > MOVED_M >= from_origin_m:
+            return "reset"
+        return "jump" if is_jump else "gap"
+    if near is None or usual_ns is None or from_origin_m > max(_AT_ORIGIN_M, 2 * near.step_m):
+        return "driven"
     # From rest to rest, half of the time faster and half of it slower.
-    hard_mps2 = _HARD_MPS2[usual_ns > _DENSE_NS]
-    return step_m > max(_FASTER * near.speed_mps * elapsed_s, hard_mps2 * elapsed_s * elapsed_s / 4)
+    hardest_m = _HARD_MPS2[usual_ns > _DENSE_NS] * elapsed_s * elapsed_s / 4
+    usual_m = max(_LONGER * near.step_m, _FASTER * near.speed_mps * elapsed_s)
+    return "reset" if step_m > max(_RESTART_M, usual_m, hardest_m) else "driven"
+
+
+def _step(before: TimedPosition, after: TimedPosition) -> tuple[float, float]:
+    """Returns the length (m) of a step, and how long it took (s).
+
+    A burst shortens the time between two poses to nothing, which is neither a jump nor fast.
+    """
+    elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
+    return distance(before.position, after.position), elapsed_s
+
+
+def _is_jump(step_m: float, elapsed_s: float, fastest_mps: float) -> bool:
+    return step_m > fastest_mps * elapsed_s * (1 + 1e-9)
 
 
 def _motion_of(path: Sequence[TimedPosition]) -> NearbyMotion:
@@ -158,13 +145,8 @@ def _motion_of(path: Sequence[TimedPosition]) -> NearbyMotion:
     if len(path) < 2:
         return _STATIONARY
     half = max(len(path) // 2, 1)
-    speed_mps = max(
-        distance(here.position, there.position)
-        / unix_from_ns(max(there.time - here.time, ARRIVAL_JITTER_NS))
-        for here, there in zip(path[:-half], path[half:], strict=True)
-    )
-    steps = (distance(here.position, there.position) for here, there in pairwise(path))
-    return NearbyMotion(max(steps), speed_mps)
+    speed_mps = max(step_m / elapsed_s for step_m, elapsed_s in map(_step, path, path[half:]))
+    return NearbyMotion(max(step_m for step_m, _ in map(_step, path, path[1:])), speed_mps)
 
 
 class Leg(NamedTuple):
@@ -362,7 +344,7 @@ class MeasuredPath(NamedTuple):
     steps_m: Floats
 
 
-def measured_path(times: Times, positions: Vectors, fastest_mps: float) -> MeasuredPath:
+def measured_path(times: Ints, positions: Vectors, fastest_mps: float) -> MeasuredPath:
     """Measures poses: the more at a time, the better noise is distinguished from driving.
 
     Args:
@@ -397,18 +379,17 @@ def measured_path(times: Times, positions: Vectors, fastest_mps: float) -> Measu
     return MeasuredPath(motion.totals, motion.step_mps, tuple(parted), steps_m)
 
 
-def _odd_steps(apart: Times, steps_m: Floats, fastest_mps: float) -> list[int]:
+def _odd_steps(apart: Ints, steps_m: Floats, fastest_mps: float) -> list[int]:
     """Returns after which poses a gap, a jump or a reset may be."""
     plausible_m = fastest_mps * np.maximum(apart, ARRIVAL_JITTER_NS) / NS_PER_S
     beside_m = np.maximum(
         np.concatenate(([0.0], steps_m[:-1])), np.concatenate((steps_m[1:], [0.0]))
     )
     odd = (steps_m > _RESTART_M) & (steps_m > _LONGER * beside_m[: len(steps_m)])
-    steps: list[int] = np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
-    return steps
+    return np.flatnonzero((apart > GAP_NS) | (steps_m > plausible_m) | odd).tolist()
 
 
-def _poses(times: Times, positions: Vectors, begin: int, end: int) -> list[TimedPosition]:
+def _poses(times: Ints, positions: Vectors, begin: int, end: int) -> list[TimedPosition]:
     places = zip(times[begin:end].tolist(), positions[begin:end].tolist(), strict=True)
     return [TimedPosition(time, (x, y, z)) for time, (x, y, z) in places]
 
@@ -427,29 +408,23 @@ class Motion:
         self.totals = MotionTotals()
         self.step_mps = 0.0
 
-    def add_leg(self, times: Times, positions: Vectors) -> Floats:
+    def add_leg(self, times: Ints, positions: Vectors) -> Floats:
         """Takes a leg that does not go on from the one before; returns the length of its steps."""
         apart = np.diff(times)
-        piece = measured((times - times[0]) / NS_PER_S, positions)
+        seconds = (times - times[0]) / NS_PER_S
+        length_m, sum_m, head, tail, still, speed_mps, steps_m = measured(seconds, positions)
         begin = _poses(times, positions, 0, _NEARBY + 1)
         end = _poses(times, positions, max(len(times) - _NEARBY - 1, 0), len(times))
-        leg = Leg(
-            begin[0],
-            end[-1],
-            len(times),
-            int(np.median(apart)) if len(apart) else None,
-            piece.length_m,
-            piece.sum_m,
-            piece.head,
-            piece.tail,
-            piece.still,
-            _motion_of(begin),
-            _motion_of(end),
-        )
+        period_ns = int(np.median(apart)) if len(apart) else None
+        motion = _motion_of(begin), _motion_of(end)
+        count, first, last = len(times), begin[0], end[-1]
+        leg = Leg(first, last, count, period_ns, length_m, sum_m, head, tail, still, *motion)
         if len(times) <= SPEED_STEPS:
-            self.step_mps = max(self.step_mps, *map(_step_mps, pairwise(begin)), 0.0)
-        self._go_on(None, leg, piece.speed_mps)
-        return piece.steps_m
+            steps = zip(map(_step, begin, begin[1:]), apart >= ARRIVAL_JITTER_NS, strict=False)
+            speeds = (step_m / elapsed_s for (step_m, elapsed_s), is_known in steps if is_known)
+            self.step_mps = max(self.step_mps, *speeds, 0.0)
+        self._go_on(None, leg, speed_mps)
+        return steps_m
 
     def join(self, later: MotionTotals) -> bool:
         """Takes the legs that come next; returns whether a jump or reset led there."""
@@ -520,23 +495,14 @@ class Motion:
             totals.gaps += 1
             totals.gap_m += step_m
             return
-        if _is_jump(before, after, self._fastest_mps):
+        if _is_jump(*_step(before, after), self._fastest_mps):
             totals.jumps += 1
             totals.jumped_m += step_m
         if kind == "reset":
             totals.resets = (*totals.resets, after.time)[:_MAX_RESETS]
 
 
-def _step_mps(step: tuple[TimedPosition, TimedPosition]) -> float:
-    """Returns the speed of a step; 0 of one that takes no longer than arrivals jitter."""
-    here, there = step
-    elapsed = there.time - here.time
-    if elapsed < ARRIVAL_JITTER_NS:
-        return 0.0
-    return distance(here.position, there.position) / unix_from_ns(elapsed)
-
-
-def _usual_ns(apart: Times, index: int, known: Ns | None) -> Ns:
+def _usual_ns(apart: Ints, index: int, known: Ns | None) -> Ns:
     """Returns the usual time between poses around an interval, which itself counts least."""
     near: list[Ns] = apart[max(index - _NEARBY, 0) : index + 1 + _NEARBY].tolist()
     own_ns = near.pop(min(index, _NEARBY))

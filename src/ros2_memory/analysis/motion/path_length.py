@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -38,13 +38,8 @@ from ros2_memory.core.arrays import row_maxima, row_sums
 from ros2_memory.core.geometry import distance
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
+    from ros2_memory.core.arrays import Flags, Floats, Vectors
     from ros2_memory.core.model import Vector3
-
-Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
-Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
-Flags: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
 FEWEST: Final = 16
 """Positions below which no noise is estimated, and the plain sum is the length."""
@@ -188,26 +183,29 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
     x, y, z = positions[0].tolist()
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
-    creeps = [
-        (begin, end, _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z)))
-        for begin, end in _runs(stationary)
-        if end - begin >= _STATIONARY_STEPS or end - begin == len(plain)
-    ]
-    moved = lengths.copy()
-    steps = lengths.copy()
-    for begin, end, creep in creeps:
+    moved, steps, inside_m = lengths.copy(), lengths.copy(), list[float]()
+    before = after = None
+    for begin, end in _runs(stationary):
+        if end - begin < min(_STATIONARY_STEPS, len(plain)):
+            continue
+        creep = _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z))
         moved[begin:end] = 0.0
         steps[begin:end] = creep.length_m / (end - begin)
-    before = next((creep for begin, _, creep in creeps if begin == 0), None)
-    after = next((creep for _, end, creep in creeps if end == len(plain)), None)
-    inside = [creep.length_m for begin, end, creep in creeps if begin > 0 and end < len(plain)]
+        before = creep if begin == 0 else before
+        after = creep if end == len(plain) else after
+        if begin > 0 and end < len(plain):
+            inside_m.append(creep.length_m)
     spread = np.sqrt(row_sums(noise**2))
+    head, tail = (
+        End(float(moved[at]), float(spread[at]), bool(as_plain[at]), creep)
+        for at, creep in ((0, before), (-1, after))
+    )
     return Measured(
-        total if as_plain.all() else math.fsum([*moved.tolist(), *inside]),
+        total if as_plain.all() else math.fsum([*moved.tolist(), *inside_m]),
         total,
-        End(float(moved[0]), float(spread[0]), bool(as_plain[0]), before),
-        End(float(moved[-1]), float(spread[-1]), bool(as_plain[-1]), after),
-        still=bool(creeps) and creeps[0][:2] == (0, len(plain)),
+        head,
+        tail,
+        still=before is not None and before is after,
         speed_mps=_highest_speed(seconds, moved),
         steps_m=plain if as_plain.all() else steps,
     )
@@ -235,9 +233,10 @@ def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flag
         slopes = np.diff(points, axis=0) if width == 2 else _slopes(points, width)
         square = row_sums(slopes**2)
         energy = _moving_mean(square[:, None], _SLOPE_SPAN)[:, 0]
-        share = 12 / (width * (width * width - 1)) * whole
+        of_slope = 12 / (width * (width * width - 1))
+        share = of_slope * whole
         along = row_sums(variance * slopes**2) / np.where(square > 0, square, 1.0)
-        across = 12 / (width * (width * width - 1)) * (whole - along)
+        across = of_slope * (whole - along)
         settled = unsettled & (energy >= _CLEAR * share)
         if width == 2:
             as_plain = settled & (share <= 2 * _PLAIN * energy)
@@ -259,8 +258,7 @@ def _scatters(points: Vectors, places: Vectors, noise: Vectors) -> Flags:
     ratio = row_sums(spread) / np.maximum(row_sums(noise**2), 1e-300)
     low, high = _SPREAD
     around: Flags = (low * low <= ratio) & (ratio <= high * high)
-    both: Flags = around[1:] & around[:-1]
-    return both
+    return around[1:] & around[:-1]
 
 
 def _slopes(points: Vectors, width: int) -> Vectors:
@@ -284,10 +282,11 @@ def _moving_mean(rows: Vectors, span: int) -> Vectors:
     return means[np.clip(np.arange(len(rows)) - span, 0, len(means) - 1)]
 
 
-def _runs(marks: Flags) -> Iterator[tuple[int, int]]:
+def _runs(marks: Flags) -> list[list[int]]:
     """Returns the half-open ranges in which marks are set."""
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], marks, [False])).astype(np.int8)))
-    return iter([(int(begin), int(end)) for begin, end in edges.reshape(-1, 2)])
+    edges = np.flatnonzero(np.diff(marks, prepend=False, append=False))
+    runs: list[list[int]] = edges.reshape(-1, 2).tolist()
+    return runs
 
 
 def _creep(places: Vectors, reach: Floats, origin: Vector3) -> Creep:

@@ -71,7 +71,7 @@ class RobotTrack:
     @property
     def ends(self) -> Mask:
         """Whether a piece ends at the vertex."""
-        return np.append(self.begins[1:], [True])[: len(self.times)]
+        return _is_last(self.begins)
 
     @property
     def pieces(self) -> tuple[Times, Times]:

@@ -1,4 +1,4 @@
-"""Where the robot stood still.
+"""Where the robot stood still, and where it suddenly slowed down.
 
 A standstill is a time of at least `SHORTEST_NS` in which the robot moves no faster than odometry
 drifts. It begins with the first pose at that place and ends with the last.
@@ -24,6 +24,13 @@ and however a history is cut.
 The noise of a slot is estimated from second differences, which a steady motion leaves at zero: see
 J. von Neumann et al., "The mean square successive difference", Ann. Math. Statist. 12 (1941), for
 first differences; those of second order have six times the variance of the noise.
+
+Of sudden losses of speed the first pose of every slot of `DROP_SLOT_NS`, counted from the epoch,
+counts. A robot moves clearly where it goes `MOVING_MPS` or faster from slot to slot. It slows down
+suddenly where its speed falls, from one slot to the next but one, to `FRACTION` of that or less,
+and stays there for two slots. A robot that turns meanwhile is taken to do so on purpose: nearly all
+slow down to turn. That depends on `_DROP_SLOTS` slots in a row. Poses that come less often than
+once a slot, and a position that jumps for a moment, show no drop.
 """
 
 from __future__ import annotations
@@ -36,7 +43,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
-from ros2_memory.analysis.motion.speed_drops import SpeedDrop, speed_drops
+from ros2_memory.analysis.poses import headings
 from ros2_memory.core.arrays import row_sums, rows_of, stacked
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
@@ -45,8 +52,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.analysis.poses import Floats, Poses, Vectors
-    from ros2_memory.core.arrays import Flags, Ints
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
 
     Corners: TypeAlias = NDArray[np.int32] | Ints
@@ -92,6 +99,13 @@ _CREEP_BLOCKS: Final = CREEP_NS // BLOCK_NS
 _BLOCKS_AT_ONCE: Final = 128
 _STILL_M: Final = DRIFT_MPS * unix_from_ns(BLOCK_NS)
 """How far the means of a block spread without noise."""
+
+DROP_SLOT_NS: Final[Ns] = NS_PER_S // 2
+MOVING_MPS: Final = 0.15
+FRACTION: Final = 0.4
+TURNS_RAD: Final = 0.35
+_DROP_SLOTS: Final = 7
+"""Slots that decide whether there is a drop at the fourth of them, and none at the third."""
 
 
 class Box3(NamedTuple):
@@ -167,10 +181,8 @@ class Blocks:
     def are_still(self) -> Flags:
         """Returns whether drift and noise explain the boxes."""
         lows, highs = self.corners()
-        are_explained: Flags = _lengths(highs - lows) <= np.minimum(
-            np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64)), LARGEST_M
-        )
-        return are_explained
+        explained_m = np.maximum(_STILL_M, 4.5 * self.noises.astype(np.float64))
+        return _lengths(highs - lows) <= np.minimum(explained_m, LARGEST_M)
 
     @property
     def memory_bytes(self) -> int:
@@ -236,17 +248,15 @@ def blocks_of(poses: Poses, start: Ns, stop: Ns) -> Blocks:
         return NO_BLOCKS
     slots = _Slots(poses.times[valid], poses.positions[valid])
     links = slots.links()
-    if not links.any():
-        return NO_BLOCKS
     before, after = np.r_[False, links], np.r_[links, False]
     is_first = after & ~before
     firsts, lasts = np.flatnonzero(is_first), np.flatnonzero(before & ~after)
-    before, after = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
-    is_long = slots.lasts[after] - slots.firsts[before] >= SHORTEST_NS
-    is_inner = np.zeros(len(slots), np.bool_)
-    for first, last in zip(firsts[is_long].tolist(), lasts[is_long].tolist(), strict=True):
-        is_inner[first + 1 : last] = True
-    blocks = _blocks(slots, np.flatnonzero(is_inner), np.cumsum(is_first))
+    beside = np.maximum(firsts - 1, 0), np.minimum(lasts + 1, len(slots) - 1)
+    is_long = slots.lasts[beside[1]] - slots.firsts[beside[0]] >= SHORTEST_NS
+    chains = np.cumsum(is_first)
+    # Each slot with links on both sides is of the newest chain that began.
+    inner = np.flatnonzero(before & after)
+    blocks = _blocks(slots, inner[is_long[chains[inner] - 1]], chains)
     times, _ = blocks.span()
     return rows_of(blocks, (times >= start) & (times < stop))
 
@@ -375,8 +385,7 @@ class _Slots:
 
 
 def _lengths(vectors: Vectors) -> Floats:
-    lengths: Floats = np.sqrt(row_sums(vectors * vectors))
-    return lengths
+    return np.sqrt(row_sums(vectors * vectors))
 
 
 def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
@@ -398,13 +407,9 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     return deviations
 
 
-def joined_blocks(parts: Sequence[Blocks]) -> Blocks:
-    """Returns the blocks of stretches of time that follow each other, maybe none."""
-    return stacked([NO_BLOCKS, *parts])
-
-
-def standstills_of(blocks: Blocks) -> tuple[Standstill, ...]:
-    """Returns the standstills in blocks of consecutive time, in order."""
+def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
+    """Returns the standstills in blocks of stretches of time that follow each other, in order."""
+    blocks = stacked([NO_BLOCKS, *parts])
     if not len(blocks):
         return ()
     begins_chain = blocks.starts != MIN_NS
@@ -522,3 +527,38 @@ def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
         far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
         left[waiting[far]] = before[far]
     return left
+
+
+class SpeedDrop(NamedTuple):
+    """A sudden loss of speed: when it began, and the speeds (m/s) before and after."""
+
+    time: Ns
+    before_mps: float
+    after_mps: float
+
+
+def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
+    """Returns where the robot suddenly slowed down, in order."""
+    valid = np.flatnonzero(are_places(poses.positions))
+    slots = poses.times[valid] // DROP_SLOT_NS
+    # The first pose of each slot.
+    rows = valid[np.flatnonzero(np.diff(slots, prepend=slots[:1] - 1))]
+    if rows.size < _DROP_SLOTS:
+        return ()
+    times, places = poses.times[rows], poses.positions[rows, :2]
+    speeds = np.hypot(*np.diff(places, axis=0).T) / (np.diff(times) / NS_PER_S)
+    # Of two slots: a robot whose position jumps, and is back, gets no farther.
+    ahead = np.hypot(*(places[2:] - places[:-2]).T) / ((times[2:] - times[:-2]) / NS_PER_S)
+    before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
+    after = np.maximum(speeds[:-1], speeds[1:])
+    falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])
+    slots = times // DROP_SLOT_NS
+    in_a_row = slots[_DROP_SLOTS - 1 :] - slots[: 1 - _DROP_SLOTS] < _DROP_SLOTS
+    drops = np.flatnonzero(in_a_row & falls[1:] & ~falls[:-1])
+    turned = headings(poses.turns[rows[drops + 6]]) - headings(poses.turns[rows[drops + 2]])
+    # Where a heading is not known, it turns no more than others.
+    drops = drops[~(np.abs(np.angle(np.exp(1j * turned))) > TURNS_RAD)]
+    return tuple(
+        SpeedDrop(int(times[at + 3]), float(before[at + 1]), float(after[at + 4]))
+        for at in drops.tolist()
+    )

@@ -33,8 +33,8 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from ros2_memory.analysis.poses import Floats, Poses, Vectors
-    from ros2_memory.core.arrays import Flags
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.core.arrays import Flags, Floats, Vectors
     from ros2_memory.core.model import Vector3
     from ros2_memory.storage.base import IntArray
 

@@ -12,7 +12,6 @@ from ros2_memory.analysis.motion.standstills import (
     BESIDE_NS,
     BLOCK_NS,
     Standstill,
-    joined_blocks,
     stands_of,
     standstills_of,
 )
@@ -22,7 +21,7 @@ from ros2_memory.analysis.poses import FrameCodes, Poses
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from ros2_memory.analysis.motion.speed_drops import SpeedDrop
+    from ros2_memory.analysis.motion.standstills import SpeedDrop
     from ros2_memory.core.model import Quaternion, Vector3
 
 
@@ -67,4 +66,4 @@ def stood_in(
         for number in np.unique(poses.times // length).tolist()
     ]
     drops = [drop for stand in stands for drop in stand.drops]
-    return standstills_of(joined_blocks([each.blocks for each in stands])), drops
+    return standstills_of([each.blocks for each in stands]), drops

@@ -245,21 +245,6 @@ def replies(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     return way, told
 
 
-def test_the_noise_of_a_stationary_robot_is_noted_and_not_driven(tmp_path: Path) -> None:
-    off = np.random.default_rng(4).normal(0, 0.001, (3000, 2))
-    messages = [odom(BEGIN + nth * S // 50, x, y) for nth, (x, y) in enumerate(off.tolist())]
-    for nth in range(6):
-        write_mcap(tmp_path / f"bag_{nth}.mcap", messages[nth * 500 : nth * 500 + 500])
-    way, told = replies(tmp_path)
-    summed = plain_sum(np.column_stack([off, np.zeros(3000)]))
-    assert (way["distance_m"], told["distance_m"]) == (0.0, 0.0)
-    assert way["max_speed"] == 0.0
-    assert way["path_sum_m"] == pytest.approx(summed, rel=1e-3)
-    assert told["path_sum_m"] == pytest.approx(summed, rel=1e-3)
-    for reply in (way, told):
-        assert any(note.startswith("the positions are noisy") for note in reply["notes"])
-
-
 @pytest.mark.parametrize(("noise_m", "doubted"), [(1.0, True), (0.02, False)])
 def test_noise_that_cannot_be_taken_off_is_noted(
     tmp_path: Path, noise_m: float, doubted: bool

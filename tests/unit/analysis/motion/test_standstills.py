@@ -1,3 +1,5 @@
+"""Where a robot stood still, or slowed down suddenly."""
+
 from __future__ import annotations
 
 import math
@@ -9,7 +11,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.motion.standstills import DRIFTED_M, Standstill
+from ros2_memory.analysis.motion.standstills import (
+    DRIFTED_M,
+    DROP_SLOT_NS,
+    SpeedDrop,
+    Standstill,
+    speed_drops,
+)
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.examples import LONG, examples
 from tests.unit.analysis.motion.posed import posed, stood_in
@@ -260,3 +268,90 @@ def test_a_jump_ends_a_standstill() -> None:
     made = world([(5, 0.0)]).poses
     poses = made + [(time + 5 * S + S // 50, (x + 3, y, z)) for time, (x, y, z) in made]
     assert [round(each.box.centre[0], 3) for each in standstills_of(poses)] == [0.0, 3.0]
+
+
+BEGIN = 1_784_000_000 * S
+Pose = tuple[int, tuple[float, float, float], tuple[float, float, float, float]]
+
+
+def driven(*legs: tuple[float, float, float], rate: int = 20) -> list[Pose]:
+    """Poses of a robot that goes for so many seconds at a speed (m/s), and turns by a rate (rad/s).
+
+    Heading and speed change at once.
+    """
+    poses: list[Pose] = []
+    x = y = heading = 0.0
+    at = BEGIN
+    for lasts_s, speed, turn in legs:
+        for _ in range(round(lasts_s * rate)):
+            rotation = (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
+            poses.append((at, (x, y, 0.0), rotation))
+            at += S // rate
+            x += speed / rate * math.cos(heading)
+            y += speed / rate * math.sin(heading)
+            heading += turn / rate
+    return poses
+
+
+def found(poses: list[Pose]) -> list[SpeedDrop]:
+    rows = [(at, place) for at, place, _ in poses]
+    return [*speed_drops(posed(rows, [turn for *_, turn in poses]))]
+
+
+def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
+    [drop] = found(driven((5.2, 0.5, 0), (2.5, 0.05, 0), (5, 0.5, 0)))
+    assert (drop.time - BEGIN) / S == pytest.approx(5.2, abs=0.6)
+    assert drop.before_mps == pytest.approx(0.5, abs=0.01)
+    assert drop.after_mps == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    "poses",
+    [
+        [],
+        driven((5, 0.5, 0), (5, 0.4, 0), (5, 0.3, 0), (5, 0.25, 0)),  # slower, not much at a time
+        driven((5, 0.5, 0), (2, 0.0, 0.8), (5, 0.5, 0)),  # to turn
+        driven((5, 0.1, 0), (2, 0.0, 0), (5, 0.1, 0)),  # hardly moved
+        driven((5, 0.5, 0), (0.6, 0.0, 0), (5, 0.5, 0)),  # for a moment
+        driven((5, 0.0, 0), (0.5, 0.5, 0), (5, 0.0, 0)),  # moved for a moment
+        driven((20, 0.5, 0), (20, 0.0, 0), rate=1),  # too seldom
+        [  # a single position is wrong
+            (at, (x + 5 * (at == BEGIN + 5 * S), y, z), turn)
+            for at, (x, y, z), turn in driven((10, 0.3, 0))
+        ],
+        [  # the position jumps back
+            (at, (x - 0.2 * (at >= BEGIN + 5.2 * S), y, z), turn)
+            for at, (x, y, z), turn in driven((10, 0.4, 0))
+        ],
+    ],
+    ids=count(),
+)
+def test_what_is_no_sudden_loss_of_speed(poses: list[Pose]) -> None:
+    assert found(poses) == []
+
+
+def test_poses_without_orientation_show_some() -> None:
+    poses = driven((5, 0.5, 0), (2, 0.0, 0.8))
+    assert len(speed_drops(posed((at, place) for at, place, _ in poses))) == 1
+
+
+@given(
+    legs=st.lists(
+        st.tuples(
+            st.floats(0.3, 6), st.sampled_from([0.0, 0.05, 0.2, 0.5]), st.sampled_from([0.0, 0.5])
+        ),
+        min_size=1,
+        max_size=8,
+    ),
+    blocks=st.integers(1, 8),
+    silent=st.booleans(),
+)
+def test_slices_of_any_length_change_no_drop(
+    legs: list[tuple[float, float, float]], blocks: int, silent: bool
+) -> None:
+    poses = driven(*legs, rate=10)
+    if silent:
+        poses = [each for each in poses if (each[0] - BEGIN) // DROP_SLOT_NS % 17 > 1]
+    rows = [(at, place) for at, place, _ in poses]
+    turned = posed(rows, [turn for *_, turn in poses])
+    assert stood_in(turned, blocks=blocks)[1] == [*speed_drops(turned)]

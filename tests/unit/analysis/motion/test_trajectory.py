@@ -240,7 +240,7 @@ def test_a_waypoint_carries_its_heading_where_the_pose_has_one() -> None:
     assert [each.yaw_rad for each in found.waypoints] == [pytest.approx(0.5), None, None]
 
 
-@pytest.mark.parametrize(("noise_m", "poses"), [(0.0, 20_000), (0.05, 30_000)])
+@pytest.mark.parametrize(("noise_m", "poses"), [(0.0, 8_000), (0.05, 12_000)])
 def test_a_long_way_is_drawn_within_its_error(noise_m: float, poses: int) -> None:
     draw = random.Random(3)
     positions = [
