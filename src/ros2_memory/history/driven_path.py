@@ -36,20 +36,15 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
     resolve_pose_topic,
-    transform_topics,
     undecodable,
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
 from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
+from ros2_memory.history.sessions import decoded_transforms
 from ros2_memory.history.transforms import (
-    decoded_transforms,
-    edges,
     frames_of,
-    moving_in,
-    sessions_of,
-    static_transforms,
     transform_at,
 )
 
@@ -388,7 +383,7 @@ def robot_body(view: View) -> Body | None:
     By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
     in the root of its frames.
     """
-    known_edges = edges(view)
+    known_edges = view.sessions.edges
     parents = {edge.child: edge.parent for edge in known_edges}
     moving = [edge.child for edge in known_edges if not edge.static]
     if not moving:
@@ -437,7 +432,7 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
     Raises:
         NoDataError: as for `resolve_pose_topic`.
     """
-    topics = transform_topics(view)
+    topics = view.moving_topics
     body, why = None, ""
     if name is None:
         body, why = body_by_transforms(view), ": no topic has the robot's poses"
@@ -463,9 +458,9 @@ def newest_of_body(
     In the map or the root of its frames, or in `frame_id`. Where the session of a `recording` has
     transforms, it is one of these.
     """
-    parent, topics, sessions = frame_id or body.parent, transform_topics(view), sessions_of(view)
+    parent, topics, sessions = frame_id or body.parent, view.moving_topics, view.sessions
     own_session = None if recording is None else sessions.of(recording)
-    if own_session and not sessions.recordings_of(own_session, tuple(topics)):
+    if own_session and not sessions.recordings_of(own_session, topics):
         own_session = None
     for stored in view.stream.messages(topics, window, newest_first=True):
         for transform in decoded_transforms(view, [stored]):
@@ -493,14 +488,14 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     body = robot_body(view)
     if body is None:
         return []
-    bags = view.stream.overlapping_bags(transform_topics(view), window)
+    bags = view.stream.overlapping_bags(view.moving_topics, window)
     if len(bags) > _MOST_BAGS_OF_BODY:
         raise InvalidArgumentsError(
             f"by transforms, a path is read from {_MOST_BAGS_OF_BODY} bags at most: these are "
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions = sessions_of(view)
+    sessions = view.sessions
     for session in dict.fromkeys(sessions.of(span.bag.recording) for span in bags):
         poses.update(_poses_of_body_in(view, window, session, body))
         view.bags.check_deadline()
@@ -511,8 +506,8 @@ def _poses_of_body_in(
     view: View, window: TimeWindow, session: Session, body: Body
 ) -> Iterator[tuple[Ns, Pose]]:
     """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
-    moving = moving_in(view, window.widened(TF_CACHE_NS), session)
-    frames = frames_of(view, static_transforms(view, session), moving, body.odometry)
+    moving = view.sessions.moving(session, window.widened(TF_CACHE_NS))
+    frames = frames_of(view, view.sessions.static(session), moving, body.odometry)
     of_body = [
         transform
         for transform in moving

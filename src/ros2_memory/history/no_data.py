@@ -171,7 +171,7 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
             f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
             "returns speeds from them, by topic"
         )
-    if moving := transform_topics(view):
+    if moving := view.moving_topics:
         return (
             f", nor another with {those}; transforms are on {listed(moving)}: get_position_at "
             "and trajectory_summary answer by them, get_transform_at returns the pose of one frame "
@@ -205,12 +205,6 @@ def topics_that_show_poses(view: View) -> list[str]:
             if pose is not None and pose.orientation is not None:
                 shown.append(f"{topic} ({type_name})")
     return shown
-
-
-def transform_topics(view: View) -> list[str]:
-    """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
-    recorded = view.timeline.topics()
-    return [topic for topic in view.limits.tf_topics if topic in recorded]
 
 
 def topics_with(view: View, what: str) -> list[str]:

@@ -24,7 +24,6 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
 from ros2_memory.history.merged_stream import bag_span_of
-from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
@@ -483,7 +482,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
-    if sessions_of(view).are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
+    if view.sessions.are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
         return False
     wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)

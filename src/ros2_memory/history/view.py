@@ -33,13 +33,13 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
 from ros2_memory.history.scan import open_scan, scan
+from ros2_memory.history.sessions import Sessions
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.sessions import Sessions
     from ros2_memory.storage.base import IntArray
 
 
@@ -70,7 +70,6 @@ class View:
         stream: all bags as one stream.
         timeline: the bags in the order of time.
         memo: what was found out in this call.
-        sessions: which recordings belong together, once that is asked (see `transforms`).
     """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
@@ -84,7 +83,21 @@ class View:
         self.bag_dir = memory.index.bag_dir
         self.notes = self.bags.notes
         self.memo = Memo()
-        self.sessions: Sessions | None = None
+
+    @cached_property
+    def sessions(self) -> Sessions:
+        """Which recordings belong together, and the transforms that they hold."""
+        return Sessions(self)
+
+    @cached_property
+    def moving_topics(self) -> tuple[str, ...]:
+        """The recorded topics of transforms that move (`data.tf_topics`)."""
+        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_topics))
+
+    @cached_property
+    def static_topics(self) -> tuple[str, ...]:
+        """The recorded topics of static transforms (`data.tf_static_topics`)."""
+        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_static_topics))
 
     @cached_property
     def pose_topic(self) -> str:

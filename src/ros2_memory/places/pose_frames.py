@@ -45,8 +45,6 @@ from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connects,
     connects_in_time,
-    newest_in_session,
-    sessions_of,
     transform_at,
 )
 from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
@@ -97,7 +95,7 @@ def newest_pose(
     if recording is None:
         stored = view.stream.newest(topic, window)
     else:
-        stored = newest_in_session(view, topic, window, recording)
+        stored = view.sessions.newest(topic, window, recording)
     message = None if stored is None else view.bags.decode(stored)
     if stored is None or message is None:
         return None
@@ -251,7 +249,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
     places_frame = frame
     if target and target != frame and leads(view, (target, frame)):
         recordings = view.timeline.recordings(topic).items()
-        lending = {sessions_of(view).lending_to(path, first) for path, (first, _) in recordings}
+        lending = {view.sessions.lending_to(path, first) for path, (first, _) in recordings}
         if any(leads(view, (target, frame), session=session) for session in lending):
             places_frame = target
     placement = MapPlacement(places_frame, frame, places_frame == target, above)
@@ -278,7 +276,7 @@ def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
 
     Or of several that repeat each other where they overlap, as a copy does.
     """
-    sessions, asked = sessions_of(view), tuple(windows)
+    sessions, asked = view.sessions, tuple(windows)
     spans = sorted(
         (*span, recording)
         for recording, span in view.timeline.recordings(topic).items()

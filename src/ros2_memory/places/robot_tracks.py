@@ -56,8 +56,6 @@ from ros2_memory.history.transforms import (
     edges_of_rows,
     frames_over,
     lending_to,
-    sessions_of,
-    static_transforms,
 )
 
 if TYPE_CHECKING:
@@ -273,7 +271,7 @@ class RobotTracks:
         start, last = stretch.window.start, stretch.last
         if stretch.parts is None or not window.covers(start, last):
             return None
-        sessions, span = sessions_of(self._view), TimeWindow(start, last + 1)
+        sessions, span = self._view.sessions, TimeWindow(start, last + 1)
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         parts = [*stretch.parts]
@@ -283,7 +281,7 @@ class RobotTracks:
             if not sessions.has_all_kinds(session):
                 return None
             if session not in numbers:
-                placed_by.append(static_in(static_transforms(self._view, session), span))
+                placed_by.append(static_in(self._view.sessions.static(session), span))
             placed_by.append(numbers.setdefault(session, len(numbers)))
         moving = self._moving_parts(scans, span)
         if moving is None:
@@ -303,7 +301,7 @@ class RobotTracks:
             if parts is None:
                 return None
             paths |= {part: scan_.recording_of(part) for part in parts}
-        is_mixed = any(map(sessions_of(self._view).holds_carried, paths.values()))
+        is_mixed = any(map(self._view.sessions.holds_carried, paths.values()))
         return None if is_mixed else paths
 
     def _settings_hash(self, placed_by: Sequence[object]) -> str:
@@ -341,10 +339,10 @@ class RobotTracks:
             moving = self._moving_parts(scans, lent.span)
             if moving is None:
                 return None
-            sessions, session = sessions_of(self._view), lent.session
+            sessions, session = self._view.sessions, lent.session
             used = [part for part, path in moving.items() if sessions.folder(path) in session]
             parts += [part for part in used if part not in parts]
-            static = static_in(static_transforms(self._view, session), lent.span)
+            static = static_in(self._view.sessions.static(session), lent.span)
             # By their places among the parts: those of one recording have one text.
             placed_by.append((lent.since, tuple(static), [parts.index(part) for part in used]))
         return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
@@ -364,7 +362,7 @@ class RobotTracks:
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
-        sessions, recording = sessions_of(self._view), rows.recording
+        sessions, recording = self._view.sessions, rows.recording
         session = sessions.of(recording)
         if sessions.has_all_kinds(session):
             return [(MIN_NS, session)]

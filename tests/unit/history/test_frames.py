@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.transforms import frames_over, sessions_of
+from ros2_memory.history.transforms import frames_over
 from ros2_memory.history.view import View
 from tests.support.bags import Msg, tf, transform, write_mcap
 from tests.support.column_worlds import World
@@ -57,7 +57,7 @@ def world(folder: Path, cuts: list[int]) -> World:
 
 
 def session_of(view: View) -> Session:
-    [session] = {sessions_of(view).of(path) for path in view.snapshot.timeline.recordings("/tf")}
+    [session] = {view.sessions.of(path) for path in view.snapshot.timeline.recordings("/tf")}
     return session
 
 

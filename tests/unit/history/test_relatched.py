@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.counting import pick
+from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap

@@ -16,7 +16,6 @@ from ros2_memory import queries
 from ros2_memory.analysis.frames import static_at
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS
 from ros2_memory.history.context import Call
-from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
@@ -62,8 +61,8 @@ def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repe
         for second, (child, x) in enumerate(received):
             bag(folder, second, [static(second, child, float(x))])
         view = View(memory_of(folder), Call())
-        [session] = sessions_of(view).recorded_at(T0) or []
-        found = static_at(static_transforms(view, session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
+        [session] = view.sessions.recorded_at(T0) or []
+        found = static_at(view.sessions.static(session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
     expected: dict[str, float] = {}
     for second, (child, x) in enumerate(received):
         if second <= at or child.lstrip("/") not in expected:
@@ -76,7 +75,7 @@ def test_a_view_is_freed_with_its_call_without_the_garbage_collector(tmp_path: P
     gc.disable()
     try:
         view = View(memory_of(tmp_path), Call())
-        assert sessions_of(view).recorded_at(T0)
+        assert view.sessions.recorded_at(T0)
         known = weakref.ref(view)
         del view
         assert known() is None

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
-from ros2_memory.history.counting import pick
+from ros2_memory.history.scan import pick
 from ros2_memory.history.view import View
 from ros2_memory.messages.to_json import evenly
 from ros2_memory.storage.mcap_reader import McapReader
