@@ -51,10 +51,10 @@ from ros2_memory.history.coverage import (
 )
 from ros2_memory.history.driven_path import (
     Body,
+    body_of,
     driven_path,
     newest_of_body,
     resolve_path_topic,
-    robot_body,
 )
 from ros2_memory.history.no_data import (
     decode,
@@ -190,7 +190,7 @@ def position(
     """
     view, at, now = open_moment(memory, call, moment)
     name = resolve_path_topic(view, topic, degrees=True)
-    body = robot_body(view) if name in memory.limits.tf_topics else None
+    body = body_of(view, name)
     if body is not None:
         return _position_of_body(
             view,

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -141,12 +142,15 @@ def slices_of_path(
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
     fastest = view.limits.max_plausible_speed_mps
-
-    def make(piece: PoseSlice) -> PathSlice:
-        return path_slice(piece.poses, fastest)
-
-    yield from slices_by_poses(
-        view, topic, window, PATHS, make, failures=failures, settings=str(fastest), reached=reached
+    return slices_by_poses(
+        view,
+        topic,
+        window,
+        PATHS,
+        lambda piece: path_slice(piece.poses, fastest),
+        failures=failures,
+        settings=str(fastest),
+        reached=reached,
     )
 
 
@@ -185,10 +189,10 @@ def slices_by_poses(
     """
     if topic in view.limits.tf_topics:
         poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-        span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
-        of_body = [PoseRows(span, lambda: poses)] if len(poses) else []
-        for pose_slice in pose_slices(of_body, beside):
-            yield pose_slice.start, make(pose_slice)
+        if len(poses):
+            first, last = int(poses.times[0]), int(poses.times[-1])
+            for pose_slice in pose_slices([PoseRows(first, last, lambda: poses)], beside):
+                yield pose_slice.start, make(pose_slice)
         return
     twice = () if view.call.stored else parallel_or_twice(view, topic, window)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
@@ -224,33 +228,34 @@ def slices_by_poses(
     )
 
 
+@dataclass(frozen=True, slots=True)
 class PoseSlice:
     """The poses in a slice of the clock, and those beside it.
 
     Attributes:
         start: log time (ns) where it begins.
         stop: where it ends.
+        beside: how far before and after it (ns) poses are with it.
+        blocks: of the poses.
     """
 
-    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
-        self.start, self.stop = start, stop
-        self._beside = beside
-        self._blocks = blocks
+    start: Ns
+    stop: Ns
+    beside: Ns
+    blocks: Sequence[PoseRows]
 
     @property
     def poses(self) -> Poses:
         """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
-        start, stop = self.start - self._beside, self.stop + self._beside
-        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
+        start, stop = self.start - self.beside, self.stop + self.beside
+        return joined_poses([block.poses.between(start, stop) for block in self.blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
         """Returns the key of the poses in memory; None where not all are of whole parts."""
-        parts: list[int] = []
-        for block in self._blocks:
-            if block.parts is None:
-                return None
-            parts += block.parts
-        return FragmentKey(self.start, settings, tuple(parts))
+        parts = [block.parts for block in self.blocks if block.parts is not None]
+        if len(parts) < len(self.blocks):
+            return None
+        return FragmentKey(self.start, settings, tuple(chain.from_iterable(parts)))
 
 
 def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
@@ -262,27 +267,21 @@ def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[Po
     """
     held: list[PoseRows] = []
     waiting: set[int] = set()
-    for block in newest_first:
-        newest = max(waiting, default=block.last // SLICE_NS)
-        held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
-        held.append(block)
-        waiting.update(block.slices(SLICE_NS))
-        yield from _complete_slices(waiting, held, beside, block.first)
-    yield from _complete_slices(waiting, held, beside, MIN_NS)
-
-
-def _complete_slices(
-    waiting: set[int], held: Sequence[PoseRows], beside: Ns, oldest: Ns
-) -> Iterator[PoseSlice]:
-    """Yields the slices that reach no poses older than `oldest`; they wait no longer."""
-    for number in sorted(waiting, reverse=True):
-        start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
-        first, last = start - beside, stop + beside
-        if first < oldest:
-            return
-        waiting.discard(number)
-        near = [block for block in reversed(held) if block.last >= first and block.first < last]
-        yield PoseSlice(start, stop, beside, near)
+    for block in chain(newest_first, [None]):
+        if block is not None:
+            newest = max(waiting, default=block.last // SLICE_NS)
+            held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
+            held.append(block)
+            waiting.update(block.slices(SLICE_NS))
+        oldest = MIN_NS if block is None else block.first
+        for number in sorted(waiting, reverse=True):
+            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+            first, last = start - beside, stop + beside
+            if first < oldest:
+                break
+            waiting.discard(number)
+            near = [rows for rows in reversed(held) if rows.last >= first and rows.first < last]
+            yield PoseSlice(start, stop, beside, near)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
@@ -337,16 +336,12 @@ def pose_frame(view: View, topic: str) -> str:
         UndecodableError: none of the newest ones can be decoded.
     """
     frames = view.memo.of(_POSE_FRAMES, dict)
-    if topic not in frames:
-        body = robot_body(view) if topic in view.limits.tf_topics else None
-        frames[topic] = _newest_frame(view, topic) if body is None else body.odometry
-    return frames[topic]
-
-
-def _newest_frame(view: View, topic: str) -> str:
-    failures: list[UndecodableError] = []
+    if topic in frames:
+        return frames[topic]
+    body, failures = body_of(view, topic), list[UndecodableError]()
+    frame = "" if body is None else body.odometry
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for stored in islice(newest, _MOST_TRIED):
+    for stored in islice(newest, _MOST_TRIED if body is None else 0):
         message = view.bags.decode(stored, failures)
         if message is None:
             continue
@@ -355,14 +350,17 @@ def _newest_frame(view: View, topic: str) -> str:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))
         if failures:
             note_left_out(view, failures[0])
-        return pose.frame_id.lstrip("/")
-    if failures:
-        raise failures[0]
-    return ""
+        frame = pose.frame_id.lstrip("/")
+        break
+    else:
+        if failures:
+            raise failures[0]
+    frames[topic] = frame
+    return frame
 
 
 class Body(NamedTuple):
-    """The robot's body among the frames that move: `child` in `parent`, and the other frames.
+    """The robot's body among the frames that move: `child` in `parent`.
 
     `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
     no correction of the map is driven: that of odometry, else `parent`. `beside`: the bodies of
@@ -371,7 +369,6 @@ class Body(NamedTuple):
 
     parent: str
     child: str
-    others: tuple[str, ...]
     above: tuple[str, ...]
     odometry: str
     beside: tuple[str, ...]
@@ -392,11 +389,12 @@ def robot_body(view: View) -> Body | None:
     map_frame = view.limits.map_frame
     body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
-    others = sorted({child for child in moving if child != body})
     odometry = next(filter(_is_odometry, above[body]), root)
-    named = (child for child in others if _body_rank(child, map_frame) < len(_BODIES))
-    beside = (child for child in named if child not in above[body] and body not in above[child])
-    return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
+    named = (child for child in moving if _body_rank(child, map_frame) < len(_BODIES))
+    beside = {
+        child for child in named if child not in {body, *above[body]} and body not in above[child]
+    }
+    return Body(root, body, tuple(above[body]), odometry, tuple(sorted(beside)))
 
 
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -417,6 +415,11 @@ def _body_rank(frame: str, map_frame: str | None) -> int:
     if name == map_frame or _is_odometry(frame):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
+
+
+def body_of(view: View, topic: str) -> Body | None:
+    """Returns the robot's body where a topic is of transforms."""
+    return robot_body(view) if topic in view.limits.tf_topics else None
 
 
 def body_by_transforms(view: View) -> Body | None:
@@ -495,8 +498,7 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions = view.sessions
-    for session in dict.fromkeys(sessions.of(span.bag.recording) for span in bags):
+    for session in dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags):
         poses.update(_poses_of_body_in(view, window, session, body))
         view.bags.check_deadline()
     return sorted(poses.items())
@@ -513,16 +515,13 @@ def _poses_of_body_in(
         for transform in moving
         if transform.child.lstrip("/") == body.child and window.contains(transform.log_time)
     ]
-    log_times = [transform.log_time for transform in of_body]
-    stamps = [transform.stamp for transform in of_body]
-    moments = stamps if frames.clock == "stamp" else log_times
+    by_stamp = frames.clock == "stamp"
+    moments = [transform.stamp if by_stamp else transform.log_time for transform in of_body]
     placed = frames.poses(body.child, np.array(moments, np.int64))
-    if placed is None:
-        return
     last = MIN_NS
     # None is before the first transform of the map, or in its gap.
-    for nth in np.flatnonzero(placed.valid).tolist():
-        if log_times[nth] - last >= _STEP_NS:
-            last = log_times[nth]
-            there = placed.at(nth)
-            yield last, Pose(there.translation, there.rotation, body.odometry)
+    for nth in [] if placed is None else np.flatnonzero(placed.valid).tolist():
+        time = of_body[nth].log_time
+        if placed is not None and time - last >= _STEP_NS:
+            last, there = time, placed.at(nth)
+            yield time, Pose(there.translation, there.rotation, body.odometry)

@@ -36,10 +36,10 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import (
     body_by_transforms,
+    body_of,
     newest_of_body,
     pose_frame,
     resolve_path_topic,
-    robot_body,
 )
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
@@ -89,7 +89,7 @@ def newest_pose(
     Where the session of a `recording` has the topic, it is one of its messages. None where there is
     no message, or it cannot be decoded.
     """
-    body = robot_body(view) if topic in view.limits.tf_topics else None
+    body = body_of(view, topic)
     if body is not None:
         return newest_of_body(view, body, window, recording=recording)
     if recording is None:
@@ -240,7 +240,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         UndecodableError: no pose can be decoded.
     """
     target, frame = view.limits.map_frame, pose_frame(view, topic)
-    body = robot_body(view) if topic in view.limits.tf_topics else None
+    body = body_of(view, topic)
     above = () if body is None else body.above
     if frame_id in (frame, *above):
         return MapPlacement(frame_id, frame, frame_id == target, above)

@@ -145,11 +145,8 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body = body_by_transforms(view)
-        self._topics = view.limits.tf_topics
-        if body is None:
-            self._topics, self._own_frame = (view.pose_topic,), pose_frame(view, view.pose_topic)
-        else:
-            self._own_frame = body.child
+        self._topics = (view.pose_topic,) if body is None else view.limits.tf_topics
+        self._own_frame = pose_frame(view, view.pose_topic) if body is None else body.child
         self._is_own = body is None and self._own_frame == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
@@ -174,17 +171,15 @@ class RobotTracks:
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
         try:
-            for start, part in self._parts(around, reading):
+            for since, part in self._parts(around, reading):  # noqa: B007
                 parts.append(part)
-                since = start
+            since = None
         except QueryTimeoutError as error:
             if not parts:
                 raise QueryTimeoutError(
                     f"the question needs more time; {view.bags.filling_progress()}"
                     "ask about a shorter window"
                 ) from error
-        else:
-            since = None
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in parts)
@@ -216,7 +211,9 @@ class RobotTracks:
         """Yields the track, the newest first, each part with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
         whole = _aligned(window, PART_NS)
-        moving = [] if self._is_own else self._moving_scans(whole)
+        around = _aligned(whole.widened(TF_CACHE_NS), PART_NS)
+        topics = () if self._is_own else self._view.moving_topics
+        moving = [open_scan(self._view, topic, around, copies=True) for topic in topics]
         for topic in self._topics:
             opened = open_scan(self._view, topic, whole, stored=self._view.call.stored)
             yield from joined_back(
@@ -227,15 +224,6 @@ class RobotTracks:
                 partial(self._stretch_key, opened, moving, window),
                 trouble=lambda: len(self._failures),
             )
-
-    def _moving_scans(self, window: TimeWindow) -> list[Scan]:
-        """Returns the scans of the moving transforms of a window, and around it."""
-        topics = self._view.timeline.topics()
-        around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
-        named = self._view.limits.tf_topics
-        return [
-            open_scan(self._view, name, around, copies=True) for name in named if name in topics
-        ]
 
     def _parts_in(
         self,
@@ -382,13 +370,9 @@ class RobotTracks:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        placed = [NOWHERE]
-        for topic in self._topics:
-            placed += [
-                self._poses_of(rows, self._lent_spans(rows, window))
-                for rows in scan(self._view, topic, window)
-            ]
-        return _in_time_order(placed)
+        scanned = chain.from_iterable(scan(self._view, topic, window) for topic in self._topics)
+        placed = [self._poses_of(rows, self._lent_spans(rows, window)) for rows in scanned]
+        return _in_time_order([NOWHERE, *placed])
 
     def _lender_at(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none, or another."""
