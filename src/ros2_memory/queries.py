@@ -474,7 +474,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
                     type_name,
                     census.first,
                     census.last,
-                    census.count,
+                    census.messages,
                     reasons.get(type_name),
                     notes.get(topic, ()),
                 )

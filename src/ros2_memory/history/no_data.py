@@ -315,8 +315,12 @@ def no_data_at(
         *_distances(at, older, newer, tolerance),
         *why,
         *_advice(view, reason),
-        *(_to_come(view, at) or _enough_tolerance(at, older, tolerance)),
+        *_to_come(view, at),
     ]
+    is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
+    if older and is_near and not _to_come(view, at):
+        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
+        detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -333,13 +337,6 @@ def _distances(
     if newer:
         later = seconds(newer.time - at)
         yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
-
-
-def _enough_tolerance(at: Ns, older: StoredMessage | None, tolerance: Ns | None) -> Iterator[str]:
-    """Yields which `tolerance_s` would take the older message, if that is not far away."""
-    if older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
-        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
-        yield f"to accept the older one, ask with tolerance_s of at least {enough:.3f}"
 
 
 def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:

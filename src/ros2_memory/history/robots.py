@@ -23,7 +23,6 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
-from ros2_memory.history.merged_stream import bag_span_of
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
@@ -220,7 +219,8 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
 
 
 def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
-    return [bag_span_of(bag, (topic,)) for bag in bags if topic in bag.summary.schema.positions]
+    holding = (bag for bag in bags if topic in bag.summary.schema.positions)
+    return [BagSpan(*bag.summary.span_of((topic,)), bag) for bag in holding]
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
@@ -511,8 +511,7 @@ def _bags_differ(
 
     Two runs of a simulation share some, as those of a robot that has not moved yet.
     """
-    first, other = bags
-    return all(_lacks_most(view, topic, pair, both) for pair in (bags, (other, first)))
+    return all(_lacks_most(view, topic, pair, both) for pair in (bags, bags[::-1]))
 
 
 def _lacks_most(

@@ -8,6 +8,7 @@ messages are looked at, and where recordings overlap those that count.
 from __future__ import annotations
 
 from collections import Counter
+from functools import partial
 from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar, Unpack
 
@@ -131,7 +132,6 @@ def joined_back(
         beside: how far before and after a stretch (ns) rows are part of it, too.
         trouble: differs from before where something could not be read since.
     """
-    fragments = view.memory.columns.fragments(joining(kind))
     for stretch in opened.stretches(beside):
         view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
         key = key_of(stretch)
@@ -139,21 +139,24 @@ def joined_back(
             yield from make(stretch._replace(parts=None))
             continue
         view.bags.check_deadline()
-        joined = fragments.get(key)
-        if joined is None:
-            before = trouble(), view.notes.added
-            results: list[tuple[Ns, T]] = []
-            try:
-                results.extend(make(stretch))
-            except QueryTimeoutError:
-                # What there was time for is an answer, too, with a note.
-                yield from results
-                raise
-            joined = Joined(kind.join([result for _, result in results[::-1]]) if results else [])
-            if before == (trouble(), view.notes.added):
-                fragments.put(key, joined)
+        results: list[tuple[Ns, T]] = []
+        join = partial(_joined, kind, make(stretch), results)
+        try:
+            joined = remembered(view, joining(kind), key, join, trouble)
+        except QueryTimeoutError:
+            # What there was time for is an answer, too, with a note.
+            yield from results
+            raise
         for result in reversed(joined.fragments):
             yield stretch.window.start, result
+
+
+def _joined(
+    kind: FragmentKind[T], made: Iterable[tuple[Ns, T]], results: list[tuple[Ns, T]]
+) -> Joined[T]:
+    """Returns what was made, the newest first, as one; `results` has it one by one."""
+    results.extend(made)
+    return Joined(kind.join([result for _, result in results[::-1]]) if results else [])
 
 
 def remembered(

@@ -257,6 +257,7 @@ def connects(
         QueryTimeoutError: the call's time is over before that is known.
     """
     sessions, linked = view.sessions, view.sessions.linked
+    origin, target = (name.lstrip("/") for name in frames)
     if (frames, session) in linked:
         return True
     pairs: set[Pair] = set()
@@ -269,18 +270,12 @@ def connects(
         fresh = frozenset[Pair]().union(*newest_pairs)
         if not fresh <= pairs:
             pairs |= fresh
-            if _are_linked(pairs, frames):
+            named = ((parent.lstrip("/"), child.lstrip("/")) for parent, child in pairs)
+            if target in connected_with(origin, filter(is_edge, named)):
                 if window is None:
                     linked.add((frames, session))
                 return True
     return False
-
-
-def _are_linked(pairs: Iterable[tuple[str, str]], frames: tuple[str, str]) -> bool:
-    """Whether pairs of a parent and a child lead from one frame to the other."""
-    origin, target = (name.lstrip("/") for name in frames)
-    linked = [(parent.lstrip("/"), child.lstrip("/")) for parent, child in filter(is_edge, pairs)]
-    return target in connected_with(origin, linked)
 
 
 def _stamp_failure(failure: NoDataError, at: Ns, *, nothing_near: bool) -> NoDataError:

@@ -161,9 +161,13 @@ def placed_waypoints(
         recording = recording_at(view, topic, waypoint.time)
         half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
         pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-        there = None
-        if recording is not None:
-            there = _pose_near(view, pose, frame_id, waypoint.time, recording)
+        # By the transforms of its time, or of the nearest one up to `HOLD_NS` off.
+        tried = (
+            pose_in(view, pose, frame_id, waypoint.time + off, recording)
+            for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS)
+            if recording is not None
+        )
+        there = next(filter(None, tried), None)
         if there is None or there.orientation is None:
             # Asked once: to look for a frame that nothing leads to at each time takes long.
             if not (moved or known_to_lead) and not connects(view, (frame_id, own_frame)):
@@ -178,15 +182,6 @@ def placed_waypoints(
         left_out = counted(len(waypoints) - len(moved), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
     return tuple(moved)
-
-
-def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
-    """Returns a pose by the transforms of its time, or of the nearest one up to `HOLD_NS` off."""
-    for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
-        there = pose_in(view, pose, frame_id, time + off, recording)
-        if there is not None:
-            return there
-    return None
 
 
 def _unreachable(frame_id: str, own_frame: str) -> str:

@@ -28,7 +28,7 @@ from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, View, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, open_search
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     WHEREABOUTS,
@@ -80,15 +80,12 @@ def visits(
         QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
-    wall = memory.clock.now()
-    window = search_window(TimeRange(start_s, end_s), wall)
-    view = open_view(memory, call, min(window.stop, wall))
+    view, now, window = open_search(memory, call, TimeRange(start_s, end_s))
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
     asked_frame = (place and place.frame_id) or frame_id
     placement = map_placement(view, topic, asked_frame)
-    now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
         return _visits_of_places(view, window, placement, mixed, now)
     region_visits = RegionVisits(view, placement.frame_id, place.region, window)

@@ -291,6 +291,7 @@ class Scope:
         where: JsonValue = None,
         during: Sequence[WhileCondition] = (),
     ) -> None:
+        self._view = view
         self.window = window
         self.unknown: Spans = []
         self.since: Ns | None = None
@@ -306,7 +307,8 @@ class Scope:
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
-            state.require_met(window)
+            state.search.require_met(window.stop)
+            state.search.note_untested(window)
             known = state.known_in(window)
             unknown = unknown_times(view, window, known, f"what {condition.topic} said")
             self.unknown = united([*self.unknown, *unknown])
@@ -314,7 +316,9 @@ class Scope:
     @property
     def compared_frames(self) -> tuple[str, ...]:
         """The notes on the frames in which the other conditions compared positions, if any did."""
-        return tuple(dict.fromkeys(chain(*(state.compared_frames for state in self._states))))
+        searches = [state.search for state in self._states]
+        notes = (compared_frames(self._view, each.topics, each.condition) for each in searches)
+        return tuple(dict.fromkeys(chain(*notes)))
 
     @property
     def is_bounded(self) -> bool:
@@ -391,37 +395,17 @@ class _ConditionStates:
 
     def __init__(self, view: View, during: WhileCondition) -> None:
         self._view = view
-        self._condition = condition_of(
-            view,
-            during.topic,
-            during.condition_type,
-            during.value,
-            field=during.field,
-            min_score=0.0,
-        )
-        self._search = ReverseSearch(view, during.topic, self._condition)
-        self._holds_on = holds_on(view, self._search.topics)
+        topic, kind, value = during.topic, during.condition_type, during.value
+        condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
+        self.search = ReverseSearch(view, topic, condition)
+        self._holds_on = holds_on(view, self.search.topics)
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []
 
-    @property
-    def compared_frames(self) -> tuple[str, ...]:
-        """The note on the frames in which the condition compared positions, if it did."""
-        return compared_frames(self._view, self._search.topics, self._condition)
-
-    def require_met(self, window: TimeWindow) -> None:
-        """Checks that messages may meet the condition, and notes those that cannot be tested.
-
-        Raises:
-            InvalidArgumentsError: none of them can.
-        """
-        self._search.require_met(window.stop)
-        self._search.note_untested(window)
-
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when the topics said something: without silences, unless that holds on."""
-        topics, timeline = self._search.topics, self._view.timeline
+        topics, timeline = self.search.topics, self._view.timeline
         if self._holds_on:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
             known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
@@ -468,12 +452,12 @@ class _ConditionStates:
         if number < len(self._times):
             return self._times[number]
         window = TimeWindow(self._known.stop, end + 1)
-        message = self._view.stream.first(self._search.topics, window)
+        message = self._view.stream.first(self.search.topics, window)
         return MAX_NS if message is None else message.time
 
     def _read_around(self, time: Ns) -> None:
         """Reads the messages of the bags that may hold the newest one at a moment."""
-        topics = self._search.topics
+        topics = self.search.topics
         spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
         start = min((span.first for span in spans), default=time)
         stop = max((span.last + 1 for span in spans), default=time + 1)
@@ -484,7 +468,7 @@ class _ConditionStates:
             messages = messages if before is None else [before, *messages]
         self._times, self._values = [], []
         for message in messages:
-            met = self._search.matches(message)
+            met = self.search.matches(message)
             if met is not None:
                 self._times.append(message.time)
                 self._values.append(met)

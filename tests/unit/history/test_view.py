@@ -135,7 +135,7 @@ def test_every_message_counts_exactly_once_however_recordings_overlap(
     view = view_of(bag_dir)
     assert times(view, "/bumper") == expected
     assert times(view, "/bumper", newest_first=True) == expected[::-1]
-    assert view.census("/bumper")["std_msgs/msg/Bool"].count == len(expected)
+    assert view.census("/bumper")["std_msgs/msg/Bool"].messages == len(expected)
     total, chosen = pick(view, "/bumper", TimeWindow.everything(), 8)
     assert total == len(expected)
     assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]
@@ -313,7 +313,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
             assert texts(memory, window) == [each[:2] for each in inside]
             assert picked(memory, window) == [each[0] for each in inside]
         [census] = View(memory, Call()).census(TOPIC).values()
-        assert (census.first, census.last, census.count) == (
+        assert (census.first, census.last, census.messages) == (
             counted[0][0],
             counted[-1][0],
             len(counted),
@@ -340,7 +340,7 @@ def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part
         def check() -> None:
             census = View(memory, Call()).census(TOPIC)
             found = texts(memory, TimeWindow.everything())
-            assert sum(each.count for each in census.values()) == len(found)
+            assert sum(each.messages for each in census.values()) == len(found)
             fresh = memory_of(root, reader=McapReader())
             assert found == texts(fresh, TimeWindow.everything())
             assert census == View(fresh, Call()).census(TOPIC)
