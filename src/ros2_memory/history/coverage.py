@@ -131,10 +131,12 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     ):
         topics = Counter[str]()
         for loss in losses:
-            topics[loss.topic] += loss.lost if loss.by in by else 0
-        if lost := topics.total():
-            most = sorted((+topics).items(), key=lambda item: (-item[1], item[0]))
+            if loss.by in by:
+                topics[loss.topic] += loss.lost
+        if topics:
+            most = sorted(topics.items(), key=lambda item: (-item[1], item[0]))
             named = listed([f"{topic} ({count})" for topic, count in most])
+            lost = topics.total()
             they = "it was" if lost == 1 else "they were"
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
     refused = defaultdict[str, Spans](list)
@@ -150,7 +152,7 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
         )
 
 
-def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) -> Iterator[str]:
+def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
     """Yields a sentence for each reason for which nothing was recorded in a part of a window.
 
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
@@ -318,13 +320,13 @@ def unread_spans(
     snapshot: Snapshot,
     window: TimeWindow,
     *,
-    nothing: bool = False,
-    absent: Sequence[SetAside] = (),
-    odd: Sequence[BagFile] | None = None,
+    nothing: bool,
+    absent: Sequence[SetAside],
+    odd: Sequence[BagFile],
 ) -> Iterator[str]:
     """Yields the sentences for a window; none where all of it was read.
 
-    `odd` are the bags to name of those that are not whole; all of them where it is not given.
+    `odd` are the bags to name of those that are not whole.
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         names = [
@@ -343,7 +345,7 @@ def unread_spans(
     ]
     if faults and not nothing:
         yield describe_misdated(faults)
-    yield from describe_odd(snapshot.timeline.faulty(window) if odd is None else odd)
+    yield from describe_odd(odd)
 
 
 def lost_in(

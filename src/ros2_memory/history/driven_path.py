@@ -258,7 +258,7 @@ class PoseSlice:
         return FragmentKey(self.start, settings, tuple(chain.from_iterable(parts)))
 
 
-def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+def pose_slices(newest_first: Iterable[PoseRows], beside: Ns) -> Iterator[PoseSlice]:
     """Yields the slices of the clock in which there may be poses, the newest first.
 
     Args:

@@ -77,7 +77,7 @@ def pose_rows(
     window: TimeWindow,
     failures: list[UndecodableError],
     *,
-    among: Callable[[Path], bool] = lambda _: True,
+    among: Callable[[Path], bool],
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 

@@ -204,7 +204,8 @@ def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> Se
 
 def sentences(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
     window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
-    return list(unread_spans(snapshot, window, nothing=nothing))
+    odd = snapshot.timeline.faulty(window)
+    return list(unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd))
 
 
 def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
