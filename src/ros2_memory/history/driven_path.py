@@ -71,34 +71,21 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-class PathBackTo(NamedTuple):
-    """The path of a window, None where there is no message.
-
-    From `since` (log time, ns) on, where older bags were not read.
-    """
-
-    path: PathSlice | None
-    since: Ns | None = None
-
-
-def driven_path(view: View, topic: str, window: TimeWindow) -> PathBackTo:
-    """Returns the path in a window; a note says how far back it is known if not all was read.
-
-    Raises as `path_by_poses`.
-    """
-    path = path_by_poses(view, topic, window)
-    if path.since is not None:
+def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
+    """Does as `path_by_poses`; a note says how far back the path is known if not all was read."""
+    path, since = path_by_poses(view, topic, window)
+    if since is not None:
         view.notes.add_lack(
-            f"the path is known back to {unix_text(path.since)}: out of time before older bags "
-            "were read"
+            f"the path is known back to {unix_text(since)}: out of time before older bags were read"
         )
-    return path
+    return path, since
 
 
-def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
-    """Returns the path in a window by the poses of one topic.
+def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
+    """Returns the path in a window by the poses of one topic; None where there is no message.
 
-    Messages that cannot be decoded are left out, with a note.
+    And from which log time (ns) on it is known, where older bags were not read. Messages that
+    cannot be decoded are left out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
@@ -130,7 +117,7 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return PathBackTo(joined_slices(slices[::-1], fastest) if slices else None, since)
+    return joined_slices(slices[::-1], fastest) if slices else None, since
 
 
 def slices_of_path(

@@ -7,7 +7,7 @@ import re
 from contextlib import suppress
 from difflib import get_close_matches
 from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
 from ros2_memory.bag_dir.layout import is_carried, is_thinned
@@ -425,25 +425,14 @@ def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataErro
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 
 
-class _Nearest(NamedTuple):
-    """The nearest messages before and after a window, and a sentence where they do not count.
-
-    `is_between`: whether there are messages on both sides, of whatever time.
-    """
-
-    older: StoredMessage | None
-    newer: StoredMessage | None
-    elsewhere: list[str]
-    is_between: bool
-
-
 def _nearest(
     view: View, topics: tuple[str, ...], window: TimeWindow, ends: tuple[Ns, Ns]
-) -> _Nearest:
+) -> tuple[StoredMessage | None, StoredMessage | None, list[str], bool]:
     """Returns the last message up to one of the ends (log time), and the first from the other on.
 
     Where the recordings of the window have none of the topics, without messages of another time
-    altogether, as of another robot's bag.
+    altogether, as of another robot's bag, and with a sentence on it. At last whether there are
+    messages on both sides, of whatever time.
     """
     until, since = ends
     nearest = (
@@ -457,7 +446,7 @@ def _nearest(
         else None
         for stored, at in zip(nearest, (window.start, window.stop), strict=True)
     )
-    return _Nearest(older, newer, elsewhere, all(nearest))
+    return older, newer, elsewhere, all(nearest)
 
 
 def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:

@@ -347,28 +347,21 @@ def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls:
     assert note.endswith("those of fixed and moving")
 
 
-@pytest.mark.parametrize("later_s", [0, 30])
-def test_a_loan_is_never_silent(tmp_path: Path, later_s: int) -> None:
+@each_way
+@pytest.mark.parametrize("apart_s", [0, 30, 3600, 86_400, -86_400])
+def test_a_loan_is_never_silent_and_a_recording_of_another_time_lends_nothing(
+    tmp_path: Path, apart_s: int, recalls: bool
+) -> None:
     """Whether `nav2` is the same robot cannot be known; a day apart it is another."""
     base = moving(T0, 60, "odom", "base_link", 0.0, 0.5)
     record(tmp_path / "nav2", [fixed(T0, "map", "odom", 100.0), *base])
-    record(tmp_path / "boat", drive(T0 + later_s * S, 60))
-    answer = visits(memory_of(tmp_path), Call(), 105.0, 0.0)
-    assert answer.total == 1
-    assert [note for note in answer.notes if "boat" in note and "those of nav2" in note]
-
-
-@each_way
-@pytest.mark.parametrize("apart", [-DAY, 3600 * S, DAY])
-def test_a_recording_of_another_time_lends_nothing(
-    tmp_path: Path, apart: int, recalls: bool
-) -> None:
-    base = moving(T0, 60, "odom", "base_link", 0.0, 0.5)
-    record(tmp_path / "nav2", [fixed(T0, "map", "odom", 100.0), *base])
-    record(tmp_path / "boat", drive(T0 + apart, 60))
+    record(tmp_path / "boat", drive(T0 + apart_s * S, 60))
     memory = memory_of(tmp_path, recalls=recalls)
-    assert visits(memory, Call(), 105.0, 0.0).total == 0
-    assert visits(memory, Call(), 5.0, 0.0).frame_id == "odom"
+    answer = visits(memory, Call(), 105.0, 0.0)
+    notes = [note for note in answer.notes if "boat" in note and "those of nav2" in note]
+    lends = apart_s in {0, 30}
+    assert (answer.total, len(notes)) == (int(lends), int(lends))
+    assert visits(memory, Call(), 5.0, 0.0).frame_id == ("map" if lends else "odom")
 
 
 @pytest.mark.parametrize("has_tf", [False, True])
