@@ -312,19 +312,15 @@ class Sessions:
         bags = self.bags_of(session, topics, window)
         merged = stream.merged(bags, topics, window, newest_first=False)
         tracked = self._view.bags.track_sources(merged)
-        return [
-            *decoded_transforms(
-                self._view, (stored for stored in tracked if self.has(session, stored))
-            )
-        ]
+        of_session = (stored for stored in tracked if self.has(session, stored))
+        return [*decoded_transforms(self._view, of_session)]
 
     def received(self, session: Session | None, rows: Rows) -> Iterator[StampedTransform]:
         """Yields the transforms in some rows that are of a session; None: of any."""
         messages = messages_of(self._view, rows)
-        return decoded_transforms(
-            self._view,
-            (stored for stored in messages if session is None or self.has(session, stored)),
-        )
+        if session is not None:
+            messages = (stored for stored in messages if self.has(session, stored))
+        return decoded_transforms(self._view, messages)
 
     def static(self, session: Session) -> Sequence[StampedTransform]:
         """Returns the static transforms of a session, in log-time order.
@@ -441,30 +437,33 @@ class Sessions:
         self, topic: str, session: Session | None, window: TimeWindow | None = None
     ) -> Iterator[frozenset[Pair]]:
         """Yields the pairs of a topic (in a window), table by table, those of the newest first."""
-        view, known_pairs = self._view, self._view.memory.columns.caches.pairs
         window = TimeWindow.everything() if window is None else window
         if session is not None:
             window = window.intersect(self._span_of(session, (topic,)))
-        for rows in scan(view, topic, window, newest_first=True, copies=True, may_be_empty=True):
-            is_carried = session is not None and self.holds_carried(rows.recording)
-            if is_carried or session is None or self.folder(rows.recording) in session:
-                part = None if is_carried else rows.part
-                pairs = None if part is None else known_pairs.get(part)
-                if pairs is None:
-                    before = view.notes.added
-                    pairs = self._pairs_in(rows, session if is_carried else None)
-                    if part is not None and view.notes.added == before:
-                        known_pairs.put(part, pairs, 200 + 200 * len(pairs))
-                yield pairs
+        for rows in scan(
+            self._view, topic, window, newest_first=True, copies=True, may_be_empty=True
+        ):
+            if session is None or self.may_hold(session, rows.recording):
+                yield self._pairs_in(rows, session if self.holds_carried(rows.recording) else None)
 
     def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
-        pair_sets = None
+        """Returns the pairs in some rows; with a `session` those that are of it."""
+        view, known_pairs = self._view, self._view.memory.columns.caches.pairs
+        part = rows.part if session is None else None
+        pairs = None if part is None else known_pairs.get(part)
+        if pairs is not None:
+            return pairs
+        before, by_columns = view.notes.added, None
         if session is None:
-            pair_sets = of_columns(self._view, rows, lambda some: pairs_in(some.table, some.index))
-        if pair_sets is not None:
-            return frozenset[Pair]().union(*pair_sets)
-        received = self.received(session, rows)
-        return frozenset((transform.parent, transform.child) for transform in received)
+            by_columns = of_columns(view, rows, lambda some: pairs_in(some.table, some.index))
+        if by_columns is None:
+            received = self.received(session, rows)
+            pairs = frozenset((transform.parent, transform.child) for transform in received)
+        else:
+            pairs = frozenset[Pair]().union(*by_columns)
+        if part is not None and view.notes.added == before:
+            known_pairs.put(part, pairs, 200 + 200 * len(pairs))
+        return pairs
 
 
 def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:

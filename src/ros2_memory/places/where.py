@@ -177,7 +177,12 @@ def _parse_place(
     limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        return _place_by_name(limits, value, what)
+        if (place := _place_named(limits, value)) is not None:
+            return Where(place.region, place.frame_id, place.name)
+        names = ", ".join(sorted(named.name for named in limits.places))
+        none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
+        listed = f"there are: {names}" if names else none
+        raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(value)}; {listed}")
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - _OF_REGION
@@ -209,19 +214,11 @@ def places_setting(limits: QuerySettings) -> str:
 
 
 def _place_named(limits: QuerySettings, name: str) -> Place | None:
-    asked = " ".join(name.split()).casefold()
-    same = (named for named in limits.places if " ".join(named.name.split()).casefold() == asked)
+    def folded(words: str) -> str:
+        return " ".join(words.split()).casefold()
+
+    same = (named for named in limits.places if folded(named.name) == folded(name))
     return next(same, None)
-
-
-def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
-    place = _place_named(limits, name)
-    if place is not None:
-        return Where(place.region, place.frame_id, place.name)
-    names = ", ".join(sorted(named.name for named in limits.places))
-    none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
-    listed = f"there are: {names}" if names else none
-    raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(name)}; {listed}")
 
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
@@ -326,14 +323,11 @@ class Scope:
         return self._inside is not None or bool(self._states)
 
     def narrowed(self) -> Iterator[TimeWindow]:
-        """Yields the parts of the window in which matches may count, newest first."""
+        """Returns the parts of the window in which matches may count, newest first."""
         if self._inside is None:
-            yield self.window
-            return
-        for start, stop in reversed(self._inside):
-            part = self.window.intersect(TimeWindow(start, stop))
-            if not part.empty:
-                yield part
+            return iter([self.window])
+        spans = (TimeWindow(*span) for span in reversed(self._inside))
+        return (part for part in map(self.window.intersect, spans) if not part.empty)
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether a match at a moment counts."""

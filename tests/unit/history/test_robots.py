@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -43,6 +43,12 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, robot in enumerate(("red", "blue")):
         write_mcap(folder / robot / f"{robot}_0.mcap", drive(10.0 * number))
     return folder
+
+
+def driven(memory: Memory, start: int, stop: int) -> Any:
+    """The path from a second to another."""
+    span = {"start": T0_S + start, "end": T0_S + stop}
+    return asked(memory, memory.index.bag_dir, "trajectory_summary", **span)
 
 
 def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
@@ -195,7 +201,7 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     if fills:
         memory = with_store(memory, tmp_path)
     window = {"start": T0_S, "end": T0_S + 200}
-    told = asked(memory, tmp_path, "trajectory_summary", **window)
+    told = driven(memory, 0, 200)
     # Of 60 m and 59.5 m, without the 20 m of the 40 s that are twice: a gap is no way.
     assert told["distance_m"] == pytest.approx(100.0, abs=0.6)
     [note] = [each for each in told["notes"] if "run_0 and run_1" in each]
@@ -206,7 +212,7 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     by_hour = asked(memory, tmp_path, "trajectory_summary", **window, by="hour")
     [[*_, metres]] = by_hour["rows"]
     assert metres == pytest.approx(told["distance_m"], abs=0.02)
-    alone = asked(memory, tmp_path, "trajectory_summary", start=T0_S + 130, end=T0_S + 200)
+    alone = driven(memory, 130, 200)
     assert not [each for each in alone.get("notes", ()) if "run_0" in each]
 
 
@@ -221,12 +227,12 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     memory = memory_of(tmp_path)
     assert differing(memory) == [(("run_1", "run_2"), None)]
     assert warned(memory) == []
-    told = asked(memory, tmp_path, "trajectory_summary", start=T0_S + 95, end=T0_S + 200)
+    told = driven(memory, 95, 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
     assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
     # What lies in a time that the recording had before is left out, and nothing is a jump back.
     for known in (memory, with_store(memory, tmp_path)):
-        whole = asked(known, tmp_path, "trajectory_summary", start=T0_S, end=T0_S + 200)
+        whole = driven(known, 0, 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])
         for at, is_twice in ((50, True), (150, False)):
@@ -305,7 +311,7 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
         (step,) = asked(memory, tmp_path, "data_time_range")["clock_steps"]
         assert step["at"] == pytest.approx(T0_S + 20, abs=1)
         assert step["step_s"] == pytest.approx(-29.9, abs=2)
-        path = asked(memory, tmp_path, "trajectory_summary", start=T0_S, end=T0_S + 70)
+        path = driven(memory, 0, 70)
         assert path["distance_m"] == pytest.approx(20.0, abs=1.2)
         assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
         assert any("run has the time from" in note for note in path["notes"])
@@ -323,7 +329,7 @@ def test_a_path_by_transforms_over_a_clock_that_was_set_back_is_not_known(tmp_pa
             moves.append(tf(at, transform(at, "odom", "base_link", (second / 5, 0.0, 0.0))))
         write_mcap(tmp_path / "run" / f"run_{number}.mcap", moves)
     memory = memory_of(tmp_path)
-    refused = asked(memory, tmp_path, "trajectory_summary", start=T0_S, end=T0_S + 60)
+    refused = driven(memory, 0, 60)
     assert (refused["reason"], refused["detail"][:11]) == ("mixed", "1 recording")
-    after = asked(memory, tmp_path, "trajectory_summary", start=T0_S + 41, end=T0_S + 60)
+    after = driven(memory, 41, 60)
     assert after["distance_m"] == pytest.approx(1.6, abs=0.1)
