@@ -347,7 +347,7 @@ def pose_frame(view: View, topic: str) -> str:
 
 
 class Body(NamedTuple):
-    """The robot's body among the frames that move: `child` in `parent`.
+    """The robot's body among the frames that move: `child` in `parent`, and the other frames.
 
     `above`: the frames above it, the nearest first. `odometry`: in which its path is measured, as
     no correction of the map is driven: that of odometry, else `parent`. `beside`: the bodies of
@@ -356,6 +356,7 @@ class Body(NamedTuple):
 
     parent: str
     child: str
+    others: tuple[str, ...]
     above: tuple[str, ...]
     odometry: str
     beside: tuple[str, ...]
@@ -377,11 +378,10 @@ def robot_body(view: View) -> Body | None:
     body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
     odometry = next(filter(_is_odometry, above[body]), root)
-    named = (child for child in moving if _body_rank(child, map_frame) < len(_BODIES))
-    beside = {
-        child for child in named if child not in {body, *above[body]} and body not in above[child]
-    }
-    return Body(root, body, tuple(above[body]), odometry, tuple(sorted(beside)))
+    others = sorted({child for child in moving if child != body})
+    named = (child for child in others if _body_rank(child, map_frame) < len(_BODIES))
+    beside = (child for child in named if child not in above[body] and body not in above[child])
+    return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
 
 
 def _ancestors(frame: str, parents: Mapping[str, str]) -> list[str]:
@@ -505,10 +505,12 @@ def _poses_of_body_in(
     by_stamp = frames.clock == "stamp"
     moments = [transform.stamp if by_stamp else transform.log_time for transform in of_body]
     placed = frames.poses(body.child, np.array(moments, np.int64))
+    if placed is None:
+        return
     last = MIN_NS
     # None is before the first transform of the map, or in its gap.
-    for nth in [] if placed is None else np.flatnonzero(placed.valid).tolist():
+    for nth in np.flatnonzero(placed.valid).tolist():
         time = of_body[nth].log_time
-        if placed is not None and time - last >= _STEP_NS:
+        if time - last >= _STEP_NS:
             last, there = time, placed.at(nth)
             yield time, Pose(there.translation, there.rotation, body.odometry)
