@@ -171,15 +171,17 @@ class RobotTracks:
         since: Ns | None = None
         reading = view.call.partial_after(_READING_S)
         try:
-            for since, part in self._parts(around, reading):  # noqa: B007
+            for start, part in self._parts(around, reading):
                 parts.append(part)
-            since = None
+                since = start
         except QueryTimeoutError as error:
             if not parts:
                 raise QueryTimeoutError(
                     f"the question needs more time; {view.bags.filling_progress()}"
                     "ask about a shorter window"
                 ) from error
+        else:
+            since = None
         if self._failures:
             note_left_out(view, self._failures[0])
         left_out = sum(part.left_out for part in parts)

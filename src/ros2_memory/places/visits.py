@@ -349,7 +349,7 @@ class RegionVisits:
         first = max(older.start, older.stop - TRACK_SLICE_NS)
         last = min(newer.stop, newer.start + TRACK_SLICE_NS)
         poses = self._poses(TimeWindow(first, last + 1))
-        inside = self._poses_inside(poses)
+        inside = [*self._poses_inside(poses)]
         if not inside or inside[0] > older.stop or inside[-1] < newer.start:
             return False
         return not any(_absences(poses.times, inside))
@@ -363,7 +363,7 @@ class RegionVisits:
         # So near to the window's ends, poses decide on which side a visit begins, or ends.
         room = TRACK_SLICE_NS
         if window.start + room <= whole.start and whole.stop < window.stop - room:
-            if self._vertices_inside(track, whole):
+            if any(True for _ in self._vertices_inside(track, whole)):
                 return visit
             self._looked_at += 1
             if self._looked_at > _MOST_TRIED:
@@ -372,11 +372,10 @@ class RegionVisits:
         if exact is None or not window.overlaps(exact.start, exact.stop):
             return None
         cut = exact.within(window)
-        if cut != exact and not (
-            self._vertices_inside(track, cut)
-            or self._poses_inside(self._poses(TimeWindow(cut.start, cut.stop + 1)))
-        ):
-            return None
+        if cut != exact and not any(True for _ in self._vertices_inside(track, cut)):
+            poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
+            if not any(True for _ in self._poses_inside(poses)):
+                return None
         return visit._replace(inside=visit.inside._replace(entered=cut.entered, left=cut.left))
 
     def _by_poses(self, visit: RegionVisit) -> Inside | None:
@@ -394,7 +393,7 @@ class RegionVisits:
     def _inside_near(self, visit: RegionVisit, at: Ns) -> list[Ns]:
         """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
         whole, poses = visit.whole, self._poses_around(visit.track, at)
-        inside = self._poses_inside(poses)
+        inside = [*self._poses_inside(poses)]
         absences = [*_absences(poses.times, inside)]
         # What lies beyond an absence is of the visit before, or after.
         begin = max((back for left, back in absences if left < whole.start), default=MIN_NS)
@@ -402,16 +401,16 @@ class RegionVisits:
         own = (time for time in inside if begin <= time <= end)
         return [*own, *self._vertices_inside(visit.track, whole)]
 
-    def _poses_inside(self, poses: Placed) -> list[Ns]:
+    def _poses_inside(self, poses: Placed) -> Iterator[Ns]:
         return self._times_inside(poses.times, poses.x, poses.y)
 
-    def _times_inside(self, times: Times, x: Floats, y: Floats) -> list[Ns]:
-        """Returns those of some times at which the robot was in the region."""
+    def _times_inside(self, times: Times, x: Floats, y: Floats) -> Iterator[Ns]:
+        """Yields those of some times at which the robot was in the region."""
         rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
-        return [time for time, *place in rows if self._region.contains(*place)]
+        return (time for time, *place in rows if self._region.contains(*place))
 
-    def _vertices_inside(self, track: RobotTrack, stay: Inside) -> list[Ns]:
-        """Returns the times of a visit's vertices that are inside."""
+    def _vertices_inside(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
+        """Yields the times of a visit's vertices that are inside."""
         first = np.searchsorted(track.times, stay.start, side="left")
         last = np.searchsorted(track.times, stay.stop, side="right")
         return self._times_inside(track.times[first:last], track.x[first:last], track.y[first:last])
