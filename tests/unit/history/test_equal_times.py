@@ -155,7 +155,7 @@ def counted(memory: Memory, bag_dir: Path) -> tuple[int, float]:
     return values.get("count", 0), values.get("seconds", 0.0)
 
 
-@settings(max_examples=10 if LONG else 2, deadline=None)
+@settings(max_examples=10 if LONG else 2)
 @given(seed=st.integers(0, 2**32), part=st.sampled_from([1.0, 0.5]), has_types=st.booleans())
 @example(seed=12, part=1.0, has_types=False)
 @example(seed=35, part=0.5, has_types=False)

@@ -87,7 +87,7 @@ def session_of(view: View) -> Session:
     return session
 
 
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(cuts=st.lists(st.integers(26, SECONDS - 1), max_size=4), stored=st.booleans())
 def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
     cuts: list[int], stored: bool

@@ -121,7 +121,6 @@ def takeovers(draw: st.DrawFn) -> tuple[list[list[Msg]], list[int]]:
 
 @settings(
     max_examples=examples(60),
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(takeovers())
@@ -293,7 +292,6 @@ def picked(memory: Memory, window: TimeWindow) -> list[int]:
 
 @settings(
     max_examples=examples(12),
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 0.5, 1.0]), stamped=st.booleans())
@@ -323,7 +321,7 @@ def test_each_message_counts_once_whatever_the_catalogue_knows(
         assert last.time == counted[-1][0]
 
 
-@settings(max_examples=examples(6), deadline=None)
+@settings(max_examples=examples(6))
 @given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 1.0]))
 def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part: float) -> None:
     draw = random.Random(seed)

@@ -160,7 +160,7 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
 SECONDS = 200
 
 
-@settings(max_examples=examples(8), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10_000),
     stored=st.booleans(),

@@ -70,7 +70,7 @@ def table(reply: Any) -> dict[str, dict[str, Any]]:
     }
 
 
-@settings(max_examples=examples(8), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
 @example(seed=23, stored=False, rooms=["hall", "kitchen"])  # comes in with the newest pose
 @given(
     seed=st.integers(0, 10_000),

@@ -253,7 +253,7 @@ def walk(draw: random.Random, count: int, step: float) -> list[tuple[int, float,
     return poses
 
 
-@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
@@ -288,7 +288,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
         )
 
 
-@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
 @example(seed=2013, split_s=5.0)
 @example(seed=7197, split_s=5.0)
