@@ -38,7 +38,6 @@ from ros2_memory.core.timebase import (
 from ros2_memory.history import transforms as frame_history
 from ros2_memory.history.clock_steps import across_steps, clock_steps, elapsed_in, while_recorded
 from ros2_memory.history.context import READING_S, Call, Memory
-from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import (
     by_remark,
     describe_misdated,
@@ -52,10 +51,10 @@ from ros2_memory.history.coverage import (
 )
 from ros2_memory.history.driven_path import (
     Body,
+    body_of,
     driven_path,
     newest_of_body,
     resolve_path_topic,
-    robot_body,
 )
 from ros2_memory.history.no_data import (
     decode,
@@ -68,7 +67,6 @@ from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,
     topics_with,
-    transform_topics,
     with_notes,
 )
 from ros2_memory.history.reverse_search import (
@@ -80,6 +78,7 @@ from ros2_memory.history.reverse_search import (
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
+from ros2_memory.history.scan import pick
 from ros2_memory.history.view import (
     AtTime,
     TimeRange,
@@ -191,7 +190,7 @@ def position(
     """
     view, at, now = open_moment(memory, call, moment)
     name = resolve_path_topic(view, topic, degrees=True)
-    body = robot_body(view) if name in memory.limits.tf_topics else None
+    body = body_of(view, name)
     if body is not None:
         return _position_of_body(
             view,
@@ -298,7 +297,7 @@ def _not_placed(
     """Returns the error for no transform that places the robot's body at a moment."""
     try:
         frame_history.transform_at(view, frame_id or body.parent, body.child, at)
-        error = no_data_at(view, tuple(transform_topics(view)), at, tolerance)
+        error = no_data_at(view, view.moving_topics, at, tolerance)
     except NoDataError as none_then:
         error = with_notes(view, TimeWindow.around(at, TF_CACHE_NS), none_then)
     fixes = topics_with(view, "geodetic")
@@ -347,7 +346,7 @@ def transform(
 def frames(memory: Memory, call: Call) -> results.Frames:
     """Returns every frame and parent-child pair that was recorded."""
     view = open_view(memory, call, memory.clock.now())
-    edges = frame_history.edges(view)
+    edges = view.sessions.edges
     note_unread(view, TimeWindow.everything(), nothing=True)
     return results.Frames(edges, notes=view.notes.sentences())
 
@@ -475,7 +474,7 @@ def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, 
                     type_name,
                     census.first,
                     census.last,
-                    census.count,
+                    census.messages,
                     reasons.get(type_name),
                     notes.get(topic, ()),
                 )
@@ -550,8 +549,8 @@ def _newest_beside(
     if newest is None or newest.bag.recording == match.bag.recording:
         return newest
     recording = match.bag.recording
-    newest = frame_history.newest_in_session(view, topic, window, recording) or newest
-    if not frame_history.sessions_of(view).are_joined(recording, newest.bag.recording):
+    newest = view.sessions.newest(topic, window, recording) or newest
+    if not view.sessions.are_joined(recording, newest.bag.recording):
         view.notes.add(
             f"the match is of recording {recording.name}, and the value of "
             f"{newest.bag.recording.name}: no handover proves that both are of one robot"

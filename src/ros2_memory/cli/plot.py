@@ -42,7 +42,6 @@ from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import counted, listed, shortened
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.counting import pick
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.driven_path import robot_body
 from ros2_memory.history.no_data import (
@@ -52,6 +51,7 @@ from ros2_memory.history.no_data import (
     topics_that_show_poses,
     topics_with,
 )
+from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.places.local_map import east_north, fixes_in, local_frame

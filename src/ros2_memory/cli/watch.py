@@ -32,8 +32,8 @@ from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.counting import count_messages
 from ros2_memory.history.coverage import cut_spans
+from ros2_memory.history.scan import count_messages
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import memory_status

@@ -26,11 +26,10 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S
-from ros2_memory.history.counting import count_messages
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import note_summarised
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.scan import decoded_rows, messages_of, of_columns, scan
+from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
 
 if TYPE_CHECKING:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from dataclasses import replace
+from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -69,27 +70,18 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
 
 def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
     """Returns those gaps, of which there is one at least, in order, that are no clock step."""
-    try:
-        steps = {
-            at for at, by in _steps_around(view, TimeWindow(gaps[0][0], gaps[-1][1])) if by > 0
-        }
-    except QueryTimeoutError:
-        _note_timeout(view)
-        return gaps
+    around = TimeWindow(gaps[0][0], gaps[-1][1])
+    steps = {step.at for step in _known_steps(view, around) if step.by > 0}
     return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     """Returns how much time passed between moments of a window; notes name the steps in it."""
-    try:
-        steps = [
-            step
-            for step in _steps_around(view, window)
-            if window.overlaps(step.at, step.at + max(step.by - 1, 0))
-        ]
-    except QueryTimeoutError:
-        _note_timeout(view)
-        return Elapsed()
+    steps = [
+        step
+        for step in _known_steps(view, window)
+        if window.overlaps(step.at, step.at + max(step.by - 1, 0))
+    ]
     _note_pauses(view, window)
     for at, by in steps:
         view.notes.add(
@@ -101,10 +93,15 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     return Elapsed(steps)
 
 
-def _note_timeout(view: View) -> None:
-    view.notes.add_lack(
-        "out of time before it was known whether the clock was set: durations are by the clock"
-    )
+def _known_steps(view: View, window: TimeWindow) -> list[ClockStep]:
+    """Returns the steps in and near a window; none, with a note, where the call's time is over."""
+    try:
+        return _steps_around(view, window)
+    except QueryTimeoutError:
+        view.notes.add_lack(
+            "out of time before it was known whether the clock was set: durations are by the clock"
+        )
+        return []
 
 
 def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:
@@ -112,29 +109,26 @@ def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> T
 
     A step is a gap among poses that are often enough for it; see `odometry`.
     """
-    duration_s = trajectory.totals.duration_s
     skipped = elapsed.skipped_between(path.first, path.last)
     if not skipped or trajectory.poses < 2:
         return trajectory
     totals = trajectory.totals
-    least = GAP_PERIODS * duration_s / (trajectory.poses - 1)
+    least = GAP_PERIODS * totals.duration_s / (trajectory.poses - 1)
     crossed = [
         stop - begin
         for begin, stop in elapsed.skipped
         if path.first <= begin and stop <= path.last and unix_from_ns(stop - begin) > least
     ]
     gaps, gap_ns = max(0, totals.gaps - len(crossed)), totals.gap_ns - sum(crossed)
-    elapsed_s = duration_s - unix_from_ns(skipped)
-    return replace(
-        trajectory,
-        totals=replace(
-            totals,
-            gaps=gaps,
-            gap_m=totals.gap_m if gaps else 0.0,
-            gap_ns=gap_ns if gap_ns > GAP_NS else 0,
-        ),
-        avg_speed=mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed,
+    elapsed_s = totals.duration_s - unix_from_ns(skipped)
+    crossing = replace(
+        totals,
+        gaps=gaps,
+        gap_m=totals.gap_m if gaps else 0.0,
+        gap_ns=gap_ns if gap_ns > GAP_NS else 0,
     )
+    avg_speed = mean_speed(totals.distance_m, elapsed_s) or trajectory.avg_speed
+    return replace(trajectory, totals=crossing, avg_speed=avg_speed)
 
 
 def while_recorded(trajectory: Trajectory, elapsed: Elapsed, path: PathSlice) -> Trajectory:
@@ -161,11 +155,10 @@ def _steps_around(view: View, window: TimeWindow) -> list[ClockStep]:
         for fault in view.snapshot.dating.faults
         if fault.kind is FaultyClock.SET_BACK and fault.by >= SHORTEST_STEP_NS
     ]
-    deleted = (ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back)
-    steps_in_pauses = (
-        _step_of_pause(view, pause) for pause in _suspects(view, window)[-_MOST_SUSPECTS:]
-    )
-    newest_first = sorted({*steps, *deleted, *filter(None, steps_in_pauses)}, reverse=True)
+    steps += [ClockStep(at, -by) for at, by in read_thinned(view.bag_dir).set_back]
+    for pause in _suspects(view, window)[-_MOST_SUSPECTS:]:
+        steps += _steps_of_pause(view, pause)
+    newest_first = sorted(steps, reverse=True)
     # A step back is a minimum: of two at one time the longer one is nearer to the truth.
     return sorted({step.at: step for step in newest_first}.values())
 
@@ -195,22 +188,22 @@ def _note_pauses(view: View, window: TimeWindow) -> None:
         )
 
 
-def _step_of_pause(view: View, pause: Pause) -> ClockStep | None:
-    """Returns the step that a pause is, which is looked at once if its bags are closed."""
+def _steps_of_pause(view: View, pause: Pause) -> tuple[ClockStep, ...]:
+    """Returns the step that a pause is, if any, which is looked at once if its bags are closed."""
     around = TimeWindow(pause.start, pause.end + 1).widened(STAMPS_BESIDE_NS)
     bags = view.timeline.overlapping(around)
     topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
     key = (topic, pause.start, pause.end, *[bag.identity for bag in bags])
-    scanner = view.memory.columns
-    remembered = scanner.caches.clock_steps.get(key)
-    if remembered is None:
+    remembered = view.memory.columns.caches.clock_steps
+    steps = remembered.get(key)
+    if steps is None:
         with view.notes.isolated():
             step = _find_step(view, topic, pause)
             is_final = view.notes.complete and all(bag.state is BagState.CLOSED for bag in bags)
-        remembered = () if step is None else (step,)
+        steps = () if step is None else (step,)
         if is_final:
-            scanner.caches.clock_steps.put(key, remembered, _STEPS_BYTES)
-    return next(iter(remembered), None)
+            remembered.put(key, steps, _STEPS_BYTES)
+    return steps
 
 
 def _find_step(view: View, topic: str | None, pause: Pause) -> ClockStep | None:
@@ -236,11 +229,9 @@ def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
         counts.update({info.topic: info.count for info in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
-        for times, stamps in _stamps(view, topic, around).values():
-            change = delay_change((pause.start, pause.end), times, stamps)
-            if change is not None:
-                changes.append(change)
-                break
+        by_recording = _stamps(view, topic, around).values()
+        found = (delay_change((pause.start, pause.end), *stamped) for stamped in by_recording)
+        changes += islice((change for change in found if change is not None), 1)
     return step_by_delays((pause.start, pause.end), changes)
 
 
@@ -270,8 +261,7 @@ def _stamps(view: View, topic: str, window: TimeWindow) -> dict[Path, NDArray[np
 
     for rows in scan(view, topic, window, may_match=may_match):
         by_recording[rows.recording] += of_columns(view, rows, stamped) or []
-    by_recording = {path: parts for path, parts in by_recording.items() if parts}
-    return {path: np.concatenate(parts, axis=1) for path, parts in by_recording.items()}
+    return {path: np.concatenate(parts, axis=1) for path, parts in by_recording.items() if parts}
 
 
 def _poses(view: View, topic: str, window: TimeWindow, recordings: Collection[Path]) -> Poses:

@@ -161,16 +161,17 @@ class Memory:
         )
 
     def _listings(self) -> Listings:
-        return self.memo.of(_LISTINGS, self._stored_listings)
-
-    def _stored_listings(self) -> Listings:
         """Returns what was stored of each metadata.yaml; one that is damaged is read again."""
-        stored = {} if self.columns.store is None else self.columns.store.listings()
-        listings: Listings = {}
-        for folder, text in stored.items():
-            with suppress(ValueError, TypeError, OverflowError):
-                listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
-        return listings
+
+        def stored() -> Listings:
+            listings: Listings = {}
+            texts = {} if self.columns.store is None else self.columns.store.listings()
+            for folder, text in texts.items():
+                with suppress(ValueError, TypeError, OverflowError):
+                    listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
+            return listings
+
+        return self.memo.of(_LISTINGS, stored)
 
     def heartbeat(self) -> Heartbeat | None:
         """Returns the last heartbeat of the recorder of these bags; None if there is none.

@@ -20,6 +20,7 @@ The first few of each kind are named, and the others counted:
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.intervals import SILENCE_NS
@@ -121,30 +122,27 @@ def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
 def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence for each way in which messages of a window are known to be missing."""
     losses = read_losses(bag_dir, window.start, window.stop)
-    for by, what in (
-        (("counter", "rosbag2"), "lost before {they} recorded"),
+    for what, *by in (
+        ("lost before {they} recorded", "counter", "rosbag2"),
         # A publisher that skipped one leaves the same mark as a loss.
-        (
-            ("stamps",),
-            "missing by the cadence of header stamps (never published, or lost)",
-        ),
-        (("forgotten",), "deleted by request"),
-        (("expired",), "deleted by retention (retention.topics)"),
+        ("missing by the cadence of header stamps (never published, or lost)", "stamps"),
+        ("deleted by request", "forgotten"),
+        ("deleted by retention (retention.topics)", "expired"),
     ):
-        topics: dict[str, int] = {}
+        topics = Counter[str]()
         for loss in losses:
             if loss.by in by:
-                topics[loss.topic] = topics.get(loss.topic, 0) + loss.lost
+                topics[loss.topic] += loss.lost
         if topics:
-            most = sorted(topics, key=lambda topic: (-topics[topic], topic))
-            named = listed([f"{topic} ({topics[topic]})" for topic in most])
-            lost = sum(topics.values())
+            most = sorted(topics.items(), key=lambda item: (-item[1], item[0]))
+            named = listed([f"{topic} ({count})" for topic, count in most])
+            lost = topics.total()
             they = "it was" if lost == 1 else "they were"
             yield f"{counted(lost, 'message')} {what.format(they=they)}: {named}"
-    refused: dict[str, list[tuple[Ns, Ns]]] = {}
+    refused = defaultdict[str, Spans](list)
     for loss in losses:
         if loss.by == "refused":
-            refused.setdefault(loss.topic, []).append((loss.start, loss.stop - 1))
+            refused[loss.topic].append((loss.start, loss.stop - 1))
     for topic in sorted(refused)[:MAX_NAMED]:
         spans = [_span_text(*span) for span in united(refused[topic], _EDGE_NS)]
         yield (
@@ -154,7 +152,7 @@ def describe_lost(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
         )
 
 
-def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) -> Iterator[str]:
+def describe_gaps(view: View, window: TimeWindow, *, explained: bool) -> Iterator[str]:
     """Yields a sentence for each reason for which nothing was recorded in a part of a window.
 
     Without a reason where none is known, unless only gaps that are `explained` are asked for.
@@ -167,7 +165,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
     ]
     if explained and not interruptions:
         return
-    spans_by_cause: dict[str, list[str]] = {}
+    spans_by_cause = defaultdict[str, list[str]](list)
     gone = deleted_spans(bag_dir)
     gaps = (part for gap in touched for part in _unrecorded(view.snapshot, gap, gone))
     for start, end in gaps:
@@ -176,7 +174,7 @@ def describe_gaps(view: View, window: TimeWindow, *, explained: bool = False) ->
         )
         may_come = being_written(view.snapshot, TimeWindow(start + 1, end))
         if window.overlaps(start, end) and (cause or not (explained or may_come)):
-            spans_by_cause.setdefault(cause, []).append(_span_text(start, end))
+            spans_by_cause[cause].append(_span_text(start, end))
     for by, spans in spans_by_cause.items():
         named = listed(spans[-MAX_NAMED:], len(spans))
         because = f", because {INTERRUPTIONS[by]}" if by else ""
@@ -199,18 +197,10 @@ def _unrecorded(
 
 
 def deleted_between(view: View, window: TimeWindow) -> Spans:
-    """Returns the parts of a window that were recorded, and that retention deleted since.
+    """Returns the spans in a window, or around its ends, that retention deleted since.
 
     Those in gaps, and those before the memory begins unless the window is open there (`MIN_NS`).
     """
-    return [
-        (max(start, window.start), min(stop, window.stop))
-        for start, stop in _deleted_near(view, window)
-    ]
-
-
-def _deleted_near(view: View, window: TimeWindow) -> Spans:
-    """Returns the spans of `deleted_between` before they are cut at the ends of the window."""
     snapshot, gone = view.snapshot, deleted_spans(view.bag_dir)
     if not gone:
         return []
@@ -230,10 +220,8 @@ def _deleted_near(view: View, window: TimeWindow) -> Spans:
 
 def describe_deleted(view: View, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on what was deleted whole of a window, if some was, and around that."""
-    spans = [_span_text(*span) for span in _deleted_near(view, window)]
-    if spans:
-        named = listed(spans[-MAX_NAMED:], len(spans))
-        yield f"recorded, and deleted since: {named}"
+    if spans := [_span_text(*span) for span in deleted_between(view, window)]:
+        yield f"recorded, and deleted since: {listed(spans[-MAX_NAMED:], len(spans))}"
 
 
 def cut_spans(bag_dir: Path, topic: str, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
@@ -253,8 +241,10 @@ def describe_excluded(bag_dir: Path, window: TimeWindow) -> Iterator[str]:
     spans = united((stretch.start, stretch.stop) for stretch in excluded)
     if spans:
         named = [f"{unix_text(start)} to {unix_text(stop)}" for start, stop in spans[-MAX_NAMED:]]
-        what = "excluded by the rules of recording.exclude_when, so there is no data of it"
-        yield f"{what}: {listed(named, len(spans))}"
+        yield (
+            "excluded by the rules of recording.exclude_when, so there is no data of it: "
+            f"{listed(named, len(spans))}"
+        )
 
 
 def note_edges(view: View, window: TimeWindow) -> None:
@@ -299,13 +289,14 @@ def not_covered(view: View, topics: Collection[str], window: TimeWindow) -> tupl
     deleted out of bags, nor by retention between two bags. A file that is being written
     does not count: or else no search of a robot that records would be complete.
     """
-    lost = lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
-    whole = all(map(is_whole, view.timeline.faulty(window)))
-    excluded = excluded_between(view.bag_dir, window.start, window.stop)
-    deleted = any(cut_spans(view.bag_dir, topic, window) for topic in topics)
-    deleted |= bool(deleted_between(view, window))
-    deleted |= any(describe_thinned(view.snapshot, window))
-    if view.notes.complete and whole and not lost and not excluded and not deleted:
+    is_complete = view.notes.complete and all(map(is_whole, view.timeline.faulty(window)))
+    if is_complete and not (
+        lost_in(view.snapshot, window, nothing=True, absent=_absent(view))
+        or excluded_between(view.bag_dir, window.start, window.stop)
+        or any(cut_spans(view.bag_dir, topic, window) for topic in topics)
+        or deleted_between(view, window)
+        or any(describe_thinned(view.snapshot, window))
+    ):
         return ()
     note_unread(view, window, nothing=True)
     return view.notes.sentences()
@@ -329,13 +320,13 @@ def unread_spans(
     snapshot: Snapshot,
     window: TimeWindow,
     *,
-    nothing: bool = False,
-    absent: Sequence[SetAside] = (),
-    odd: Sequence[BagFile] | None = None,
+    nothing: bool,
+    absent: Sequence[SetAside],
+    odd: Sequence[BagFile],
 ) -> Iterator[str]:
     """Yields the sentences for a window; none where all of it was read.
 
-    `odd` are the bags to name of those that are not whole; all of them where it is not given.
+    `odd` are the bags to name of those that are not whole.
     """
     if lost := lost_in(snapshot, window, nothing=nothing, absent=absent):
         names = [
@@ -354,7 +345,7 @@ def unread_spans(
     ]
     if faults and not nothing:
         yield describe_misdated(faults)
-    yield from describe_odd(snapshot.timeline.faulty(window) if odd is None else odd)
+    yield from describe_odd(odd)
 
 
 def lost_in(
@@ -497,27 +488,24 @@ def note_unrecorded(view: View, asked: TimeWindow) -> None:
     start = max(start, min(0, earliest))
     until = latest if asked.stop >= MAX_NS else memory.now(memory.clock.now(), latest)
     end = min(end, max(start, until))
+    until_end = TimeWindow(start, end)
     outside = (min(end, earliest) - start, end - max(start, latest))
-    gaps = [last - first for first, last in recording_gaps(view, TimeWindow(start, end))]
-    missing = sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
-    length = end - start
+    gaps = [last - first for first, last in recording_gaps(view, until_end)]
+    length, missing = end - start, sum(max(span_ns, 0) for span_ns in (*outside, *gaps))
     when = f"between {unix_text(start)} and {unix_text(end)}"
-    deleted = deleted_between(view, TimeWindow(start, end))
+    deleted = bool(deleted_between(view, until_end))
     if gap_around(view, asked) is not None:
-        view.notes.add(why_nothing(when, deleted=bool(deleted)))
+        view.notes.add(why_nothing(when, deleted=deleted))
     elif gaps or max(outside) > _EDGE_NS:
-        recorded_s = unix_from_ns(max(length - missing, 0))
+        recorded_s, of_s = unix_from_ns(max(length - missing, 0)), unix_from_ns(length)
         digits = 0 if length >= 100 * NS_PER_S else 1
         what = "here are only" if deleted else "recorded only"
-        of_s = f"{unix_from_ns(length):.{digits}f} s"
-        view.notes.add(f"{what} {recorded_s:.{digits}f} of {of_s} {when}")
+        view.notes.add(f"{what} {recorded_s:.{digits}f} of {of_s:.{digits}f} s {when}")
 
 
 def why_nothing(when: str, *, deleted: bool) -> str:
     """Returns that a time has no messages: none were recorded, or retention deleted them."""
-    if deleted:
-        return f"what was recorded {when} was deleted"
-    return f"nothing was recorded {when}"
+    return f"what was recorded {when} was deleted" if deleted else f"nothing was recorded {when}"
 
 
 def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | None:
@@ -541,10 +529,7 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
 
 def reached(snapshot: Snapshot, window: TimeWindow) -> TimeWindow:
     """Returns the part of a window that the memory can show, by `recorded_reach`."""
-    reach = recorded_reach(snapshot, window)
-    if reach is None:
-        return window
-    first, last = reach
+    first, last = recorded_reach(snapshot, window) or (window.start, window.stop - 1)
     return window.intersect(TimeWindow(first, last + 1))
 
 

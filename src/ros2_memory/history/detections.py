@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
@@ -51,15 +51,6 @@ class Detected(NamedTuple):
     times: IntArray
     found: Detections
     frames: Texts
-
-
-class _DecodedMessage(NamedTuple):
-    """A decoded message: log time and header stamp (ns; the log time if none), what is in it."""
-
-    log_time: Ns
-    stamp: Ns
-    detections: list[Detection]
-    frame: str
 
 
 def joined_detected(parts: Sequence[Detected]) -> Detected:
@@ -112,28 +103,27 @@ class DetectionRows:
         return _with_times(rows.times, stamps, detections, frames)
 
     def _by_messages(self, rows: Rows) -> Detected:
-        decoded = (self._decode(stored) for stored in messages_of(self._view, rows))
+        extractor = self._view.extractor
+        messages: list[tuple[Ns, Ns, list[Detection], str]] = []
+        for stored in messages_of(self._view, rows):
+            message = self._view.bags.decode(stored)
+            if message is not None:
+                frame = extractor.frame(message)
+                stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
+                detections = [
+                    detection if detection.frame_id else detection._replace(frame_id=frame)
+                    for detection in detections_of(extractor.exact(message, stored.type))
+                ]
+                stamp = stored.time if stamp is None else stamp
+                messages.append((stored.time, stamp, detections, frame))
         # Those of a part come bag after bag, in the order in which bags were stored.
-        messages = sorted(filter(None, decoded), key=lambda message: message.log_time)
+        messages.sort(key=itemgetter(0))
         return _with_times(
-            np.array([message.log_time for message in messages], np.int64),
-            np.array([message.stamp for message in messages], np.int64),
-            detections_by([message.detections for message in messages]),
-            Texts.of([message.frame for message in messages]),
+            np.array([log_time for log_time, *_ in messages], np.int64),
+            np.array([stamp for _, stamp, *_ in messages], np.int64),
+            detections_by([detections for *_, detections, _ in messages]),
+            Texts.of([frame for *_, frame in messages]),
         )
-
-    def _decode(self, stored: StoredMessage) -> _DecodedMessage | None:
-        extractor, message = self._view.extractor, self._view.bags.decode(stored)
-        if message is None:
-            return None
-        frame = extractor.frame(message)
-        stamp = nanoseconds(getattr(getattr(message, "header", None), "stamp", None))
-        detections = [
-            detection if detection.frame_id else detection._replace(frame_id=frame)
-            for detection in detections_of(extractor.exact(message, stored.type))
-        ]
-        log_time = stored.time
-        return _DecodedMessage(log_time, log_time if stamp is None else stamp, detections, frame)
 
 
 def _with_times(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
 import numpy as np
@@ -36,20 +37,15 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
     resolve_pose_topic,
-    transform_topics,
     undecodable,
     with_notes,
 )
 from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
 from ros2_memory.history.robots import parallel_or_twice
 from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
+from ros2_memory.history.sessions import decoded_transforms
 from ros2_memory.history.transforms import (
-    decoded_transforms,
-    edges,
     frames_of,
-    moving_in,
-    sessions_of,
-    static_transforms,
     transform_at,
 )
 
@@ -75,34 +71,21 @@ _POSE_FRAMES: Final[Key[dict[str, str]]] = Key()
 """Of a call: the frames of topics of poses."""
 
 
-class PathBackTo(NamedTuple):
-    """The path of a window, None where there is no message.
-
-    From `since` (log time, ns) on, where older bags were not read.
-    """
-
-    path: PathSlice | None
-    since: Ns | None = None
-
-
-def driven_path(view: View, topic: str, window: TimeWindow) -> PathBackTo:
-    """Returns the path in a window; a note says how far back it is known if not all was read.
-
-    Raises as `path_by_poses`.
-    """
-    path = path_by_poses(view, topic, window)
-    if path.since is not None:
+def driven_path(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
+    """Does as `path_by_poses`; a note says how far back the path is known if not all was read."""
+    path, since = path_by_poses(view, topic, window)
+    if since is not None:
         view.notes.add_lack(
-            f"the path is known back to {unix_text(path.since)}: out of time before older bags "
-            "were read"
+            f"the path is known back to {unix_text(since)}: out of time before older bags were read"
         )
-    return path
+    return path, since
 
 
-def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
-    """Returns the path in a window by the poses of one topic.
+def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice | None, Ns | None]:
+    """Returns the path in a window by the poses of one topic; None where there is no message.
 
-    Messages that cannot be decoded are left out, with a note.
+    And from which log time (ns) on it is known, where older bags were not read. Messages that
+    cannot be decoded are left out, with a note.
 
     Raises:
         InvalidArgumentsError: a message of the topic carries no position.
@@ -134,7 +117,7 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> PathBackTo:
         why = f"{len(failures)} ({failures[0].reason})"
         view.notes.add_lack(f"poses left out, since they cannot be decoded: {why}")
     fastest = view.limits.max_plausible_speed_mps
-    return PathBackTo(joined_slices(slices[::-1], fastest) if slices else None, since)
+    return joined_slices(slices[::-1], fastest) if slices else None, since
 
 
 def slices_of_path(
@@ -146,12 +129,15 @@ def slices_of_path(
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
     fastest = view.limits.max_plausible_speed_mps
-
-    def make(piece: PoseSlice) -> PathSlice:
-        return path_slice(piece.poses, fastest)
-
-    yield from slices_by_poses(
-        view, topic, window, PATHS, make, failures=failures, settings=str(fastest), reached=reached
+    return slices_by_poses(
+        view,
+        topic,
+        window,
+        PATHS,
+        lambda piece: path_slice(piece.poses, fastest),
+        failures=failures,
+        settings=str(fastest),
+        reached=reached,
     )
 
 
@@ -190,10 +176,10 @@ def slices_by_poses(
     """
     if topic in view.limits.tf_topics:
         poses = poses_of([(at, pose, None) for at, pose in poses_of_body(view, window)])
-        span = (int(poses.times[0]), int(poses.times[-1])) if len(poses) else (0, 0)
-        of_body = [PoseRows(span, lambda: poses)] if len(poses) else []
-        for pose_slice in pose_slices(of_body, beside):
-            yield pose_slice.start, make(pose_slice)
+        if len(poses):
+            first, last = int(poses.times[0]), int(poses.times[-1])
+            for pose_slice in pose_slices([PoseRows(first, last, lambda: poses)], beside):
+                yield pose_slice.start, make(pose_slice)
         return
     twice = () if view.call.stored else parallel_or_twice(view, topic, window)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
@@ -229,36 +215,37 @@ def slices_by_poses(
     )
 
 
+@dataclass(frozen=True, slots=True)
 class PoseSlice:
     """The poses in a slice of the clock, and those beside it.
 
     Attributes:
         start: log time (ns) where it begins.
         stop: where it ends.
+        beside: how far before and after it (ns) poses are with it.
+        blocks: of the poses.
     """
 
-    def __init__(self, start: Ns, stop: Ns, beside: Ns, blocks: Sequence[PoseRows]) -> None:
-        self.start, self.stop = start, stop
-        self._beside = beside
-        self._blocks = blocks
+    start: Ns
+    stop: Ns
+    beside: Ns
+    blocks: Sequence[PoseRows]
 
     @property
     def poses(self) -> Poses:
         """Those in the slice and beside it, in order; raises as `PoseRows.poses`."""
-        start, stop = self.start - self._beside, self.stop + self._beside
-        return joined_poses([block.poses.between(start, stop) for block in self._blocks])
+        start, stop = self.start - self.beside, self.stop + self.beside
+        return joined_poses([block.poses.between(start, stop) for block in self.blocks])
 
     def key(self, settings: str) -> FragmentKey | None:
         """Returns the key of the poses in memory; None where not all are of whole parts."""
-        parts: list[int] = []
-        for block in self._blocks:
-            if block.parts is None:
-                return None
-            parts += block.parts
-        return FragmentKey(self.start, settings, tuple(parts))
+        parts = [block.parts for block in self.blocks if block.parts is not None]
+        if len(parts) < len(self.blocks):
+            return None
+        return FragmentKey(self.start, settings, tuple(chain.from_iterable(parts)))
 
 
-def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[PoseSlice]:
+def pose_slices(newest_first: Iterable[PoseRows], beside: Ns) -> Iterator[PoseSlice]:
     """Yields the slices of the clock in which there may be poses, the newest first.
 
     Args:
@@ -267,27 +254,21 @@ def pose_slices(newest_first: Iterable[PoseRows], beside: Ns = 0) -> Iterator[Po
     """
     held: list[PoseRows] = []
     waiting: set[int] = set()
-    for block in newest_first:
-        newest = max(waiting, default=block.last // SLICE_NS)
-        held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
-        held.append(block)
-        waiting.update(block.slices(SLICE_NS))
-        yield from _complete_slices(waiting, held, beside, block.first)
-    yield from _complete_slices(waiting, held, beside, MIN_NS)
-
-
-def _complete_slices(
-    waiting: set[int], held: Sequence[PoseRows], beside: Ns, oldest: Ns
-) -> Iterator[PoseSlice]:
-    """Yields the slices that reach no poses older than `oldest`; they wait no longer."""
-    for number in sorted(waiting, reverse=True):
-        start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
-        first, last = start - beside, stop + beside
-        if first < oldest:
-            return
-        waiting.discard(number)
-        near = [block for block in reversed(held) if block.last >= first and block.first < last]
-        yield PoseSlice(start, stop, beside, near)
+    for block in chain(newest_first, [None]):
+        if block is not None:
+            newest = max(waiting, default=block.last // SLICE_NS)
+            held = [older for older in held if older.first < (newest + 1) * SLICE_NS + beside]
+            held.append(block)
+            waiting.update(block.slices(SLICE_NS))
+        oldest = MIN_NS if block is None else block.first
+        for number in sorted(waiting, reverse=True):
+            start, stop = number * SLICE_NS, (number + 1) * SLICE_NS
+            first, last = start - beside, stop + beside
+            if first < oldest:
+                break
+            waiting.discard(number)
+            near = [rows for rows in reversed(held) if rows.last >= first and rows.first < last]
+            yield PoseSlice(start, stop, beside, near)
 
 
 def length_notes(path: Trajectory) -> Iterator[str]:
@@ -342,16 +323,12 @@ def pose_frame(view: View, topic: str) -> str:
         UndecodableError: none of the newest ones can be decoded.
     """
     frames = view.memo.of(_POSE_FRAMES, dict)
-    if topic not in frames:
-        body = robot_body(view) if topic in view.limits.tf_topics else None
-        frames[topic] = _newest_frame(view, topic) if body is None else body.odometry
-    return frames[topic]
-
-
-def _newest_frame(view: View, topic: str) -> str:
-    failures: list[UndecodableError] = []
+    if topic in frames:
+        return frames[topic]
+    body, failures = body_of(view, topic), list[UndecodableError]()
+    frame = "" if body is None else body.odometry
     newest = view.stream.messages([topic], TimeWindow.everything(), newest_first=True)
-    for stored in islice(newest, _MOST_TRIED):
+    for stored in islice(newest, _MOST_TRIED if body is None else 0):
         message = view.bags.decode(stored, failures)
         if message is None:
             continue
@@ -360,10 +337,13 @@ def _newest_frame(view: View, topic: str) -> str:
             raise InvalidArgumentsError(describe_lack(view, "position", stored))
         if failures:
             note_left_out(view, failures[0])
-        return pose.frame_id.lstrip("/")
-    if failures:
-        raise failures[0]
-    return ""
+        frame = pose.frame_id.lstrip("/")
+        break
+    else:
+        if failures:
+            raise failures[0]
+    frames[topic] = frame
+    return frame
 
 
 class Body(NamedTuple):
@@ -388,7 +368,7 @@ def robot_body(view: View) -> Body | None:
     By its name (`base_footprint`, `base_link`), else what moves in the root itself; in the map, or
     in the root of its frames.
     """
-    known_edges = edges(view)
+    known_edges = view.sessions.edges
     parents = {edge.child: edge.parent for edge in known_edges}
     moving = [edge.child for edge in known_edges if not edge.static]
     if not moving:
@@ -397,8 +377,8 @@ def robot_body(view: View) -> Body | None:
     map_frame = view.limits.map_frame
     body = min(moving, key=lambda child: (_body_rank(child, map_frame), len(above[child]), child))
     root = map_frame if map_frame in above[body] else above[body][-1]
-    others = sorted({child for child in moving if child != body})
     odometry = next(filter(_is_odometry, above[body]), root)
+    others = sorted({child for child in moving if child != body})
     named = (child for child in others if _body_rank(child, map_frame) < len(_BODIES))
     beside = (child for child in named if child not in above[body] and body not in above[child])
     return Body(root, body, tuple(others), tuple(above[body]), odometry, tuple(beside))
@@ -424,6 +404,11 @@ def _body_rank(frame: str, map_frame: str | None) -> int:
     return _BODIES.index(name) if name in _BODIES else len(_BODIES)
 
 
+def body_of(view: View, topic: str) -> Body | None:
+    """Returns the robot's body where a topic is of transforms."""
+    return robot_body(view) if topic in view.limits.tf_topics else None
+
+
 def body_by_transforms(view: View) -> Body | None:
     """Returns the robot's body where transforms alone show it; None where a topic has its poses."""
     return None if view.has_poses else robot_body(view)
@@ -437,7 +422,7 @@ def resolve_path_topic(view: View, name: str | None = None, *, degrees: bool = F
     Raises:
         NoDataError: as for `resolve_pose_topic`.
     """
-    topics = transform_topics(view)
+    topics = view.moving_topics
     body, why = None, ""
     if name is None:
         body, why = body_by_transforms(view), ": no topic has the robot's poses"
@@ -463,9 +448,9 @@ def newest_of_body(
     In the map or the root of its frames, or in `frame_id`. Where the session of a `recording` has
     transforms, it is one of these.
     """
-    parent, topics, sessions = frame_id or body.parent, transform_topics(view), sessions_of(view)
+    parent, topics, sessions = frame_id or body.parent, view.moving_topics, view.sessions
     own_session = None if recording is None else sessions.of(recording)
-    if own_session and not sessions.recordings_of(own_session, tuple(topics)):
+    if own_session and not sessions.recordings_of(own_session, topics):
         own_session = None
     for stored in view.stream.messages(topics, window, newest_first=True):
         for transform in decoded_transforms(view, [stored]):
@@ -493,15 +478,14 @@ def poses_of_body(view: View, window: TimeWindow) -> list[tuple[Ns, Pose]]:
     body = robot_body(view)
     if body is None:
         return []
-    bags = view.stream.overlapping_bags(transform_topics(view), window)
+    bags = view.stream.overlapping_bags(view.moving_topics, window)
     if len(bags) > _MOST_BAGS_OF_BODY:
         raise InvalidArgumentsError(
             f"by transforms, a path is read from {_MOST_BAGS_OF_BODY} bags at most: these are "
             f"{len(bags)}; ask about a shorter window"
         )
     poses: dict[Ns, Pose] = {}
-    sessions = sessions_of(view)
-    for session in dict.fromkeys(sessions.of(span.bag.recording) for span in bags):
+    for session in dict.fromkeys(view.sessions.of(span.bag.recording) for span in bags):
         poses.update(_poses_of_body_in(view, window, session, body))
         view.bags.check_deadline()
     return sorted(poses.items())
@@ -511,23 +495,22 @@ def _poses_of_body_in(
     view: View, window: TimeWindow, session: Session, body: Body
 ) -> Iterator[tuple[Ns, Pose]]:
     """Yields the poses of the body by one session's transforms, each with its log time (ns)."""
-    moving = moving_in(view, window.widened(TF_CACHE_NS), session)
-    frames = frames_of(view, static_transforms(view, session), moving, body.odometry)
+    moving = view.sessions.moving(session, window.widened(TF_CACHE_NS))
+    frames = frames_of(view, view.sessions.static(session), moving, body.odometry)
     of_body = [
         transform
         for transform in moving
         if transform.child.lstrip("/") == body.child and window.contains(transform.log_time)
     ]
-    log_times = [transform.log_time for transform in of_body]
-    stamps = [transform.stamp for transform in of_body]
-    moments = stamps if frames.clock == "stamp" else log_times
+    by_stamp = frames.clock == "stamp"
+    moments = [transform.stamp if by_stamp else transform.log_time for transform in of_body]
     placed = frames.poses(body.child, np.array(moments, np.int64))
     if placed is None:
         return
     last = MIN_NS
     # None is before the first transform of the map, or in its gap.
     for nth in np.flatnonzero(placed.valid).tolist():
-        if log_times[nth] - last >= _STEP_NS:
-            last = log_times[nth]
-            there = placed.at(nth)
-            yield last, Pose(there.translation, there.rotation, body.odometry)
+        time = of_body[nth].log_time
+        if time - last >= _STEP_NS:
+            last, there = time, placed.at(nth)
+            yield time, Pose(there.translation, there.rotation, body.odometry)

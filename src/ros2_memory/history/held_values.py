@@ -275,24 +275,18 @@ class HeldValues:
 
 
 def _breaks(view: View, topic: str) -> list[Ns]:
-    """Returns the moments from which on what a topic said before is not known to hold, in order."""
-    breaks = set(_ends_of_clocks(view))
+    """Returns the moments from which on what a topic said before is not known to hold, in order.
+
+    Also where bags of a wrong clock end before the others, and where these end before more.
+    """
+    snapshot, breaks = view.snapshot, list[Ns]()
     if not is_latched(view, topic):
-        breaks.update(start for start, _ in view.snapshot.breaks)
-    return sorted(breaks)
-
-
-def _ends_of_clocks(view: View) -> Iterator[Ns]:
-    """Yields where bags of a wrong clock end before the others, and where these end before more."""
-    earliest, latest = view.snapshot.earliest, view.snapshot.latest
-    bags = [fault.bag for fault in view.snapshot.misdated]
-    if earliest is None or latest is None:
-        return
-    before = [bag.end for bag in bags if bag.end < earliest]
-    if before:
-        yield max(before)
-    if any(bag.start > latest for bag in bags):
-        yield latest
+        breaks += [start for start, _ in snapshot.breaks]
+    if snapshot.earliest is not None and snapshot.latest is not None:
+        bags = [fault.bag for fault in snapshot.misdated]
+        breaks += sorted(bag.end for bag in bags if bag.end < snapshot.earliest)[-1:]
+        breaks += [snapshot.latest] if any(bag.start > snapshot.latest for bag in bags) else []
+    return sorted(set(breaks))
 
 
 def _as_said(value: JsonValue) -> JsonValue:

@@ -16,7 +16,7 @@ from functools import partial
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.duplicates import (
@@ -99,12 +99,12 @@ class MergedStream:
         segments = self._timeline.segments
         begin = bisect_right(segments, window.start, key=_start_of)
         end = bisect_left(segments, window.stop, begin, key=_start_of)
-        cuts = [
-            _start_of(segment)
+        held = (
+            segment
             for segment in segments[begin:end]
-            if any(topic in segment.spans for topic in topics)
-        ]
-        edges = [window.start, *dict.fromkeys(cuts), window.stop]
+            if not segment.spans.keys().isdisjoint(topics)
+        )
+        edges = [window.start, *dict.fromkeys(map(_start_of, held)), window.stop]
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
 
     def _messages_in(
@@ -237,8 +237,3 @@ def _span_order(span: BagSpan) -> tuple[Ns, Ns, str]:
 
 def _recording_order(span: BagSpan) -> tuple[str, Ns, Ns, str]:
     return str(span.bag.recording), *_span_order(span)
-
-
-def bag_span_of(bag: BagFile, topics: Collection[str]) -> BagSpan:
-    """Returns a bag with the times of its first and last message of these topics, if any."""
-    return BagSpan(*bag.summary.span_of(topics), bag)

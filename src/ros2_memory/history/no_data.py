@@ -78,8 +78,7 @@ def only_pose_topic(view: View, what: str = "position", *, degrees: bool = False
     count.
     """
     configured = view.limits.pose_topic
-    is_recorded = configured in view.timeline.topics()
-    if configured != _DEFAULT_POSES or is_recorded:
+    if configured != _DEFAULT_POSES or configured in view.timeline.topics():
         return None
     topics = topics_of_robot(view, what)
     if not topics and degrees:
@@ -171,7 +170,7 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
             f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
             "returns speeds from them, by topic"
         )
-    if moving := transform_topics(view):
+    if moving := view.moving_topics:
         return (
             f", nor another with {those}; transforms are on {listed(moving)}: get_position_at "
             "and trajectory_summary answer by them, get_transform_at returns the pose of one frame "
@@ -200,17 +199,10 @@ def topics_that_show_poses(view: View) -> list[str]:
             newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
             if newest is None:
                 continue
-            type_name = newest.type
-            pose = extractor.pose(decode(view, newest), type_name)
+            pose = extractor.pose(decode(view, newest), newest.type)
             if pose is not None and pose.orientation is not None:
-                shown.append(f"{topic} ({type_name})")
+                shown.append(f"{topic} ({newest.type})")
     return shown
-
-
-def transform_topics(view: View) -> list[str]:
-    """Returns the recorded topics of transforms that move (`data.tf_topics`)."""
-    recorded = view.timeline.topics()
-    return [topic for topic in view.limits.tf_topics if topic in recorded]
 
 
 def topics_with(view: View, what: str) -> list[str]:
@@ -219,9 +211,8 @@ def topics_with(view: View, what: str) -> list[str]:
     Each with its type behind it. What types that are not in the schema map carry is not known.
     """
     kinds_of, types = view.extractor.kinds_of, view.timeline.types
-    carriers = {
-        type_name for type_name in set(chain(*types.values())) if what in kinds_of(type_name)
-    }
+    all_types = set(chain(*types.values()))
+    carriers = {type_name for type_name in all_types if what in kinds_of(type_name)}
     return [
         f"{topic} ({type_name})"
         for topic, names in types.items()
@@ -304,11 +295,9 @@ def no_data_at(
     With `around`, neither so long after it. The sentence names the nearest older and newer message
     with their distances, and what to do.
     """
-    older, newer = _neighbours(view, topics, at, at + 1)
-    is_between = bool(older and newer)
-    elsewhere = _only_elsewhere(view, topics, TimeWindow(at, at + 1))
-    if elsewhere:
-        older, newer = _of_this_time(older, at), _of_this_time(newer, at)
+    older, newer, elsewhere, is_between = _nearest(
+        view, topics, TimeWindow(at, at + 1), (at, at + 1)
+    )
     when = "at or before" if tolerance is None else f"within {seconds(tolerance)} before"
     if around is not None:
         when = f"within {seconds(around)} of"
@@ -320,15 +309,18 @@ def no_data_at(
         reason, why = _within_recording(view, older, newer)
     if _have_expired(view, topics, window) or _is_thinned(view, TimeWindow(at, at + 1)):
         reason = NoDataReason.DELETED
-    to_come = _to_come(view, at)
     detail = [
         f"no message of {' or '.join(topics)} {when} {unix_text(at)}",
         *elsewhere,
         *_distances(at, older, newer, tolerance),
         *why,
         *_advice(view, reason),
-        *(to_come or _enough_tolerance(at, older, tolerance)),
+        *_to_come(view, at),
     ]
+    is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
+    if older and is_near and not _to_come(view, at):
+        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
+        detail.append(f"to accept the older one, ask with tolerance_s of at least {enough:.3f}")
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -345,13 +337,6 @@ def _distances(
     if newer:
         later = seconds(newer.time - at)
         yield f"the nearest newer one is {later} after it, at {unix_text(newer.time)}"
-
-
-def _enough_tolerance(at: Ns, older: StoredMessage | None, tolerance: Ns | None) -> Iterator[str]:
-    """Yields which `tolerance_s` would take the older message, if that is not far away."""
-    if older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance):
-        enough = math.ceil(unix_from_ns(at - older.time) * 1000) / 1000
-        yield f"to accept the older one, ask with tolerance_s of at least {enough:.3f}"
 
 
 def _have_expired(view: View, topics: Collection[str], window: TimeWindow) -> bool:
@@ -383,11 +368,9 @@ def _within_recording(
 
 def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> NoDataError:
     """Returns the error for no message of these topics in a window."""
-    older, newer = _neighbours(view, topics, window.start - 1, window.stop)
-    is_between = bool(older and newer)
-    elsewhere = _only_elsewhere(view, topics, window)
-    if elsewhere:
-        older, newer = _of_this_time(older, window.start), _of_this_time(newer, window.stop)
+    older, newer, elsewhere, is_between = _nearest(
+        view, topics, window, (window.start - 1, window.stop)
+    )
     start, end = window.asked()
     names = " or ".join(topics)
     detail = [f"no message of {names} between {unix_text(start)} and {unix_text(end)}", *elsewhere]
@@ -442,19 +425,28 @@ def with_notes(view: View, window: TimeWindow, error: NoDataError) -> NoDataErro
     return NoDataError(error.reason, error.detail, view.notes.sentences())
 
 
-def _neighbours(
-    view: View, topics: tuple[str, ...], until: Ns, since: Ns
-) -> tuple[StoredMessage | None, StoredMessage | None]:
-    """Returns the last message up to one log time, and the first from another one on."""
-    return (
+def _nearest(
+    view: View, topics: tuple[str, ...], window: TimeWindow, ends: tuple[Ns, Ns]
+) -> tuple[StoredMessage | None, StoredMessage | None, list[str], bool]:
+    """Returns the last message up to one of the ends (log time), and the first from the other on.
+
+    Where the recordings of the window have none of the topics, without messages of another time
+    altogether, as of another robot's bag, and with a sentence on it. At last whether there are
+    messages on both sides, of whatever time.
+    """
+    until, since = ends
+    nearest = (
         view.stream.first(topics, TimeWindow.until(until), newest_first=True),
         view.stream.first(topics, TimeWindow(since, MAX_NS)),
     )
-
-
-def _of_this_time(stored: StoredMessage | None, at: Ns) -> StoredMessage | None:
-    """Returns a message that is not of another time altogether, as of another robot's bag."""
-    return stored if stored is not None and abs(stored.time - at) <= LONGEST_OFF_NS else None
+    elsewhere = _only_elsewhere(view, topics, window)
+    older, newer = (
+        stored
+        if not elsewhere or (stored is not None and abs(stored.time - at) <= LONGEST_OFF_NS)
+        else None
+        for stored, at in zip(nearest, (window.start, window.stop), strict=True)
+    )
+    return older, newer, elsewhere, all(nearest)
 
 
 def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> list[str]:
@@ -490,14 +482,11 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
 def _alike(view: View, topics: tuple[str, ...], held: set[str]) -> list[str]:
     """Returns which of the `held` topics carry all that some topics do, or else some of it."""
 
-    def carried(topic: str) -> set[str]:
-        return {
-            kind
-            for type_name in view.timeline.types_of(topic)
-            for kind in view.extractor.kinds_of(type_name)
-        }
+    def carried(*topics: str) -> set[str]:
+        types = chain.from_iterable(map(view.timeline.types_of, topics))
+        return set(chain.from_iterable(map(view.extractor.kinds_of, types)))
 
-    wanted = {kind for topic in topics for kind in carried(topic)}
+    wanted = carried(*topics)
     similar = [topic for topic in sorted(held) if carried(topic) & wanted]
     return [topic for topic in similar if carried(topic) >= wanted] or similar
 

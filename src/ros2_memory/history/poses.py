@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Final, TypeVar
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
@@ -27,42 +29,29 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
     from pathlib import Path
 
-    from ros2_memory.columns.fragments import Sized
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import ParallelRecordings
     from ros2_memory.history.view import View
-
 
 _MOST_SLICES: Final = 64
 """Of more between its ends, a block may have most slices without a pose."""
 
 
-T = TypeVar("T", bound="Sized")
-
-
+@dataclass
 class PoseRows:
     """Poses that no other ones overlap in time.
-
-    Args:
-        span: log times (ns) that none of them is earlier or later than.
-        load: returns the poses.
-        parts: the numbers of the parts of which all rows are here; None if there are others, too.
 
     Attributes:
         first: a log time (ns) that none of the poses is earlier than.
         last: one that none is later than.
-        parts: see above.
+        load: returns the poses.
+        parts: the numbers of the parts of which all rows are here; None if there are others, too.
     """
 
-    def __init__(
-        self,
-        span: tuple[Ns, Ns],
-        load: Callable[[], Poses],
-        parts: tuple[int, ...] | None = None,
-    ) -> None:
-        self.first, self.last = span
-        self.parts = parts
-        self._load = load
+    first: Ns
+    last: Ns
+    load: Callable[[], Poses]
+    parts: tuple[int, ...] | None = None
 
     def slices(self, length: Ns) -> Iterable[int]:
         """Returns which slices of the clock may have poses, counted from the epoch."""
@@ -79,7 +68,7 @@ class PoseRows:
         Raises:
             InvalidArgumentsError: messages carry no position.
         """
-        return self._load()
+        return self.load()
 
 
 def pose_rows(
@@ -88,7 +77,7 @@ def pose_rows(
     window: TimeWindow,
     failures: list[UndecodableError],
     *,
-    among: Callable[[Path], bool] = lambda _: True,
+    among: Callable[[Path], bool],
 ) -> Iterator[PoseRows]:
     """Yields the poses of a topic in a window, in order of time; the columns are not read yet.
 
@@ -104,19 +93,18 @@ def pose_rows(
         yield reader.block(together)
 
 
-def poses_of(samples: Iterable[tuple[Ns, Pose, float | None]]) -> Poses:
+def poses_of(samples: Sequence[tuple[Ns, Pose, float | None]]) -> Poses:
     """Returns poses with their log times, and the speed (m/s) that each message states, if any."""
-    rows = [*samples]
-    unknown = (math.nan,) * 4
-    turns = [unknown if pose.orientation is None else pose.orientation for _, pose, _ in rows]
-    places = np.array([pose.position for _, pose, _ in rows], np.float64).reshape(-1, 3)
-    frames = Texts.of([pose.frame_id for _, pose, _ in rows])
+    times, poses, speeds = zip(*samples, strict=True) if samples else ((), (), ())
+    turns = [pose.orientation or (math.nan,) * 4 for pose in poses]
+    places = np.array([pose.position for pose in poses], np.float64).reshape(-1, 3)
+    frames = Texts.of([pose.frame_id for pose in poses])
     return Poses(
-        np.array([time for time, *_ in rows], np.int64),
+        np.array(times, np.int64),
         rounded(places, METRES),
         np.array(turns, np.float64).reshape(-1, 4),
         FrameCodes(frames.codes, frames.words),
-        np.array([math.nan if speed is None else speed for *_, speed in rows], np.float64),
+        np.array([math.nan if speed is None else speed for speed in speeds], np.float64),
     )
 
 
@@ -155,23 +143,18 @@ class PoseReader:
 
     def block(self, rows: Sequence[Rows]) -> PoseRows:
         """Returns the poses of rows that overlap in time, in the order of `blocks`."""
-        span = (
-            min(table_rows.first for table_rows in rows),
-            max(table_rows.last for table_rows in rows),
-        )
-        part_numbers = [table_rows.part for table_rows in rows]
-        numbers = tuple(part for part in part_numbers if part is not None)
-        is_whole = len(numbers) == len(part_numbers) and not any(map(self._held_by_others, rows))
-        parts = numbers if is_whole else None
-        return PoseRows(span, partial(self._joined, rows), parts)
+        parts = tuple(some.part for some in rows if some.part is not None)
+        is_whole = len(parts) == len(rows) and not any(map(self._held_by_others, rows))
+        first, last = min(some.first for some in rows), max(some.last for some in rows)
+        return PoseRows(first, last, partial(self._joined, rows), parts if is_whole else None)
 
     def trouble(self) -> Hashable:
         """Returns how many failures and notes there are: more once something could not be read."""
         return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
-        counting = [self._without_others(table_rows) for table_rows in rows]
-        return joined_poses([self.poses(table_rows) for table_rows in counting if len(table_rows)])
+        counting = map(self._without_others, rows)
+        return joined_poses([self.poses(some) for some in counting if len(some)])
 
     def _without_others(self, rows: Rows) -> Rows:
         """Returns the rows that others do not have the time of."""
@@ -201,11 +184,7 @@ class PoseReader:
         """
         try:
             poses = of_columns(
-                self._view,
-                rows,
-                lambda table_rows: self._columns.of(
-                    table_rows.table, table_rows.times, table_rows.index
-                ),
+                self._view, rows, lambda some: self._columns.of(some.table, some.times, some.index)
             )
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
@@ -214,19 +193,17 @@ class PoseReader:
             return joined_poses([])  # deleted meanwhile
         return poses_of(self._decoded(rows)) if poses is None else joined_poses(poses)
 
-    def _decoded(self, rows: Rows) -> Iterator[tuple[Ns, Pose, float | None]]:
+    def _decoded(self, rows: Rows) -> list[tuple[Ns, Pose, float | None]]:
         extractor = self._view.extractor
         samples: list[tuple[Ns, Pose, float | None]] = []
         for stored in messages_of(self._view, rows):
-            type_name = stored.type
             message = self._view.bags.decode(stored, self._failures)
-            if message is None:
-                continue
-            pose, twist = extractor.pose(message, type_name), extractor.twist(message, type_name)
-            if pose is None:
-                raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
-            samples.append(
-                (stored.time, pose, None if twist is None else math.hypot(*twist.linear))
-            )
+            if message is not None:
+                pose = extractor.pose(message, stored.type)
+                twist = extractor.twist(message, stored.type)
+                if pose is None:
+                    raise InvalidArgumentsError(describe_lack(self._view, "position", stored))
+                speed = None if twist is None else math.hypot(*twist.linear)
+                samples.append((stored.time, pose, speed))
         # Those of a part come bag after bag, in the order in which bags were stored.
-        yield from sorted(samples, key=lambda sample: sample[0])
+        return sorted(samples, key=itemgetter(0))

@@ -127,11 +127,15 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
         return value
     is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
     for channel in channels:
-        text = channel.schema.text.decode("utf-8", "replace")
-        if channel.type == type_name and is_number.search(text):
-            numbers = {number for name, number in _CONSTANT.findall(text) if name == word}
+        if channel.type == type_name and is_number.search(_text_of(channel.schema)):
+            constants = _CONSTANT.findall(_text_of(channel.schema))
+            numbers = {number for name, number in constants if name == word}
             return int(numbers.pop()) if len(numbers) == 1 else value
     return value
+
+
+def _text_of(schema: Schema) -> str:
+    return schema.text.decode("utf-8", "replace")
 
 
 def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
@@ -215,7 +219,7 @@ def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
     Only the one whose name is the field's and the word, where there is one.
     """
     wanted = "_".join(word.upper().split())
-    constants = _CONSTANT.findall(schema.text.decode("utf-8", "replace")) if wanted else []
+    constants = _CONSTANT.findall(_text_of(schema)) if wanted else []
     whole = {wanted, f"{field.upper()}_{wanted}"}
     same = [(name, value) for name, value in constants if name in whole]
     shown = same or [(name, value) for name, value in constants if wanted in name]
@@ -277,13 +281,6 @@ class RowCondition:
         return TruthValues(surely, perhaps)
 
 
-class _Candidate(NamedTuple):
-    """A message that may match: its log time (ns) and its topic."""
-
-    time: Ns
-    topic: str
-
-
 class _TableCandidates(NamedTuple):
     """A table's last log time (ns), its topic, and when messages of it may match."""
 
@@ -308,7 +305,7 @@ class CandidateRows:
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
         self._ready: list[tuple[Ns, str]] = []
-        self._group: list[_Candidate] = []
+        self._group: list[tuple[Ns, str]] = []
         self._view = view
         self._window = window
         self._test = RowCondition(view, condition)
@@ -321,12 +318,12 @@ class CandidateRows:
         most = 1
         for time, topic in chain(self._times(), [(MIN_NS - 1, "")]):
             group = self._group
-            if group and (group[-1].time - time > _TOGETHER_NS or len(group) >= most):
-                window = TimeWindow(group[-1].time, group[0].time + 1)
-                yield window, sorted({candidate.topic for candidate in group})
+            if group and (group[-1][0] - time > _TOGETHER_NS or len(group) >= most):
+                (latest, _), (earliest, _) = group[0], group[-1]
+                yield TimeWindow(earliest, latest + 1), sorted({topic for _, topic in group})
                 # The first that may match mostly does; where many do not, more are read at once.
                 most, self._group = min(2 * most, _MOST_TOGETHER), []
-            self._group.append(_Candidate(time, topic))
+            self._group.append((time, topic))
 
     def messages(self) -> Iterator[StoredMessage]:
         """Yields the messages at the times at which a match can lie, newest first."""
@@ -527,21 +524,18 @@ class ReverseSearch:
 
     def matches(self, stored: StoredMessage) -> bool | None:
         """Whether a message meets the condition; None where it cannot be decoded."""
-        channel, memory = stored.record.channel, self._view.memory
+        failures: list[UndecodableError] = []
         with self._view.call.stages.timed("extract"):
-            try:
-                message = memory.reader.decode(stored.record)
-                value = memory.extractor.exact(message, channel.type)
+            message = self._view.bags.decode(stored, failures)
+            if message is not None:
                 self._has_decoded = True
+                value = self._view.extractor.exact(message, stored.type)
                 return self.condition.matches(value)
-            except UndecodableError as error:
-                # A copy: the raised error keeps its traceback alive, and the message with it.
-                alone = UndecodableError(error.topic, error.type_name, error.reason)
-                key = channel.topic, channel.type
-                # The newest is reported, in whatever order messages are tested.
-                if key not in self._failures or self._failures[key][1] < stored.time:
-                    self._failures[key] = alone, stored.time
-                return None
+        key = stored.topic, stored.type
+        # The newest is reported, in whatever order messages are tested.
+        if key not in self._failures or self._failures[key][1] < stored.time:
+            self._failures[key] = failures[0], stored.time
+        return None
 
     def note_untested(self, window: TimeWindow) -> None:
         """Notes which topics have messages in a window that could not be tested, or not wholly."""

@@ -23,8 +23,6 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
-from ros2_memory.history.merged_stream import bag_span_of
-from ros2_memory.history.transforms import sessions_of
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
@@ -221,7 +219,8 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
 
 
 def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
-    return [bag_span_of(bag, (topic,)) for bag in bags if topic in bag.summary.schema.positions]
+    holding = (bag for bag in bags if topic in bag.summary.schema.positions)
+    return [BagSpan(*bag.summary.span_of((topic,)), bag) for bag in holding]
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
@@ -286,7 +285,7 @@ class ParallelRecordings(NamedTuple):
     def described(self, topic: str) -> str:
         """Returns what a clock made, as a sentence without a full stop."""
         span = f"from {unix_text(self.span.start)} to {unix_text(self.span.stop - 1)}"
-        if self.first == self.other:
+        if self.is_twice:
             return (
                 f"{self.first.name} has the time {span} twice, as the clock was set back meanwhile"
             )
@@ -346,24 +345,16 @@ def _recording_names(beside: Sequence[ParallelRecordings]) -> list[str]:
 
 
 def parallel_or_twice(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
-    """Returns all that would make a path by a topic go to and fro between two times of a robot."""
-    holding = view.timeline.recordings(topic)
-    twice = (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
-    return [*parallel_recordings(view, topic, window), *twice]
+    """Returns all that would make a path by a topic go to and fro between two times of a robot.
 
-
-def parallel_recordings(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
-    """Returns the recordings that hold messages of their own on a topic at the same time.
-
-    None for latched topics, which each recording receives again, or where the time for the answer
-    is over before it is known, or a lake does not hold the messages.
+    Recordings beside each other not of latched topics, which each recording receives again, nor
+    where that is not known.
     """
-    if topic in view.timeline.transient_local:
-        return []
-    try:
-        return _recordings_beside(view, topic, window)
-    except (QueryTimeoutError, NotInLakeError):
-        return []
+    holding = view.timeline.recordings(topic)
+    is_latched = topic in view.timeline.transient_local
+    beside = [] if is_latched else _recordings_beside(view, topic, window) or []
+    twice = (pair for pair in _times_recorded_twice(view, window) if pair.first in holding)
+    return [*beside, *twice]
 
 
 def recordings_apart(
@@ -373,14 +364,23 @@ def recordings_apart(
 
     None where that is not known.
     """
-    try:
-        pairs = [*chain(*(_recordings_beside(view, topic, window) for topic in topics))]
-    except (QueryTimeoutError, NotInLakeError):
-        return None
-    return frozenset(path for pair in pairs for path in (pair.first, pair.other))
+    apart: set[Path] = set()
+    for topic in topics:
+        pairs = _recordings_beside(view, topic, window)
+        if pairs is None:
+            return None
+        apart.update(path for pair in pairs for path in (pair.first, pair.other))
+    return frozenset(apart)
 
 
-def _recordings_beside(view: View, topic: str, window: TimeWindow) -> list[ParallelRecordings]:
+def _recordings_beside(
+    view: View, topic: str, window: TimeWindow
+) -> list[ParallelRecordings] | None:
+    """Returns the recordings that hold messages of their own on a topic at the same time.
+
+    None where the time for the answer is over before it is known, or a lake does not hold the
+    messages.
+    """
     differing: list[ParallelRecordings] = []
     apart: set[Path] = set()
     noted_before = view.notes.keys()
@@ -392,6 +392,8 @@ def _recordings_beside(view: View, topic: str, window: TimeWindow) -> list[Paral
             if not is_known and _differ(view, topic, pair, beside.span.intersect(window)):
                 differing.append(beside)
                 apart.update(() if beside.by_clock else pair)
+    except (QueryTimeoutError, NotInLakeError):
+        return None
     finally:
         # The answer itself needed nothing of what was read here.
         view.notes.retract_outside(keep=noted_before)
@@ -483,7 +485,7 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
-    if sessions_of(view).are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
+    if view.sessions.are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
         return False
     wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
     bags = view.stream.overlapping_bags([topic], wide)
@@ -509,10 +511,7 @@ def _bags_differ(
 
     Two runs of a simulation share some, as those of a robot that has not moved yet.
     """
-    first, other = bags
-    return _lacks_most(view, topic, (first, other), both) and _lacks_most(
-        view, topic, (other, first), both
-    )
+    return all(_lacks_most(view, topic, pair, both) for pair in (bags, bags[::-1]))
 
 
 def _lacks_most(

@@ -1,9 +1,16 @@
-"""Scans of topics within one call: what `columns.scan` yields, under the call's deadline."""
+"""Scans of topics within one call: what `columns.scan` yields, under the call's deadline.
+
+And how many messages there are in pieces of a window, each counted once. The index knows that of
+every bag in which no piece ends, where no other recording may hold copies. Of the rest the times of
+messages are looked at, and where recordings overlap those that count.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING, TypedDict, TypeVar, Unpack
+from functools import partial
+from itertools import groupby
+from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar, Unpack
 
 import numpy as np
 
@@ -13,7 +20,9 @@ from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.spans import united
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -123,7 +132,6 @@ def joined_back(
         beside: how far before and after a stretch (ns) rows are part of it, too.
         trouble: differs from before where something could not be read since.
     """
-    fragments = view.memory.columns.fragments(joining(kind))
     for stretch in opened.stretches(beside):
         view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
         key = key_of(stretch)
@@ -131,21 +139,24 @@ def joined_back(
             yield from make(stretch._replace(parts=None))
             continue
         view.bags.check_deadline()
-        joined = fragments.get(key)
-        if joined is None:
-            before = trouble(), view.notes.added
-            results: list[tuple[Ns, T]] = []
-            try:
-                results.extend(make(stretch))
-            except QueryTimeoutError:
-                # What there was time for is an answer, too, with a note.
-                yield from results
-                raise
-            joined = Joined(kind.join([result for _, result in results[::-1]]) if results else [])
-            if before == (trouble(), view.notes.added):
-                fragments.put(key, joined)
+        results: list[tuple[Ns, T]] = []
+        join = partial(_joined, kind, make(stretch), results)
+        try:
+            joined = remembered(view, joining(kind), key, join, trouble)
+        except QueryTimeoutError:
+            # What there was time for is an answer, too, with a note.
+            yield from results
+            raise
         for result in reversed(joined.fragments):
             yield stretch.window.start, result
+
+
+def _joined(
+    kind: FragmentKind[T], made: Iterable[tuple[Ns, T]], results: list[tuple[Ns, T]]
+) -> Joined[T]:
+    """Returns what was made, the newest first, as one; `results` has it one by one."""
+    results.extend(made)
+    return Joined(kind.join([result for _, result in results[::-1]]) if results else [])
 
 
 def remembered(
@@ -251,3 +262,109 @@ def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
                 if position is not None:
                     yield position, stored
                 met[stored.time] += 1
+
+
+class Counted(NamedTuple):
+    """How many messages each piece holds, and the log times of its first and last one."""
+
+    messages: IntArray
+    first: IntArray
+    last: IntArray
+
+    def add(self, pieces: IntArray, messages: IntArray, first: IntArray, last: IntArray) -> None:
+        """Adds messages to pieces, each of which may be named several times."""
+        np.add.at(self.messages, pieces, messages)
+        np.minimum.at(self.first, pieces, first)
+        np.maximum.at(self.last, pieces, last)
+
+    def add_times(self, times: IntArray, edges: IntArray) -> None:
+        """Adds a message at each of some log times (ns) to the piece that it lies in."""
+        pieces = np.searchsorted(edges, times, side="right")
+        self.add(pieces, np.ones_like(times), times, times)
+
+
+def count_messages(
+    view: View, topic: str, window: TimeWindow, edges: IntArray, *, proves: bool = False
+) -> Counted:
+    """Returns how many messages of a topic lie in each piece of a window.
+
+    Messages that cannot be decoded count, too.
+
+    Args:
+        view: the call's.
+        topic: its name.
+        window: of log time.
+        edges: where pieces begin (ns), ascending; what is before the first is piece 0.
+        proves: whether messages are read for their times, as indexes of bags may lie.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    size = len(edges) + 1
+    counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
+    if view.stream.may_be_relatched([topic]):
+        for rows in scan(view, topic, window, columns=proves):
+            counted.add_times(rows.times, edges)
+        return counted
+    shared = open_scan(view, topic, window).shared
+    # Those of bags are inclusive; spans are half-open, in order and apart.
+    starts, stops = np.array([*shared, (MAX_NS, MAX_NS)], np.int64).T
+    to_read: set[str] = set()
+    spans: list[tuple[Ns, Ns]] = []
+    for segment in view.timeline.segments_in(window):
+        column = segment.column(topic)
+        if column is None:
+            continue
+        bag_numbers, firsts, lasts, messages = column
+        pieces = np.searchsorted(edges, firsts, side="right")
+        is_cut = pieces != np.searchsorted(edges, lasts, side="right")
+        is_cut |= (firsts < window.start) | (lasts >= window.stop)
+        is_cut |= starts[np.searchsorted(stops, firsts, side="right")] <= lasts
+        # Under none of its types is a bag counted that is read.
+        is_cut = np.isin(bag_numbers, bag_numbers[is_cut])
+        is_here = (firsts < window.stop) & (lasts >= window.start)
+        is_in = is_here & ~is_cut
+        counted.add(pieces[is_in], messages[is_in], firsts[is_in], lasts[is_in])
+        for row in np.flatnonzero(is_here & is_cut).tolist():
+            # A bag has a row for each type of the topic.
+            to_read.add(segment.bags[bag_numbers[row]].file)
+            spans.append((int(firsts[row]), int(lasts[row]) + 1))
+    near_those = united(sorted(spans))
+    for rows in scan(view, topic, window, columns=proves, shared=shared, within=near_those):
+        for _, positions in rows.bag_rows(to_read):
+            counted.add_times(rows.times[positions], edges)
+    return counted
+
+
+def pick(
+    view: View, topic: str, window: TimeWindow, at_most: int
+) -> tuple[int, Iterator[StoredMessage]]:
+    """Returns how many messages of a topic a window holds, and `at_most` of them, evenly spaced.
+
+    The first and the last are always among them. Each is read when it is its turn.
+
+    Raises:
+        QueryTimeoutError: the call's time is over.
+    """
+    edges = np.unique(view.bounds(topic, window)[0])
+    counts = count_messages(view, topic, window, edges, proves=True).messages
+    ends = np.cumsum(counts)
+    chosen = np.array(evenly(int(ends[-1]), at_most), np.int64)
+    opened = open_scan(view, topic, window)
+
+    def read() -> Iterator[StoredMessage]:
+        pieces = np.searchsorted(ends, chosen, side="right")
+        bounds = [MIN_NS, *edges.tolist(), MAX_NS]
+        for piece in np.unique(pieces).tolist():
+            part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
+            nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
+            scanned = [rows.times for rows in opened.rows(among=part)]
+            times = np.sort(np.concatenate([np.empty(0, np.int64), *scanned]))
+            times = times[(times >= part.start) & (times < part.stop)]
+            there = nth[nth < times.size].tolist()  # fewer, where a bag was deleted since
+            for time, equal in groupby(there, key=lambda position: int(times[position])):
+                numbers = {position - int(np.searchsorted(times, time)) for position in equal}
+                at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
+                yield from (stored for number, stored in enumerate(at_once) if number in numbers)
+
+    return int(ends[-1]), read()

@@ -1,4 +1,4 @@
-"""Sessions: which recordings are of one robot in one run, so that their transforms belong together.
+"""Sessions: which recordings are of one robot in one run, and the transforms that they hold.
 
 A transform holds in the session in which it was published: another robot, or the same one after a
 restart, has its own. A session is a recording and those that it is joined with by handovers, and
@@ -13,22 +13,43 @@ are of one robot, so a reply that uses borrowed transforms has to note it.
 
 from __future__ import annotations
 
+from collections import defaultdict
+from functools import cached_property
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from weakref import proxy
 
+import numpy as np
+
+from ros2_memory.analysis.frames import is_edge
 from ros2_memory.bag_dir.layout import CARRY_FOLDER
 from ros2_memory.bag_dir.moment_file import HardLinks
+from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.store import relative
+from ros2_memory.columns.transforms import STATICS, Pair, Statics, pairs_in, static_times
+from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
+from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.history.context import Note
+from ros2_memory.history.scan import (
+    joined_back,
+    messages_of,
+    of_columns,
+    open_scan,
+    remembered,
+    scan,
+)
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.columns.scan import Scan, Stretch
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.history.duplicates import BagSpan, StoredMessage
     from ros2_memory.history.view import View
 
 Session: TypeAlias = frozenset[str]
@@ -36,6 +57,9 @@ Session: TypeAlias = frozenset[str]
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
+_FEW_SESSIONS: Final = 4
+"""Sessions of which static transforms are looked up one by one."""
+_UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
 
 
 class _TransformSpans(NamedTuple):
@@ -61,35 +85,31 @@ _LINKED: Final[Key[set[tuple[tuple[str, str], Session | None]]]] = Key()
 
 
 class Sessions:
-    """The sessions of a view that hold transforms.
+    """The sessions of a view that hold transforms, and these.
 
     Args:
         view: one call's view of the memory. Two sessions that hold the topic of the robot's own
             poses (`View.pose_topic`) at once are two robots.
-        children: returns the child frames of all transforms of a session.
 
     Attributes:
         chosen: for a session with one that may lend to it and two frames, whose transforms hold.
-        statics: the static transforms of sessions, as far as they are known.
         linked: frames that are known to be connected in a session, or in some.
-        edges: every parent and child pair of all, once that is asked.
+        parts: by a session that is joined by lending, the two that it is of.
     """
 
-    def __init__(self, view: View, children: Callable[[View, Session], set[str]]) -> None:
+    def __init__(self, view: View) -> None:
         # A view holds its sessions: so the arrays of a call are freed as it ends.
         self._view: View = proxy(view)
-        self._children = children
         self._names = HardLinks(view.bag_dir)
         self._root = str(view.bag_dir).rstrip("/")
         self._carried = f"{self._root}/{CARRY_FOLDER}"
-        self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
-        self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
-        self.statics: dict[Session, Sequence[StampedTransform]] = {}
-        self.linked = view.timeline.memo.of(_LINKED, set)
-        self.edges: tuple[FrameEdge, ...] | None = None
-        self._parts: dict[Session, tuple[Session, Session]] = {}
-        self._lending: dict[tuple[str, Ns], Session] = {}
         self._recordings = view.timeline.memo.of(_RECORDINGS, dict)
+        self._spans = view.timeline.memo.of(_RECORDED, self._find_spans)
+        self._static: dict[Session, Sequence[StampedTransform]] = {}
+        self._lending: dict[tuple[str, Ns], Session] = {}
+        self.chosen: dict[tuple[Session, Session, tuple[str, str]], Session] = {}
+        self.linked = view.timeline.memo.of(_LINKED, set)
+        self.parts: dict[Session, tuple[Session, Session]] = {}
 
     def folder(self, recording: Path) -> str:
         """Returns where a recording was recorded; a saved moment keeps it elsewhere."""
@@ -178,10 +198,6 @@ class Sessions:
         ] or recordings
         return " and ".join(folder.rpartition("/")[2] for folder in around) or "deleted recordings"
 
-    def parts_of(self, session: Session) -> tuple[Session, ...]:
-        """Returns the two sessions that were joined by lending into this one; none if it is one."""
-        return self._parts.get(session, ())
-
     def nearest_to(self, moment: Ns) -> list[Session]:
         """Returns all sessions that hold transforms, the nearest in time first."""
         near = sorted(
@@ -203,7 +219,7 @@ class Sessions:
             partners = [*dict.fromkeys(self._with_lender(other, at) for other in beside)]
         if len(partners) == 1:
             completed = session | partners[0]
-            self._parts[completed] = session, partners[0]
+            self.parts[completed] = session, partners[0]
             return completed
         return session if kinds else frozenset()
 
@@ -221,7 +237,11 @@ class Sessions:
         """Whether one has moving transforms alone, the other static ones alone, of other frames."""
         if self._kinds(first) & self._kinds(other):
             return False
-        return self._children(self._view, first).isdisjoint(self._children(self._view, other))
+        topics = (*self._view.moving_topics, *self._view.static_topics)
+        frames, others = (
+            {child for _, child in self.pairs(topics, session)} for session in (first, other)
+        )
+        return frames.isdisjoint(others)
 
     def _kinds(self, session: Session) -> frozenset[int]:
         """Returns which kinds of transforms a session holds; carried ones count as its own."""
@@ -248,20 +268,229 @@ class Sessions:
         return {folder: enclosing(spans.values()) for folder, spans in by_folder.items()}
 
     def _find_spans(self) -> _TransformSpans:
-        limits, pose_topic = self._view.limits, self._view.pose_topic
-        topics = (*limits.tf_topics, *limits.tf_static_topics, pose_topic)
-        recordings = map(self._view.timeline.recordings, topics)
+        view = self._view
+        topics = (*view.moving_topics, *view.static_topics, view.pose_topic)
+        recordings = map(view.timeline.recordings, topics)
         paths = {self.folder(path): path for path in chain.from_iterable(recordings)}
         chains = components(
             (folder, f"{folder.rpartition('/')[0]}/{name}")
             for folder, path in (paths.items() if len(paths) > 1 else ())
-            for name in self._view.memory.index.joined_with(path)
+            for name in view.memory.index.joined_with(path)
         )
         return _TransformSpans(
-            (self._spans_of(limits.tf_topics), self._spans_of(limits.tf_static_topics)),
-            [*self._spans_of((pose_topic,)).items()],
+            (self._spans_of(view.moving_topics), self._spans_of(view.static_topics)),
+            [*self._spans_of((view.pose_topic,)).items()],
             {folder: frozenset(linked | {self._carried}) for folder, linked in chains.items()},
         )
+
+    def bags_of(
+        self, session: Session, topics: tuple[str, ...], window: TimeWindow
+    ) -> list[BagSpan]:
+        """Returns the bags of a session that hold messages of some topics in a window."""
+        # A session is mostly some minutes of a week, whose bags are many.
+        part = window.intersect(self._span_of(session, topics))
+        chosen = self.recordings_of(session, topics)
+        bags = self._view.stream.overlapping_bags(topics, part)
+        return [span for span in bags if span.bag.recording in chosen]
+
+    def newest(self, topic: str, window: TimeWindow, recording: Path) -> StoredMessage | None:
+        """Returns the newest message of a topic in a window, from the session of a recording.
+
+        From any session where that one has no message of the topic at all.
+        """
+        newest, session = self._view.stream.newest(topic, window), self.of(recording)
+        if not self.recordings_of(session, (topic,)):
+            return newest
+        bags = self.bags_of(session, (topic,), window)
+        if newest is not None and newest.bag in {span.bag for span in bags}:
+            return newest
+        return self._view.stream.first((topic,), window, newest_first=True, among=bags)
+
+    def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
+        """Returns the moving transforms that a session received in a window, in log-time order."""
+        stream, topics = self._view.stream, self._view.moving_topics
+        bags = self.bags_of(session, topics, window)
+        merged = stream.merged(bags, topics, window, newest_first=False)
+        tracked = self._view.bags.track_sources(merged)
+        of_session = (stored for stored in tracked if self.has(session, stored))
+        return [*decoded_transforms(self._view, of_session)]
+
+    def received(self, session: Session | None, rows: Rows) -> Iterator[StampedTransform]:
+        """Yields the transforms in some rows that are of a session; None: of any."""
+        messages = messages_of(self._view, rows)
+        if session is not None:
+            messages = (stored for stored in messages if self.has(session, stored))
+        return decoded_transforms(self._view, messages)
+
+    def static(self, session: Session) -> Sequence[StampedTransform]:
+        """Returns the static transforms of a session, in log-time order.
+
+        One that is equal to the one before of its child is left out: each split may have all again.
+        So few messages of a part are read: those by whose columns something is new.
+
+        Raises:
+            QueryTimeoutError: the call's time is over.
+        """
+        view, caches = self._view, self._view.memory.columns.caches
+        if session not in self._static:
+            key = (session, view.static_topics)
+            timeline, static = caches.statics.get(key) or (None, ())
+            if timeline is view.timeline:
+                self._static[session] = static
+            elif len(self._static) == _FEW_SESSIONS:
+                # Who has asked for so many asks for more.
+                self._find_all_static()
+        if session not in self._static:
+            before = view.notes.added
+            static = _without_repeats(
+                transform
+                for topic in view.static_topics
+                for transform in self._static_received(topic, session)
+            )
+            self._static[session] = static
+            # What was noted must be noted in each answer.
+            if view.notes.added == before and not view.call.used_active:
+                caches.statics.put(key, (view.timeline, static), 1000 + 600 * len(static))
+        return self._static[session]
+
+    def _find_all_static(self) -> None:
+        """Finds the static transforms of all sessions that are stored, unless some are carried."""
+        view = self._view
+        coverage = view.memory.columns.coverage(view.timeline)
+        recordings = chain.from_iterable(map(view.timeline.recordings, view.static_topics))
+        if coverage is None or any(map(self.holds_carried, recordings)):
+            return
+        received: dict[Session, list[StampedTransform]] = defaultdict(list)
+        for statics in self.static_back(TimeWindow.everything()):
+            received[self.of(view.bag_dir / statics.recording)] += statics.transforms
+        for session in {self.of(bag.recording) for bag in coverage.missing}:
+            received.pop(session, None)
+        for session, transforms in received.items():
+            self._static[session] = _without_repeats(transforms)
+
+    def static_back(self, window: TimeWindow) -> Iterator[Statics]:
+        """Yields the static transforms of the parts in a window, of bags that are stored."""
+        for topic in self._view.static_topics:
+            opened = open_scan(self._view, topic, window, copies=True, stored=True)
+
+            def make(stretch: Stretch, opened: Scan = opened) -> Iterator[tuple[Ns, Statics]]:
+                for rows in opened.rows(newest_first=True, among=stretch.window):
+                    if stretch.window.contains(max(rows.first, window.start)):
+                        yield rows.first, self._static_changes(rows)
+
+            for _, statics in joined_back(self._view, opened, STATICS, make):
+                yield statics
+
+    def _static_received(self, topic: str, session: Session) -> Iterator[StampedTransform]:
+        """Yields static transforms of a topic; of equal ones that follow in a part the first."""
+        for rows in scan(self._view, topic, self._span_of(session, (topic,)), copies=True):
+            if self.holds_carried(rows.recording):
+                yield from self.received(session, rows)
+            elif self.folder(rows.recording) in session:
+                yield from self._static_changes(rows).transforms
+
+    def _static_changes(self, rows: Rows) -> Statics:
+        """Returns the static transforms in some rows that differ from those before, as received."""
+
+        def make() -> Statics:
+            times = static_times(rows.table, rows.times, rows.index)
+            new = rows if times is None else rows.some(np.flatnonzero(np.isin(rows.times, times)))
+            changes = _without_repeats(self.received(None, new))
+            return Statics(relative(str(rows.recording), str(self._view.bag_dir)), tuple(changes))
+
+        key = None if rows.part is None else FragmentKey(rows.first, "", (rows.part,))
+        return remembered(self._view, STATICS, key, make)
+
+    def _span_of(self, session: Session, topics: tuple[str, ...]) -> TimeWindow:
+        """Returns when a session has some topics: mostly some hours of a week."""
+        spans = self.recordings_of(session, topics).values()
+        if not spans:
+            return TimeWindow(0, 0)
+        first, last = enclosing(spans)
+        return TimeWindow(first, last + 1)
+
+    @cached_property
+    def edges(self) -> tuple[FrameEdge, ...]:
+        """Every parent and child pair that was recorded, sorted; `static` where published so.
+
+        A pair that was published in both directions appears once, as moving. A pair with an unnamed
+        frame is invalid in tf2, and is left out with a note.
+        """
+        view = self._view
+        pairs = dict.fromkeys(self.pairs(view.static_topics), True)
+        pairs |= dict.fromkeys(self.pairs(view.moving_topics), False)
+        edges = [
+            FrameEdge(*pair, is_static)
+            for pair, is_static in sorted(pairs.items())
+            if is_edge(pair)
+        ]
+        if len(edges) < len(pairs):
+            view.notes.add(f"pairs left out, since a frame has no name: {len(pairs) - len(edges)}")
+        return tuple(edges)
+
+    def pairs(self, topics: Iterable[str], session: Session | None = None) -> set[Pair]:
+        """Returns the pairs of these topics; with a `session` those that it received."""
+        pair_sets = (self.pairs_back(topic, session) for topic in topics)
+        return set[Pair]().union(*chain.from_iterable(pair_sets))
+
+    def pairs_back(
+        self, topic: str, session: Session | None, window: TimeWindow | None = None
+    ) -> Iterator[frozenset[Pair]]:
+        """Yields the pairs of a topic (in a window), table by table, those of the newest first."""
+        window = TimeWindow.everything() if window is None else window
+        if session is not None:
+            window = window.intersect(self._span_of(session, (topic,)))
+        for rows in scan(
+            self._view, topic, window, newest_first=True, copies=True, may_be_empty=True
+        ):
+            if session is None or self.may_hold(session, rows.recording):
+                yield self._pairs_in(rows, session if self.holds_carried(rows.recording) else None)
+
+    def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
+        """Returns the pairs in some rows; with a `session` those that are of it."""
+        view, known_pairs = self._view, self._view.memory.columns.caches.pairs
+        part = rows.part if session is None else None
+        pairs = None if part is None else known_pairs.get(part)
+        if pairs is not None:
+            return pairs
+        before, by_columns = view.notes.added, None
+        if session is None:
+            by_columns = of_columns(view, rows, lambda some: pairs_in(some.table, some.index))
+        if by_columns is None:
+            received = self.received(session, rows)
+            pairs = frozenset((transform.parent, transform.child) for transform in received)
+        else:
+            pairs = frozenset[Pair]().union(*by_columns)
+        if part is not None and view.notes.added == before:
+            known_pairs.put(part, pairs, 200 + 200 * len(pairs))
+        return pairs
+
+
+def decoded_transforms(view: View, messages: Iterable[StoredMessage]) -> Iterator[StampedTransform]:
+    """Yields the transforms of messages; a note names the topics that cannot be decoded."""
+    for stored in messages:
+        is_static = stored.topic in view.limits.tf_static_topics
+        with view.call.stages.timed("extract"):
+            try:
+                message = view.memory.reader.decode(stored.record)
+                transforms = view.extractor.transforms(message, stored.time, static=is_static)
+            except UndecodableError as error:
+                view.notes.add_lack(Note(_UNDECODED, error.topic, error.reason))
+                continue
+        yield from transforms
+
+
+def _without_repeats(static: Iterable[StampedTransform]) -> list[StampedTransform]:
+    """Returns transforms by log time without those equal to the one before of their child."""
+    latest: dict[str, StampedTransform] = {}
+    changes: list[StampedTransform] = []
+    for transform in sorted(static, key=lambda transform: transform.log_time):
+        child = transform.child.lstrip("/")
+        last = latest.get(child)
+        if last is None or (last.parent, last.transform) != (transform.parent, transform.transform):
+            latest[child] = transform
+            changes.append(transform)
+    return changes
 
 
 def components(pairs: Iterable[tuple[str, str]]) -> dict[str, set[str]]:

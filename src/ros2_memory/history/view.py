@@ -33,27 +33,19 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
 from ros2_memory.history.scan import open_scan, scan
+from ros2_memory.history.sessions import Sessions
+from ros2_memory.index.segment import TopicTotals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.sessions import Sessions
     from ros2_memory.storage.base import IntArray
 
 
-_CENSUSES: Final[Key[dict[str, dict[str, Census]]]] = Key()
+_CENSUSES: Final[Key[dict[str, dict[str, TopicTotals]]]] = Key()
 """Of a timeline: its topics' censuses."""
-
-
-@dataclass(frozen=True, slots=True)
-class Census:
-    """Log times of the earliest and latest message (inclusive), and how many there are."""
-
-    first: Ns
-    last: Ns
-    count: int
 
 
 class View:
@@ -70,7 +62,6 @@ class View:
         stream: all bags as one stream.
         timeline: the bags in the order of time.
         memo: what was found out in this call.
-        sessions: which recordings belong together, once that is asked (see `transforms`).
     """
 
     def __init__(self, memory: Memory, call: Call, reach: Ns | None = None) -> None:
@@ -84,7 +75,21 @@ class View:
         self.bag_dir = memory.index.bag_dir
         self.notes = self.bags.notes
         self.memo = Memo()
-        self.sessions: Sessions | None = None
+
+    @cached_property
+    def sessions(self) -> Sessions:
+        """Which recordings belong together, and the transforms that they hold."""
+        return Sessions(self)
+
+    @cached_property
+    def moving_topics(self) -> tuple[str, ...]:
+        """The recorded topics of transforms that move (`data.tf_topics`)."""
+        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_topics))
+
+    @cached_property
+    def static_topics(self) -> tuple[str, ...]:
+        """The recorded topics of static transforms (`data.tf_static_topics`)."""
+        return tuple(filter(self.timeline.topics().__contains__, self.limits.tf_static_topics))
 
     @cached_property
     def pose_topic(self) -> str:
@@ -124,7 +129,7 @@ class View:
         touched = [(start, end) for start, end in gaps if start < last and first < end]
         return without_steps(self, touched) if touched else touched
 
-    def census(self, topic: str) -> dict[str, Census]:
+    def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
 
         From the summaries of bags; messages are read only where recordings overlap. What is counted
@@ -140,16 +145,14 @@ class View:
                 counted[topic] = censuses
         return censuses
 
-    def _read_census(self, topic: str) -> dict[str, Census]:
-        counted = {
-            type_name: Census(*stated) for type_name, stated in self.timeline.totals(topic).items()
-        }
+    def _read_census(self, topic: str) -> dict[str, TopicTotals]:
+        counted = self.timeline.totals(topic)
         for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
             type_name = rows.table.channel.type
-            before = counted[type_name]
-            last = before.last if rows.span[1] < before.last else self._last_of(topic, type_name)
-            counted[type_name] = Census(before.first, last, before.count - len(rows))
-        return {type_name: census for type_name, census in counted.items() if census.count}
+            first, last, messages = counted[type_name]
+            last = last if rows.span[1] < last else self._last_of(topic, type_name)
+            counted[type_name] = TopicTotals(first, last, messages - len(rows))
+        return {type_name: totals for type_name, totals in counted.items() if totals.messages}
 
     def _last_of(self, topic: str, type_name: str) -> Ns:
         """Returns the log time of the newest message of a type that counts."""

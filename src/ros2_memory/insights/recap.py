@@ -412,7 +412,8 @@ def _recording_events(view: View, window: TimeWindow, drive: Drive) -> Iterator[
 
 
 def _gap_sentence(view: View, begin: Ns, until: Ns) -> str:
-    spans = deleted_between(view, TimeWindow(begin, until))
+    near = deleted_between(view, TimeWindow(begin, until))
+    spans = [(max(start, begin), min(stop, until)) for start, stop in near]
     deleted = unix_from_ns(sum(stop - start for start, stop in spans))
     if not deleted:
         return "nothing was recorded"

@@ -37,7 +37,6 @@ from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import poses_of_bag
-from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.tables import ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
@@ -104,8 +103,8 @@ def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str]
     """
     counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
     view = View(memory, Call())
-    recordings = sessions_of(view).lending_to(bag.recording, bag.end)
-    statics = repr(static_at(static_transforms(view, recordings), bag.end))
+    recordings = view.sessions.lending_to(bag.recording, bag.end)
+    statics = repr(static_at(view.sessions.static(recordings), bag.end))
     labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
     joined = memory.index.joined_with(bag.recording)
     made = ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted

@@ -10,7 +10,7 @@ import numpy as np
 
 from ros2_memory.analysis.motion.robot_track import RobotTrack, empty_track, track_of
 from ros2_memory.core.model import Geodetic, TimeWindow
-from ros2_memory.history.counting import pick
+from ros2_memory.history.scan import pick
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -36,17 +36,15 @@ from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import (
     body_by_transforms,
+    body_of,
     newest_of_body,
     pose_frame,
     resolve_path_topic,
-    robot_body,
 )
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.transforms import (
     connects,
     connects_in_time,
-    newest_in_session,
-    sessions_of,
     transform_at,
 )
 from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
@@ -91,13 +89,13 @@ def newest_pose(
     Where the session of a `recording` has the topic, it is one of its messages. None where there is
     no message, or it cannot be decoded.
     """
-    body = robot_body(view) if topic in view.limits.tf_topics else None
+    body = body_of(view, topic)
     if body is not None:
         return newest_of_body(view, body, window, recording=recording)
     if recording is None:
         stored = view.stream.newest(topic, window)
     else:
-        stored = newest_in_session(view, topic, window, recording)
+        stored = view.sessions.newest(topic, window, recording)
     message = None if stored is None else view.bags.decode(stored)
     if stored is None or message is None:
         return None
@@ -163,9 +161,13 @@ def placed_waypoints(
         recording = recording_at(view, topic, waypoint.time)
         half = math.nan if waypoint.yaw_rad is None else waypoint.yaw_rad / 2
         pose = Pose(waypoint.position, (0.0, 0.0, math.sin(half), math.cos(half)), own_frame)
-        there = None
-        if recording is not None:
-            there = _pose_near(view, pose, frame_id, waypoint.time, recording)
+        # By the transforms of its time, or of the nearest one up to `HOLD_NS` off.
+        tried = (
+            pose_in(view, pose, frame_id, waypoint.time + off, recording)
+            for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS)
+            if recording is not None
+        )
+        there = next(filter(None, tried), None)
         if there is None or there.orientation is None:
             # Asked once: to look for a frame that nothing leads to at each time takes long.
             if not (moved or known_to_lead) and not connects(view, (frame_id, own_frame)):
@@ -180,15 +182,6 @@ def placed_waypoints(
         left_out = counted(len(waypoints) - len(moved), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
     return tuple(moved)
-
-
-def _pose_near(view: View, pose: Pose, frame_id: str, time: Ns, recording: Path) -> Pose | None:
-    """Returns a pose by the transforms of its time, or of the nearest one up to `HOLD_NS` off."""
-    for off in (0, HOLD_NS // 2, -HOLD_NS // 2, HOLD_NS, -HOLD_NS):
-        there = pose_in(view, pose, frame_id, time + off, recording)
-        if there is not None:
-            return there
-    return None
 
 
 def _unreachable(frame_id: str, own_frame: str) -> str:
@@ -242,7 +235,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         UndecodableError: no pose can be decoded.
     """
     target, frame = view.limits.map_frame, pose_frame(view, topic)
-    body = robot_body(view) if topic in view.limits.tf_topics else None
+    body = body_of(view, topic)
     above = () if body is None else body.above
     if frame_id in (frame, *above):
         return MapPlacement(frame_id, frame, frame_id == target, above)
@@ -251,7 +244,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
     places_frame = frame
     if target and target != frame and leads(view, (target, frame)):
         recordings = view.timeline.recordings(topic).items()
-        lending = {sessions_of(view).lending_to(path, first) for path, (first, _) in recordings}
+        lending = {view.sessions.lending_to(path, first) for path, (first, _) in recordings}
         if any(leads(view, (target, frame), session=session) for session in lending):
             places_frame = target
     placement = MapPlacement(places_frame, frame, places_frame == target, above)
@@ -278,7 +271,7 @@ def is_one_run(view: View, topic: str, windows: Iterable[TimeWindow]) -> bool:
 
     Or of several that repeat each other where they overlap, as a copy does.
     """
-    sessions, asked = sessions_of(view), tuple(windows)
+    sessions, asked = view.sessions, tuple(windows)
     spans = sorted(
         (*span, recording)
         for recording, span in view.timeline.recordings(topic).items()

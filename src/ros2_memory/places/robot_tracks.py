@@ -56,8 +56,6 @@ from ros2_memory.history.transforms import (
     edges_of_rows,
     frames_over,
     lending_to,
-    sessions_of,
-    static_transforms,
 )
 
 if TYPE_CHECKING:
@@ -147,11 +145,8 @@ class RobotTracks:
         self._view = view
         self._frame_id = frame_id
         self._body = body = body_by_transforms(view)
-        self._topics = view.limits.tf_topics
-        if body is None:
-            self._topics, self._own_frame = (view.pose_topic,), pose_frame(view, view.pose_topic)
-        else:
-            self._own_frame = body.child
+        self._topics = (view.pose_topic,) if body is None else view.limits.tf_topics
+        self._own_frame = pose_frame(view, view.pose_topic) if body is None else body.child
         self._is_own = body is None and self._own_frame == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
@@ -218,7 +213,9 @@ class RobotTracks:
         """Yields the track, the newest first, each part with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
         whole = _aligned(window, PART_NS)
-        moving = [] if self._is_own else self._moving_scans(whole)
+        around = _aligned(whole.widened(TF_CACHE_NS), PART_NS)
+        topics = () if self._is_own else self._view.moving_topics
+        moving = [open_scan(self._view, topic, around, copies=True) for topic in topics]
         for topic in self._topics:
             opened = open_scan(self._view, topic, whole, stored=self._view.call.stored)
             yield from joined_back(
@@ -229,15 +226,6 @@ class RobotTracks:
                 partial(self._stretch_key, opened, moving, window),
                 trouble=lambda: len(self._failures),
             )
-
-    def _moving_scans(self, window: TimeWindow) -> list[Scan]:
-        """Returns the scans of the moving transforms of a window, and around it."""
-        topics = self._view.timeline.topics()
-        around = _aligned(window.widened(TF_CACHE_NS), PART_NS)
-        named = self._view.limits.tf_topics
-        return [
-            open_scan(self._view, name, around, copies=True) for name in named if name in topics
-        ]
 
     def _parts_in(
         self,
@@ -273,7 +261,7 @@ class RobotTracks:
         start, last = stretch.window.start, stretch.last
         if stretch.parts is None or not window.covers(start, last):
             return None
-        sessions, span = sessions_of(self._view), TimeWindow(start, last + 1)
+        sessions, span = self._view.sessions, TimeWindow(start, last + 1)
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
         parts = [*stretch.parts]
@@ -283,7 +271,7 @@ class RobotTracks:
             if not sessions.has_all_kinds(session):
                 return None
             if session not in numbers:
-                placed_by.append(static_in(static_transforms(self._view, session), span))
+                placed_by.append(static_in(self._view.sessions.static(session), span))
             placed_by.append(numbers.setdefault(session, len(numbers)))
         moving = self._moving_parts(scans, span)
         if moving is None:
@@ -303,7 +291,7 @@ class RobotTracks:
             if parts is None:
                 return None
             paths |= {part: scan_.recording_of(part) for part in parts}
-        is_mixed = any(map(sessions_of(self._view).holds_carried, paths.values()))
+        is_mixed = any(map(self._view.sessions.holds_carried, paths.values()))
         return None if is_mixed else paths
 
     def _settings_hash(self, placed_by: Sequence[object]) -> str:
@@ -341,10 +329,10 @@ class RobotTracks:
             moving = self._moving_parts(scans, lent.span)
             if moving is None:
                 return None
-            sessions, session = sessions_of(self._view), lent.session
+            sessions, session = self._view.sessions, lent.session
             used = [part for part, path in moving.items() if sessions.folder(path) in session]
             parts += [part for part in used if part not in parts]
-            static = static_in(static_transforms(self._view, session), lent.span)
+            static = static_in(self._view.sessions.static(session), lent.span)
             # By their places among the parts: those of one recording have one text.
             placed_by.append((lent.since, tuple(static), [parts.index(part) for part in used]))
         return FragmentKey(rows.first, self._settings_hash(placed_by), tuple(parts))
@@ -364,7 +352,7 @@ class RobotTracks:
 
     def _lenders(self, rows: Rows) -> list[tuple[Ns, Session]]:
         """Returns which sessions' transforms place the poses of some rows, each since when."""
-        sessions, recording = sessions_of(self._view), rows.recording
+        sessions, recording = self._view.sessions, rows.recording
         session = sessions.of(recording)
         if sessions.has_all_kinds(session):
             return [(MIN_NS, session)]
@@ -384,13 +372,9 @@ class RobotTracks:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        placed = [NOWHERE]
-        for topic in self._topics:
-            placed += [
-                self._poses_of(rows, self._lent_spans(rows, window))
-                for rows in scan(self._view, topic, window)
-            ]
-        return _in_time_order(placed)
+        scanned = chain.from_iterable(scan(self._view, topic, window) for topic in self._topics)
+        placed = [self._poses_of(rows, self._lent_spans(rows, window)) for rows in scanned]
+        return _in_time_order([NOWHERE, *placed])
 
     def _lender_at(self, recording: Path, at: Ns) -> Session:
         """Returns the session that places a recording's poses; a note says if none, or another."""

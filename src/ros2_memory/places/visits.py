@@ -28,7 +28,7 @@ from ros2_memory.history.coverage import note_unread, unix_text, unknown_times
 from ros2_memory.history.driven_path import driven_path, resolve_path_topic
 from ros2_memory.history.no_data import require_recorded
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.view import TimeRange, View, open_view, search_window
+from ros2_memory.history.view import TimeRange, View, open_search
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     WHEREABOUTS,
@@ -80,15 +80,12 @@ def visits(
         QueryTimeoutError: the call's time runs out before any result.
     """
     place = asked_place(memory.limits, (x, y), radius_m, where)
-    wall = memory.clock.now()
-    window = search_window(TimeRange(start_s, end_s), wall)
-    view = open_view(memory, call, min(window.stop, wall))
+    view, now, window = open_search(memory, call, TimeRange(start_s, end_s))
     require_recorded(view, window)
     topic = resolve_path_topic(view)
     mixed = note_robots(view, topic, window)
     asked_frame = (place and place.frame_id) or frame_id
     placement = map_placement(view, topic, asked_frame)
-    now = memory.now(wall, view.snapshot.latest, call)
     if place is None:
         return _visits_of_places(view, window, placement, mixed, now)
     region_visits = RegionVisits(view, placement.frame_id, place.region, window)
@@ -379,8 +376,7 @@ class RegionVisits:
             poses = self._poses(TimeWindow(cut.start, cut.stop + 1))
             if not any(True for _ in self._poses_inside(poses)):
                 return None
-        inside = visit.inside._replace(entered=cut.entered, left=cut.left)
-        return visit._replace(inside=inside)
+        return visit._replace(inside=visit.inside._replace(entered=cut.entered, left=cut.left))
 
     def _by_poses(self, visit: RegionVisit) -> Inside | None:
         """Returns a visit from its first to its last pose inside, where it was entered and left.
@@ -396,8 +392,7 @@ class RegionVisits:
 
     def _inside_near(self, visit: RegionVisit, at: Ns) -> list[Ns]:
         """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
-        whole = visit.whole
-        poses = self._poses_around(visit.track, at)
+        whole, poses = visit.whole, self._poses_around(visit.track, at)
         inside = [*self._poses_inside(poses)]
         absences = [*_absences(poses.times, inside)]
         # What lies beyond an absence is of the visit before, or after.
@@ -416,10 +411,9 @@ class RegionVisits:
 
     def _vertices_inside(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
         """Yields the times of a visit's vertices that are inside."""
-        first = int(np.searchsorted(track.times, stay.start, side="left"))
-        last = int(np.searchsorted(track.times, stay.stop, side="right"))
-        visit = slice(first, last)
-        return self._times_inside(track.times[visit], track.x[visit], track.y[visit])
+        first = np.searchsorted(track.times, stay.start, side="left")
+        last = np.searchsorted(track.times, stay.stop, side="right")
+        return self._times_inside(track.times[first:last], track.x[first:last], track.y[first:last])
 
     def _poses_around(self, track: RobotTrack, at: Ns) -> Placed:
         """Returns the poses between the vertices before and after a time, these included."""

@@ -177,7 +177,12 @@ def _parse_place(
     limits: QuerySettings, value: JsonValue, default_radius_m: float | None, what: str
 ) -> Where:
     if isinstance(value, str):
-        return _place_by_name(limits, value, what)
+        if (place := _place_named(limits, value)) is not None:
+            return Where(place.region, place.frame_id, place.name)
+        names = ", ".join(sorted(named.name for named in limits.places))
+        none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
+        listed = f"there are: {names}" if names else none
+        raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(value)}; {listed}")
     if not isinstance(value, dict):
         raise InvalidArgumentsError(f"{what} was {abbreviate(value)}; {_EXPECTED}")
     unknown = value.keys() - _OF_REGION
@@ -209,19 +214,11 @@ def places_setting(limits: QuerySettings) -> str:
 
 
 def _place_named(limits: QuerySettings, name: str) -> Place | None:
-    asked = " ".join(name.split()).casefold()
-    same = (named for named in limits.places if " ".join(named.name.split()).casefold() == asked)
+    def folded(words: str) -> str:
+        return " ".join(words.split()).casefold()
+
+    same = (named for named in limits.places if folded(named.name) == folded(name))
     return next(same, None)
-
-
-def _place_by_name(limits: QuerySettings, name: str, what: str) -> Where:
-    place = _place_named(limits, name)
-    if place is not None:
-        return Where(place.region, place.frame_id, place.name)
-    names = ", ".join(sorted(named.name for named in limits.places))
-    none = f"none are named in {places_setting(limits)}; {_EXPECTED}"
-    listed = f"there are: {names}" if names else none
-    raise InvalidArgumentsError(f"{what}: no place is named {abbreviate(name)}; {listed}")
 
 
 def _parse_range(axis: str, value: JsonValue) -> tuple[float, float]:
@@ -291,6 +288,7 @@ class Scope:
         where: JsonValue = None,
         during: Sequence[WhileCondition] = (),
     ) -> None:
+        self._view = view
         self.window = window
         self.unknown: Spans = []
         self.since: Ns | None = None
@@ -306,7 +304,8 @@ class Scope:
             self.unknown = unknown_times(view, window, known, WHEREABOUTS)
         self._states = [_ConditionStates(view, condition) for condition in during]
         for state, condition in zip(self._states, during, strict=True):
-            state.require_met(window)
+            state.search.require_met(window.stop)
+            state.search.note_untested(window)
             known = state.known_in(window)
             unknown = unknown_times(view, window, known, f"what {condition.topic} said")
             self.unknown = united([*self.unknown, *unknown])
@@ -314,7 +313,9 @@ class Scope:
     @property
     def compared_frames(self) -> tuple[str, ...]:
         """The notes on the frames in which the other conditions compared positions, if any did."""
-        return tuple(dict.fromkeys(chain(*(state.compared_frames for state in self._states))))
+        searches = [state.search for state in self._states]
+        notes = (compared_frames(self._view, each.topics, each.condition) for each in searches)
+        return tuple(dict.fromkeys(chain(*notes)))
 
     @property
     def is_bounded(self) -> bool:
@@ -322,14 +323,11 @@ class Scope:
         return self._inside is not None or bool(self._states)
 
     def narrowed(self) -> Iterator[TimeWindow]:
-        """Yields the parts of the window in which matches may count, newest first."""
+        """Returns the parts of the window in which matches may count, newest first."""
         if self._inside is None:
-            yield self.window
-            return
-        for start, stop in reversed(self._inside):
-            part = self.window.intersect(TimeWindow(start, stop))
-            if not part.empty:
-                yield part
+            return iter([self.window])
+        spans = (TimeWindow(*span) for span in reversed(self._inside))
+        return (part for part in map(self.window.intersect, spans) if not part.empty)
 
     def holds_at(self, time: Ns) -> bool:
         """Returns whether a match at a moment counts."""
@@ -391,37 +389,17 @@ class _ConditionStates:
 
     def __init__(self, view: View, during: WhileCondition) -> None:
         self._view = view
-        self._condition = condition_of(
-            view,
-            during.topic,
-            during.condition_type,
-            during.value,
-            field=during.field,
-            min_score=0.0,
-        )
-        self._search = ReverseSearch(view, during.topic, self._condition)
-        self._holds_on = holds_on(view, self._search.topics)
+        topic, kind, value = during.topic, during.condition_type, during.value
+        condition = condition_of(view, topic, kind, value, field=during.field, min_score=0.0)
+        self.search = ReverseSearch(view, topic, condition)
+        self._holds_on = holds_on(view, self.search.topics)
         self._known = TimeWindow(0, 0)
         self._times: list[Ns] = []
         self._values: list[bool] = []
 
-    @property
-    def compared_frames(self) -> tuple[str, ...]:
-        """The note on the frames in which the condition compared positions, if it did."""
-        return compared_frames(self._view, self._search.topics, self._condition)
-
-    def require_met(self, window: TimeWindow) -> None:
-        """Checks that messages may meet the condition, and notes those that cannot be tested.
-
-        Raises:
-            InvalidArgumentsError: none of them can.
-        """
-        self._search.require_met(window.stop)
-        self._search.note_untested(window)
-
     def known_in(self, window: TimeWindow) -> Spans:
         """Returns when the topics said something: without silences, unless that holds on."""
-        topics, timeline = self._search.topics, self._view.timeline
+        topics, timeline = self.search.topics, self._view.timeline
         if self._holds_on:
             spans = (span for topic in topics for span in timeline.recordings(topic).values())
             known = [(min((first for first, _ in spans), default=MAX_NS), MAX_NS)]
@@ -468,12 +446,12 @@ class _ConditionStates:
         if number < len(self._times):
             return self._times[number]
         window = TimeWindow(self._known.stop, end + 1)
-        message = self._view.stream.first(self._search.topics, window)
+        message = self._view.stream.first(self.search.topics, window)
         return MAX_NS if message is None else message.time
 
     def _read_around(self, time: Ns) -> None:
         """Reads the messages of the bags that may hold the newest one at a moment."""
-        topics = self._search.topics
+        topics = self.search.topics
         spans = self._view.stream.overlapping_bags(topics, TimeWindow(time, time + 1))
         start = min((span.first for span in spans), default=time)
         stop = max((span.last + 1 for span in spans), default=time + 1)
@@ -484,7 +462,7 @@ class _ConditionStates:
             messages = messages if before is None else [before, *messages]
         self._times, self._values = [], []
         for message in messages:
-            met = self._search.matches(message)
+            met = self.search.matches(message)
             if met is not None:
                 self._times.append(message.time)
                 self._values.append(met)

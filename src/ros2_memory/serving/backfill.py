@@ -27,7 +27,6 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import Ns, ns_from_unix
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.transforms import make_statics
 from ros2_memory.history.view import View
 from ros2_memory.insights.changes_before import topics_with_changes
 from ros2_memory.insights.drive import drive_made
@@ -234,7 +233,7 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
         EpisodicError: they cannot be made.
     """
     view = View(memory, Call(stored=True))
-    make_statics(view, window)
+    deque(view.sessions.static_back(window), maxlen=0)
     fragments = [
         drive_made(view, window),
         make_tracks(view, window),

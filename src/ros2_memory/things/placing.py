@@ -35,7 +35,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.history.detections import Detected, DetectionRows, joined_detected
 from ros2_memory.history.poses import pose_rows
 from ros2_memory.history.scan import messages_of, scan
-from ros2_memory.history.transforms import frames_over, sessions_of
+from ros2_memory.history.transforms import frames_over
 
 if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
@@ -87,7 +87,7 @@ class Placer:
 
     def __init__(self, view: View) -> None:
         self._view = view
-        self._sessions = sessions_of(view)
+        self._sessions = view.sessions
         self.rows = DetectionRows(view)
 
     def placed(

@@ -24,7 +24,6 @@ from ros2_memory.columns.sights import packed
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import remembered, scan
-from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
 if TYPE_CHECKING:
@@ -160,7 +159,7 @@ class Watching:
     def __init__(self, view: View) -> None:
         self._view = view
         self._placer = Placer(view)
-        self._sessions = sessions_of(view)
+        self._sessions = view.sessions
         self._session_of: dict[Path, Session] = {}
         timeline = view.timeline
         self._topics = [
@@ -324,7 +323,7 @@ class Watching:
         statics = [
             [
                 (static, static.log_time if window.contains(static.log_time) else 0)
-                for static in static_in(static_transforms(self._view, lender), window)
+                for static in static_in(self._view.sessions.static(lender), window)
             ]
             for _, lender, _ in around.sessions
             if lender

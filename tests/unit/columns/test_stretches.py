@@ -18,7 +18,6 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.driven_path import slices_of_path
 from ros2_memory.history.scan import joined_back, open_scan
-from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_in
 from ros2_memory.serving import backfill
@@ -225,7 +224,7 @@ def test_what_could_not_be_decoded_is_said_again_of_what_is_stored(tmp_path: Pat
     world.fill()
     for memory in (world.unstored().memory, world.memory, World.of(tmp_path).memory):
         view = View(memory, Call())
-        assert static_transforms(view, sessions_of(view).of(tmp_path / "rec"))
+        assert view.sessions.static(view.sessions.of(tmp_path / "rec"))
         assert not view.notes.complete
         [said] = [one for one in view.notes.sentences() if "could not be decoded" in one]
         assert said.startswith("messages of /tf_static could not be decoded: ")

@@ -1,26 +1,52 @@
-"""Transforms from columns are those that the messages hold, stored or not, however they are cut."""
+"""Transforms: the same however they are cut or stored, and whose hold at which time."""
 
 from __future__ import annotations
 
+import gc
 import math
+import weakref
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory import queries
+from ros2_memory.analysis.frames import static_at
+from ros2_memory.bag_dir.handover_file import Handover, write_handover
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
-from ros2_memory.history.transforms import frames_over, sessions_of
-from ros2_memory.history.view import View
-from tests.support.bags import Msg, tf, transform, write_mcap
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, unix_from_ns
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.transforms import frames_over
+from ros2_memory.history.view import AtTime, TimeRange, View
+from ros2_memory.insights.recap import recap
+from ros2_memory.insights.sightings import find_matches
+from ros2_memory.places.visits import visits
+from ros2_memory.queries import frames, value_when
+from tests.support.bags import (
+    Msg,
+    boolean,
+    detections,
+    odom,
+    tf,
+    transform,
+    write_mcap,
+    write_splits,
+)
 from tests.support.column_worlds import World
 from tests.support.examples import examples
+from tests.support.memories import each_way, memory_of
+from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from ros2_memory.history.sessions import Session
 
 S = 10**9
@@ -57,11 +83,11 @@ def world(folder: Path, cuts: list[int]) -> World:
 
 
 def session_of(view: View) -> Session:
-    [session] = {sessions_of(view).of(path) for path in view.snapshot.timeline.recordings("/tf")}
+    [session] = {view.sessions.of(path) for path in view.snapshot.timeline.recordings("/tf")}
     return session
 
 
-@settings(max_examples=examples(15), deadline=None)
+@settings(max_examples=examples(15))
 @given(cuts=st.lists(st.integers(26, SECONDS - 1), max_size=4), stored=st.booleans())
 def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
     cuts: list[int], stored: bool
@@ -80,3 +106,349 @@ def test_frames_are_the_same_however_a_history_is_cut_and_whatever_is_stored(
             assert poses.valid.all()
             found.append(np.stack([*poses.translation, *poses.rotation]))
     assert (found[0] == found[1]).all()
+
+
+def asked(reader: NotingReader, topic: str) -> set[str]:
+    return {path.name for path, topics in reader.asked if topic in topics}
+
+
+def static(second: int, child: str, x: float) -> Msg:
+    at = T0 + second * S
+    return tf(at, transform(at, "base_link", child, (x, 0.0, 0.0)), topic="/tf_static")
+
+
+def bag(folder: Path, number: int, messages: Sequence[Msg]) -> None:
+    write_mcap(folder / "rec" / f"rec_{number}.mcap", messages)
+
+
+@settings(max_examples=examples(30))
+@given(
+    received=st.lists(
+        st.tuples(st.sampled_from(["arm", "/arm", "eye"]), st.integers(0, 2)),
+        min_size=1,
+        max_size=12,
+    ),
+    at=st.integers(-1, 13),
+)
+def test_a_static_transform_is_the_newest_of_its_child_however_often_it_was_repeated(
+    received: list[tuple[str, int]], at: int
+) -> None:
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        for second, (child, x) in enumerate(received):
+            bag(folder, second, [static(second, child, float(x))])
+        view = View(memory_of(folder), Call())
+        [session] = view.sessions.recorded_at(T0) or []
+        found = static_at(view.sessions.static(session), T0 + at * S - AT_OR_BEFORE_SLACK_NS)
+    expected: dict[str, float] = {}
+    for second, (child, x) in enumerate(received):
+        if second <= at or child.lstrip("/") not in expected:
+            expected[child.lstrip("/")] = float(x)
+    assert {each.child.lstrip("/"): each.transform.translation[0] for each in found} == expected
+
+
+def test_a_view_is_freed_with_its_call_without_the_garbage_collector(tmp_path: Path) -> None:
+    bag(tmp_path, 0, [static(0, "eye", 1.0)])
+    gc.disable()
+    try:
+        view = View(memory_of(tmp_path), Call())
+        assert view.sessions.recorded_at(T0)
+        known = weakref.ref(view)
+        del view
+        assert known() is None
+    finally:
+        gc.enable()
+
+
+def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) -> None:
+    for second in range(3):
+        bag(tmp_path, second, [static(second, "eye", 1.0)])
+    reader = NotingReader()
+    memory = memory_of(tmp_path, reader=reader)
+    moment = AtTime(T0 / 1e9 + 2.5)
+
+    def place() -> float:
+        return queries.transform(memory, Call(), "base_link", "eye", moment).transform.translation[
+            0
+        ]
+
+    assert place() == 1.0
+    assert asked(reader, "/tf_static") == {"rec_0.mcap", "rec_1.mcap", "rec_2.mcap"}
+    reader.asked.clear()
+    assert place() == 1.0
+    assert asked(reader, "/tf_static") == set()
+    bag(tmp_path, 3, [static(2, "eye", 2.0)])
+    assert place() == 2.0
+
+
+@each_way
+def test_transforms_that_cannot_be_decoded_are_named_each_time(
+    tmp_path: Path, recalls: bool
+) -> None:
+    moved = [
+        tf(T0 + n * S // 10, transform(T0 + n * S // 10, "odom", "base_link", (0.1 * n, 0.0, 0.0)))
+        for n in range(100)
+    ]
+    moved[50] = replace(moved[50], body=b"\0\1\0\0\1")
+    bag(tmp_path, 0, [*moved, *(odom(T0 + n * S // 10, 0.1 * n, 0.0) for n in range(100))])
+    memory = memory_of(tmp_path, recalls=recalls)
+    for _ in range(2):
+        notes = recap(memory, Call(), TimeRange(start_s=T0 / 1e9, end_s=T0 / 1e9 + 9)).notes
+        assert any("messages of /tf could not be decoded" in note for note in notes)
+
+
+def test_where_no_transform_leads_to_the_map_a_sighting_reads_those_around_it_alone(
+    tmp_path: Path,
+) -> None:
+    for minute in range(20):
+        at = T0 + minute * 60 * S
+        messages = [tf(at, transform(at, "odom", "other", (1.0, 0.0, 0.0)))]
+        messages += [detections(at, ["cup"])] if minute == 10 else []
+        bag(tmp_path, minute, messages)
+    reader = NotingReader()
+    answer = find_matches(
+        memory_of(tmp_path, reader=reader), Call(), "/vision/scene/scene_objects", "contains", "cup"
+    )
+    [sighting] = answer.sightings
+    assert sighting.thing is not None
+    assert sighting.thing.frame_id == "base_link"
+    assert asked(reader, "/tf") == {"rec_10.mcap"}
+
+
+DAY = 86_400 * S
+
+
+def fixed(at: int, parent: str, child: str, x: float) -> Msg:
+    return tf(at, transform(at, parent, child, (x, 0.0, 0.0)), topic="/tf_static")
+
+
+def moving(begin: int, seconds: int, parent: str, child: str, x: float, mps: float) -> list[Msg]:
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [
+        tf(at, transform(at, parent, child, (x + mps * (at - begin) / S, 0.0, 0.0))) for at in ticks
+    ]
+
+
+def drive(begin: int, seconds: int, mps: float = 0.5) -> list[Msg]:
+    """Odometry along x from 0."""
+    ticks = [begin + nth * S // 5 for nth in range(seconds * 5 + 1)]
+    return [odom(at, mps * (at - begin) / S, 0.0, 0.0) for at in ticks]
+
+
+def record(folder: Path, messages: list[Msg], split_s: int = 10) -> None:
+    write_splits(folder.parent, messages, split_s, folder.name)
+
+
+def arrivals(memory: Memory, x: float, radius: float = 0.3) -> list[float]:
+    """Arrivals in whole seconds after T0, newest first."""
+    found = visits(memory, Call(), x, 0.0, radius_m=radius)
+    assert found.frame_id == "map"
+    return [round(((each.arrived or 0) - T0) / S, 1) for each in found.visits]
+
+
+def two_robots(root: Path, static_at: int, moving_at: int) -> None:
+    """One whose map is 100 m off its odometry for ever; and one that slips in its odometry."""
+    first = drive(static_at + 1, 20, 0.4)  # else the first messages of both are one
+    record(root / "nav2", [fixed(static_at, "map", "odom", 100.0), *first])
+    record(root / "boat", [*moving(moving_at, 20, "map", "odom", 5.0, -0.5), *drive(moving_at, 20)])
+
+
+@each_way
+@pytest.mark.parametrize("nav2_days", [-3, 3, 0])
+def test_a_place_in_the_map_is_one_by_the_transforms_of_the_own_recording(
+    tmp_path: Path, nav2_days: int, recalls: bool
+) -> None:
+    """The boat stands at 5 m of its map throughout; the other robot drives from 100 m to 110."""
+    apart = nav2_days * DAY
+    two_robots(tmp_path, T0 + apart, T0)
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert arrivals(memory, 5.0) == [0.0]
+    assert arrivals(memory, 103.0) == [round(apart / S + 6.8, 1)]
+    assert visits(memory, Call(), 3.0, 0.0, radius_m=0.3).visits == ()
+    assert visits(memory, Call(), 105.0, 0.0, radius_m=0.3).total == 1
+
+
+def test_another_robots_static_transform_places_nothing(tmp_path: Path) -> None:
+    """A boat without a map has no position in that of another robot."""
+    record(tmp_path / "nav2", [fixed(T0 - DAY, "map", "odom", 100.0), *drive(T0 - DAY, 20)])
+    record(tmp_path / "boat", [*moving(T0, 20, "odom", "base_link", 0.0, 0.5), *drive(T0, 20)])
+    memory = memory_of(tmp_path)
+    assert arrivals(memory, 103.0) == [round(-DAY / S + 5.4, 1)]
+    with pytest.raises(NoDataError):
+        queries.transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(T0 + 5 * S)))
+
+
+def x_of(memory: Memory, at: int, parent: str = "map", child: str = "odom") -> float:
+    found = queries.transform(memory, Call(), parent, child, AtTime(unix_from_ns(at)))
+    return round(found.transform.translation[0], 3)
+
+
+def test_a_note_names_the_recording_that_answers_and_none_that_is_not_there(tmp_path: Path) -> None:
+    first, second = "rec_20260714T000000Z", "rec_20260714T000001Z"
+    for name, x in ((first, 100.0), (second, 500.0)):
+        record(tmp_path / name, [fixed(T0, "map", "odom", x), *drive(T0, 20)])
+    memory = memory_of(tmp_path)
+    found = queries.transform(memory, Call(), "map", "odom", AtTime(unix_from_ns(T0 + 4 * S)))
+    named = {100.0: first, 500.0: second}[found.transform.translation[0]]
+    [note] = [note for note in found.notes if "2 sessions" in note]
+    assert note.endswith(f"this is that of {named}")
+
+
+@each_way
+def test_a_static_transform_that_changes_holds_from_then_on(tmp_path: Path, recalls: bool) -> None:
+    """Also inside one bag: the robot is placed anew while it stands."""
+    poses = [odom(T0 + nth * S // 5, 0.0, 0.0, 0.0) for nth in range(100)]
+    changed = [fixed(T0, "map", "odom", 0.0), fixed(T0 + 8 * S, "map", "odom", 50.0)]
+    record(tmp_path / "one", [*changed, *poses], split_s=60)
+    memory = memory_of(tmp_path, recalls=recalls)
+    there, later = (visits(memory, Call(), x, 0.0, radius_m=1.0).visits for x in (0.0, 50.0))
+    assert [((each.arrived or 0) - T0, (each.departed or 0) - T0) for each in there] == [
+        (0, 39 * S // 5)
+    ]
+    assert [((each.arrived or 0) - T0, (each.departed or 0) - T0) for each in later] == [
+        (8 * S, 99 * S // 5)
+    ]
+
+
+@each_way
+def test_recordings_joined_by_a_handover_share_their_transforms(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """A publisher that has gone is not heard by the recording that took over."""
+    first, second = tmp_path / "rec_20260714T000000Z", tmp_path / "rec_20260714T010000Z"
+    record(first, [fixed(T0, "map", "odom", 7.0), *drive(T0, 20)])
+    record(second, [fixed(T0 + 21 * S, "base_link", "laser", 1.0), *drive(T0 + 21 * S, 20)])
+    memory = memory_of(tmp_path, recalls=recalls)
+    with pytest.raises(NoDataError):
+        x_of(memory, T0 + 33 * S)
+    write_handover(first, Handover(next=second.name))
+    write_handover(second, Handover(previous=first.name))
+    memory = memory_of(tmp_path, recalls=recalls)
+    assert x_of(memory, T0 + 33 * S) == 7.0
+    assert arrivals(memory, 12.0) == [pytest.approx(30.6, abs=0.3), pytest.approx(9.6, abs=0.3)]
+
+
+@each_way
+def test_two_recorders_of_one_robot_complete_each_other(tmp_path: Path, recalls: bool) -> None:
+    """One records what moves, one what is static, one neither."""
+    record(tmp_path / "fixed", [fixed(T0, "map", "odom", 7.0)])
+    record(tmp_path / "moving", moving(T0, 20, "odom", "base_link", 0.0, 0.5))
+    record(tmp_path / "sensors", drive(T0, 20))
+    memory = memory_of(tmp_path, recalls=recalls)
+    at = AtTime(unix_from_ns(T0 + 4 * S))
+    joined = queries.transform(memory, Call(), "map", "base_link", at)
+    assert joined.transform.translation[0] == pytest.approx(9.0)
+    assert [note for note in joined.notes if "fixed and moving are combined" in note]
+    alone = queries.transform(memory, Call(), "odom", "base_link", at)
+    assert alone.notes == ()
+    assert arrivals(memory, 9.0) == [pytest.approx(3.4, abs=0.21)]
+    [note] = visits(memory, Call(), 9.0, 0.0, radius_m=0.3).notes[:1]
+    assert note.startswith("sensors is placed by transforms of another recording")
+    assert note.endswith("those of fixed and moving")
+
+
+@each_way
+@pytest.mark.parametrize("apart_s", [0, 30, 3600, 86_400, -86_400])
+def test_a_loan_is_never_silent_and_a_recording_of_another_time_lends_nothing(
+    tmp_path: Path, apart_s: int, recalls: bool
+) -> None:
+    """Whether `nav2` is the same robot cannot be known; a day apart it is another."""
+    base = moving(T0, 60, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "nav2", [fixed(T0, "map", "odom", 100.0), *base])
+    record(tmp_path / "boat", drive(T0 + apart_s * S, 60))
+    memory = memory_of(tmp_path, recalls=recalls)
+    answer = visits(memory, Call(), 105.0, 0.0)
+    notes = [note for note in answer.notes if "boat" in note and "those of nav2" in note]
+    lends = apart_s in {0, 30}
+    assert (answer.total, len(notes)) == (int(lends), int(lends))
+    assert visits(memory, Call(), 5.0, 0.0).frame_id == ("map" if lends else "odom")
+
+
+@pytest.mark.parametrize("has_tf", [False, True])
+def test_a_robot_beside_it_that_has_poses_of_its_own_lends_nothing(
+    tmp_path: Path, has_tf: bool
+) -> None:
+    """A boat without a map was nowhere in that of the other robot, and a note says so."""
+    record(tmp_path / "nav2", [fixed(T0, "map", "odom", 100.0), *drive(T0, 20, 0.0)])
+    base = moving(T0, 20, "odom", "base_link", 0.0, 0.5) if has_tf else []
+    record(tmp_path / "boat", [*base, *drive(T0, 20)])
+    memory = memory_of(tmp_path)
+    answer = visits(memory, Call(), 105.0, 0.0)
+    assert (answer.frame_id, answer.total) == ("map", 0)
+    assert visits(memory, Call(), 100.0, 0.0).total == 1
+    if has_tf:
+        with pytest.raises(NoDataError):
+            x_of(memory, T0 + 4 * S, "map", "base_link")
+    else:
+        assert [note for note in answer.notes if "boat has no transforms" in note]
+
+
+@each_way
+def test_a_thing_and_who_saw_it_are_placed_by_the_recording_of_the_sighting(
+    tmp_path: Path, recalls: bool
+) -> None:
+    """Two robots of one time: the sighting is of the one that stands, though the other is newer."""
+    record(
+        tmp_path / "nav2",
+        [
+            fixed(T0, "map", "odom", 100.0),
+            *moving(T0, 20, "odom", "base_link", 2.0, 0.0),
+            *[odom(T0 + nth * S, 2.0, 0.0, 0.0) for nth in range(20)],
+            detections(T0 + 4 * S + S // 2, ["scissors"]),
+        ],
+    )
+    boat = moving(T0, 20, "map", "odom", 5.0, -0.5)
+    boat += moving(T0, 20, "odom", "base_link", 0.0, 0.5)
+    record(tmp_path / "boat", [*boat, *drive(T0, 20)])
+    memory = memory_of(tmp_path, recalls=recalls)
+    topic = detections(T0, []).topic
+    [found] = find_matches(memory, Call(), topic, "contains", "scissors").sightings
+    assert found.thing is not None
+    assert found.thing.frame_id == "map"
+    assert found.thing.position[0] == pytest.approx(103.0)
+    assert found.robot is not None
+    assert found.robot.frame_id == "map"
+    assert found.robot.position[0] == pytest.approx(102.0)
+
+
+def two_at_once(root: Path) -> None:
+    """Two robots of one time on the same topics: r1 drives 20 m, r2 stands at 50 m and bumps."""
+    ticks = [T0 + nth * S // 5 for nth in range(101)]
+    bumps = [boolean(at + 1, False) for at in ticks]
+    record(root / "r1", [*drive(T0, 20, 1.0), *bumps])
+    bumps = [boolean(at + 2, at == ticks[50]) for at in ticks]
+    record(root / "r2", [*[odom(at + S // 10, 50.0, 0.0, 0.0) for at in ticks], *bumps])
+
+
+def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
+    two_at_once(tmp_path)
+    memory = memory_of(tmp_path)
+    reply = value_when(
+        memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
+    )
+    assert reply.value is not None
+    assert reply.value.sample.time == T0 + 49 * S // 5 + S // 10
+    assert [note for note in reply.notes if "/bumper" in note and note.endswith(": r1, r2")]
+    assert not [note for note in reply.notes if "the match is of" in note]
+
+
+def test_a_value_of_another_recording_than_the_match_is_noted(tmp_path: Path) -> None:
+    record(tmp_path / "r1", [boolean(T0 + 4 * S + 1, True)])
+    record(tmp_path / "r2", drive(T0, 20))
+    memory = memory_of(tmp_path)
+    reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
+    assert reply.value is not None
+    assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
+
+
+def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
+    """Neither listed, nor a reason to advise another time."""
+    nameless = moving(T0, 20, "", "base_link", 0.0, 0.0)
+    record(tmp_path / "one", [*nameless, *moving(T0, 20, "odom", "wheel", 0.0, 0.0)])
+    memory = memory_of(tmp_path)
+    found = frames(memory, Call())
+    assert [(edge.parent, edge.child) for edge in found.edges] == [("odom", "wheel")]
+    assert [note for note in found.notes if "no name" in note and note.endswith("1")]
+    with pytest.raises(NoDataError) as refused:
+        x_of(memory, T0 + 300 * S, "", "base_link")
+    assert "ask about then" not in refused.value.detail

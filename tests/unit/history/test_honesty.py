@@ -71,6 +71,9 @@ def at(second: float) -> float:
     return T0_S + second
 
 
+FULL: dict[str, Any] = {"start": at(0), "end": at(29)}
+NEAR: dict[str, Any] = {"topic": "/odom", "condition_type": "near_position"}
+SCISSORS: dict[str, Any] = {"condition_type": "contains", "value": "scissors"}
 SEEN = {"topic": "/vision/*", "condition_type": "contains", "value": "cup"}
 TOUCHING: list[tuple[str, dict[str, Any]]] = [
     ("get_topic_at_time", {"topic": "/odom", "timestamp": at(15), "tolerance_s": 30}),
@@ -79,33 +82,18 @@ TOUCHING: list[tuple[str, dict[str, Any]]] = [
     ("get_velocity_at", {"timestamp": at(15)}),
     ("get_transform_at", {"parent": "odom", "child": "base_link", "timestamp": at(12)}),
     ("get_transform_at", {"parent": "odom", "child": "nobody", "timestamp": at(15)}),
-    ("trajectory_summary", {"start": at(0), "end": at(29)}),
+    ("trajectory_summary", FULL),
     ("get_topic_in_range", {"topic": "/odom", "start": at(12), "end": at(15)}),
     ("list_frames", {}),
-    (
-        "find_last_match",
-        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 0.3, "y": 0}},
-    ),
-    (
-        "find_last_match",
-        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 500, "y": 0}},
-    ),
-    (
-        "find_last_match",
-        {
-            "topic": "/vision/*",
-            "condition_type": "contains",
-            "value": "scissors",
-            "before": at(19),
-        },
-    ),
+    ("find_last_match", {**NEAR, "value": {"x": 0.3, "y": 0}}),
+    ("find_last_match", {**NEAR, "value": {"x": 500, "y": 0}}),
+    ("find_last_match", {"topic": "/vision/*", **SCISSORS, "before": at(19)}),
     (
         "get_value_when",
         {
             "value_topic": "/odom",
             "condition_topic": "/vision/scene/scene_objects",
-            "condition_type": "contains",
-            "value": "scissors",
+            **SCISSORS,
         },
     ),
     ("get_topic_at_time", {"topic": "/nowhere", "timestamp": at(5)}),
@@ -114,12 +102,12 @@ TOUCHING: list[tuple[str, dict[str, Any]]] = [
     ("find_matches", SEEN),
     ("find_matches", {**SEEN, "by": "day"}),
     ("find_matches", {**SEEN, "by": "label"}),
-    ("get_topic_in_range", {"topic": "/bumper", "start": at(0), "end": at(29), "changes": True}),
-    ("get_topic_in_range", {"topic": "/bumper", "start": at(0), "end": at(29), "by": "value"}),
-    ("trajectory_summary", {"start": at(0), "end": at(29), "by": "hour"}),
+    ("get_topic_in_range", {"topic": "/bumper", **FULL, "changes": True}),
+    ("get_topic_in_range", {"topic": "/bumper", **FULL, "by": "value"}),
+    ("trajectory_summary", {**FULL, "by": "hour"}),
     ("visits", {"x": 500, "y": 0}),
-    ("visits", {"x": 0.5, "y": 0, "by": "day", "start": at(0), "end": at(29)}),
-    ("recap", {"start": at(0), "end": at(29)}),
+    ("visits", {"x": 0.5, "y": 0, "by": "day", **FULL}),
+    ("recap", FULL),
     ("recap", {"around": at(25)}),
     ("compare", {"start": at(12), "end": at(29), "with_start": at(0), "with_end": at(9)}),
 ]
@@ -132,15 +120,11 @@ APART: list[tuple[str, dict[str, Any]]] = [
     ("find_things", {"end": at(9)}),
     ("find_things", {"label": "dog", "start": at(21)}),
     ("compare", {"start": at(21), "end": at(29), "with_start": at(0), "with_end": at(8)}),
-    (
-        "find_last_match",
-        {"topic": "/odom", "condition_type": "near_position", "value": {"x": 2.5, "y": 0}},
-    ),
+    ("find_last_match", {**NEAR, "value": {"x": 2.5, "y": 0}}),
     (
         "find_last_match",
         {
-            "topic": "/odom",
-            "condition_type": "near_position",
+            **NEAR,
             "value": {"x": 500, "y": 0},
             "before": at(8),
         },

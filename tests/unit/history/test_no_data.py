@@ -1,29 +1,33 @@
-"""What an answer says must hold: of which time it speaks, how far off, and what would help."""
+"""What an answer says must hold: of which time it speaks, how far off, and what would help.
+
+A window in which nothing was recorded has no answer: "never" and "none" would be false.
+"""
 
 from __future__ import annotations
 
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from ros2_memory import queries
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.model import Transform
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Call, QuerySettings
+from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.coverage import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
 from ros2_memory.tools.reply_json import as_json
-from tests.support.bags import boolean, odom, text, tf, transform, write_mcap
-from tests.support.memories import memory_of, with_store
+from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
     from pathlib import Path
 
+S = 10**9
 T0_S = 1_784_023_200
-T0 = T0_S * NS_PER_S
+T0 = T0_S * S
 
 
 def after(seconds_later: float) -> AtTime:
@@ -33,7 +37,7 @@ def after(seconds_later: float) -> AtTime:
 def frames_that_part(bag_dir: Path) -> None:
     """`map` is known for ten seconds, `odom` for a minute."""
     messages = [
-        tf(T0 + tick * NS_PER_S // 2, transform(T0 + tick * NS_PER_S // 2, *pair, (tick, 0.0, 0.0)))
+        tf(T0 + tick * S // 2, transform(T0 + tick * S // 2, *pair, (tick, 0.0, 0.0)))
         for tick in range(120)
         for pair in [("map", "odom"), ("odom", "base_link")]
         if tick <= 20 or pair[0] == "odom"
@@ -65,7 +69,7 @@ def test_a_frame_that_is_reported_within_an_hour_is_not_unknown_but_silent(
     tmp_path: Path, parent: str, child: str, later: float, reason: NoDataReason
 ) -> None:
     frames_that_part(tmp_path)
-    at = T0 + 3 * 3600 * NS_PER_S + 50 * NS_PER_S
+    at = T0 + 3 * 3600 * S + 50 * S
     moved = [tf(at, transform(at, "odom", "base_link", (0.0, 0.0, 0.0)))]
     write_mcap(tmp_path / "late" / "late_0.mcap", moved)
     plain = memory_of(tmp_path)
@@ -107,11 +111,11 @@ def test_of_the_two_quaternions_of_a_rotation_the_one_with_positive_w_is_reporte
     [(0.0493, "0.0493 s"), (2.0, "2 s"), (99.96, "100 s"), (515_219.9, "515220 s")],
 )
 def test_a_duration_is_reported_without_powers_of_ten(length_s: float, reply: str) -> None:
-    assert seconds(round(length_s * NS_PER_S)) == reply
+    assert seconds(round(length_s * S)) == reply
 
 
 def test_no_tolerance_is_advised_for_a_message_of_another_day(tmp_path: Path) -> None:
-    messages = [boolean(T0, True), text(T0 + 80_000 * NS_PER_S, "late")]
+    messages = [boolean(T0, True), text(T0 + 80_000 * S, "late")]
     write_mcap(tmp_path / "run" / "run_0.mcap", messages)
     with pytest.raises(NoDataError) as caught:
         queries.topic_value(memory_of(tmp_path), Call(), "/bumper", after(80_000))
@@ -120,7 +124,7 @@ def test_no_tolerance_is_advised_for_a_message_of_another_day(tmp_path: Path) ->
 
 @pytest.mark.parametrize("older_s", [12.631, 59.891])
 def test_the_tolerance_that_is_advised_finds_the_message(tmp_path: Path, older_s: float) -> None:
-    messages = [boolean(T0, True), text(T0 + round(older_s * NS_PER_S), "late")]
+    messages = [boolean(T0, True), text(T0 + round(older_s * S), "late")]
     write_mcap(tmp_path / "run" / "run_0.mcap", messages)
     memory = memory_of(tmp_path)
     with pytest.raises(NoDataError) as caught:
@@ -140,9 +144,9 @@ def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robo
     """Years apart: what the recording of that time has is named, and where to look in it."""
     names = ("robin", "wren") if loose else ("robin/robin_0", "wren/wren_0")
     year = 365 * 86_400
-    own = [odom(T0 + n * NS_PER_S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
+    own = [odom(T0 + n * S, 0.0, 0.0, topic="/base/odometry") for n in range(10)]
     write_mcap(tmp_path / f"{names[0]}.mcap", [*own, text(T0, "one")])
-    write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * NS_PER_S, 0.0, 0.0)])
+    write_mcap(tmp_path / f"{names[1]}.mcap", [odom(T0 + year * S, 0.0, 0.0)])
     memory = memory_of(tmp_path)
     with pytest.raises(NoDataError) as caught:
         queries.position(memory, Call(), after(5))
@@ -158,8 +162,8 @@ def test_of_several_robots_in_one_folder_the_nearest_message_is_not_another_robo
 
 
 def test_a_topic_that_a_recording_lacks_is_near_in_the_next_one(tmp_path: Path) -> None:
-    write_mcap(tmp_path / "one" / "one_0.mcap", [text(T0, "a"), text(T0 + 9 * NS_PER_S, "b")])
-    write_mcap(tmp_path / "two" / "two_0.mcap", [odom(T0 + 20 * NS_PER_S, 0.0, 0.0)])
+    write_mcap(tmp_path / "one" / "one_0.mcap", [text(T0, "a"), text(T0 + 9 * S, "b")])
+    write_mcap(tmp_path / "two" / "two_0.mcap", [odom(T0 + 20 * S, 0.0, 0.0)])
     with pytest.raises(NoDataError) as caught:
         queries.position(memory_of(tmp_path), Call(), after(5))
     assert "the recording of that time, one, has no such topic" in caught.value.detail
@@ -170,3 +174,90 @@ def test_what_never_had_a_message_before_a_time_is_reported_in_words(tmp_path: P
     frames_that_part(tmp_path)
     with pytest.raises(NoDataError, match=f"no message of /tf within 10 s of {T0_S - 100}"):
         queries.transform(memory_of(tmp_path), Call(), "odom", "base_link", after(-100))
+
+
+TRUE = {"topic": "/bumper", "condition_type": "equals", "value": True}
+WINDOWED: dict[str, dict[str, Any]] = {
+    "find_matches": TRUE,
+    "find_things": {},
+    "visits": {"x": 1, "y": 0},
+    "trajectory_summary": {},
+    "get_topic_in_range": {"topic": "/odom"},
+}
+BEFORE: dict[str, dict[str, Any]] = {
+    "find_last_match": TRUE,
+    "get_value_when": {
+        "value_topic": "/odom",
+        "condition_topic": "/bumper",
+        "condition_type": "equals",
+        "value": True,
+    },
+}
+NOTHING = [((-50, -20), "outside_range"), ((70, 90), "gap"), ((160, 190), "outside_range")]
+"""Seconds after the begin; recorded are 0 to 39 and 140 to 149."""
+
+
+@pytest.fixture(scope="module")
+def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gap")
+    for name, driven in (("a", range(40)), ("b", range(140, 150))):
+        messages = [odom(T0 + at * S, 0.1 * at, 0.0) for at in driven]
+        begin = T0 + driven[0] * S
+        messages += [boolean(begin, True), detections(begin, ["cup"])]
+        messages.append(log_entry(begin, 40, "motor", "too hot"))
+        write_mcap(folder / name / f"{name}_0.mcap", messages)
+    return folder
+
+
+@pytest.fixture(scope="module", params=[False, True], ids=["plain", "catalogue"])
+def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
+    found = memory_of(bag_dir, clock=FixedClock(T0 + 200 * S), limits=QuerySettings())
+    return with_store(found, bag_dir) if request.param else found
+
+
+@pytest.mark.parametrize(("window", "reason"), NOTHING)
+@pytest.mark.parametrize("tool", WINDOWED)
+def test_a_window_without_recording_is_not_answered_as_never(
+    memory: Memory, bag_dir: Path, tool: str, window: tuple[int, int], reason: str
+) -> None:
+    start, end = (T0_S + each for each in window)
+    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=start, end=end)
+    assert (told["error"], told["reason"]) == ("no_data", reason)
+    assert "the memory covers" in told["detail"]
+
+
+@pytest.mark.parametrize("tool", BEFORE)
+def test_never_before_the_memory_began_is_no_data(memory: Memory, bag_dir: Path, tool: str) -> None:
+    told = asked(memory, bag_dir, tool, **BEFORE[tool], before=T0_S - 1)
+    assert (told["error"], told["reason"]) == ("no_data", "outside_range")
+    found = asked(memory, bag_dir, tool, **BEFORE[tool], before=T0_S + 90)
+    assert found["timestamp"] == T0_S
+    never = BEFORE[tool] | {"value": False}
+    assert asked(memory, bag_dir, tool, **never) is None
+
+
+@pytest.mark.parametrize("tool", WINDOWED)
+def test_a_window_that_is_recorded_in_part_says_how_much(
+    memory: Memory, bag_dir: Path, tool: str
+) -> None:
+    told = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 149)
+    window = f"between {T0_S}.000000 and {T0_S + 149}.000000"
+    assert f"recorded only 48 of 149 s {window}" in told["notes"]
+    whole = asked(memory, bag_dir, tool, **WINDOWED[tool], start=T0_S, end=T0_S + 39)
+    assert not any("recorded" in note for note in whole.get("notes", ()))
+
+
+@pytest.mark.parametrize("window", [each for each, _ in NOTHING])
+def test_recap_and_compare_say_first_that_nothing_was_recorded(
+    memory: Memory, bag_dir: Path, window: tuple[int, int]
+) -> None:
+    start, end = (T0_S + each for each in window)
+    note = f"nothing was recorded between {start}.000000 and {end}.000000"
+    assert asked(memory, bag_dir, "recap", start=start, end=end)["notes"][0] == note
+    other = {"with_start": T0_S, "with_end": T0_S + 30}
+    reply = asked(memory, bag_dir, "compare", start=start, end=end, **other)
+    assert reply["notes"][0] == note
+    assert "things are not compared: there is nothing to compare them with" in reply["notes"]
+    assert (reply["things"], reply["things_unchanged"]) == ({}, 0)
+    [error] = reply["errors"].values()
+    assert (error["this"], error["with"]) == (None, 1)

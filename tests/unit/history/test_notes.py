@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import sqlite3
 from contextlib import closing
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import Writer
 
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import Reason
+from ros2_memory.history.coverage import unread_spans
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.index.timeline import Timeline
 from tests.support.bags import McapLayout, Msg, boolean, detections, write_db3, write_mcap
 from tests.support.mcap_surgery import spoil_chunk
 from tests.support.memories import asked, each_way, memory_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
+from tests.support.moving_map import BEGIN, write_moving_map
 
 S = 10**9
 T0_S = 1_784_000_000
@@ -181,3 +184,134 @@ def test_one_sentence_counts_all_things_and_names_a_few(things: dict[str, str]) 
     else:
         assert told.startswith(f"of {len(things)} bags are torn: ")
         assert len(told) < 700
+
+
+DAY = 24 * 3600 * S
+
+
+def split(
+    number: int, *, state: BagState = BagState.CLOSED, notes: tuple[str, ...] = ()
+) -> BagFile:
+    start, end = T0 + number * 10 * S, T0 + number * 10 * S + 9 * S
+    topics = (TopicSummary("/odom", "nav_msgs/msg/Odometry", "cdr", 2, start, end),)
+    summary = BagSummary(topics, notes=notes)
+    return BagFile(f"/b/rec/rec_{number}.mcap", 1, end, state, summary, start, end)
+
+
+def torn(number: int, written: int | None = T0 + DAY, folder: str = "rec") -> SetAside:
+    return SetAside(Path(f"/b/{folder}/{folder}_{number}.mcap"), "torn", written)
+
+
+def sentences(snapshot: Snapshot, start: float, stop: float, *, nothing: bool = False) -> list[str]:
+    window = TimeWindow(T0 + round(start * S), T0 + round(stop * S))
+    odd = snapshot.timeline.faulty(window)
+    return list(unread_spans(snapshot, window, nothing=nothing, absent=(), odd=odd))
+
+
+def test_a_file_of_which_the_time_is_unknown_is_reported_where_nothing_was_found() -> None:
+    snapshot = Snapshot(
+        Timeline.of((split(0),)), damaged=(torn(7, None, "alone"),), scanned_at=T0 + DAY
+    )
+    assert sentences(snapshot, 0, 9) == []
+    assert sentences(snapshot, 0, 9, nothing=True) == [
+        "1 bag file could not be read and may hold more: alone/alone_7.mcap (torn)"
+    ]
+
+
+def test_many_files_are_counted_and_the_last_ones_named() -> None:
+    lost = tuple(torn(number) for number in range(1, 9))
+    snapshot = Snapshot(Timeline.of((split(0), split(9))), damaged=lost, scanned_at=T0 + DAY)
+    assert sentences(snapshot, 0, 100) == [
+        (
+            "8 bag files could not be read and may hold more: rec/rec_6.mcap (torn), "
+            "rec/rec_7.mcap (torn), rec/rec_8.mcap (torn) and 5 more"
+        )
+    ]
+
+
+def test_beside_an_answer_that_there_is_nothing_each_file_is_named_that_may_hold_it() -> None:
+    active = SetAside(Path("/b/copied/copied_0.db3"), "still being written")
+    timeline = Timeline.of((split(0), split(1)))
+    snapshot = Snapshot(timeline, active=(active,), scanned_at=T0 + 3 * DAY)
+    assert sentences(snapshot, 0, 9) == []
+    named = ["still being written and not included: copied/copied_0.db3"]
+    assert sentences(snapshot, 0, 9, nothing=True) == named
+
+
+def test_of_closed_bags_that_are_odd_in_many_ways_the_newest_are_reported() -> None:
+    odd = [split(number, notes=(f"way {number}",)) for number in range(5)]
+    snapshot = Snapshot(Timeline.of(tuple(odd)), scanned_at=T0 + DAY)
+    assert sentences(snapshot, 0, 60) == [
+        "rec/rec_2.mcap: way 2",
+        "rec/rec_3.mcap: way 3",
+        "rec/rec_4.mcap: way 4",
+        "2 older bags are odd too",
+    ]
+
+
+@given(
+    lost=st.sets(st.integers(0, 40), max_size=30),
+    reason=st.text(min_size=1, max_size=3000),
+    window=st.tuples(st.integers(-100, 500), st.integers(-100, 500)),
+    nothing=st.booleans(),
+)
+def test_what_is_reported_stays_short_however_much_was_lost(
+    lost: set[int], reason: str, window: tuple[int, int], nothing: bool
+) -> None:
+    asides = tuple(SetAside(Path(f"/b/rec/rec_{n}.mcap"), reason, T0) for n in sorted(lost))
+    bags = tuple(split(n, notes=(reason,)) for n in range(41) if n not in lost)
+    snapshot = Snapshot(Timeline.of(bags), damaged=asides, scanned_at=T0 + DAY)
+    told = sentences(snapshot, *sorted(window), nothing=nothing)
+    assert len(told) <= 5
+    assert sum(map(len, told)) < 2000
+
+
+_BEGIN_S = BEGIN // S
+
+
+def within(start: int, end: int) -> dict[str, int]:
+    return {"start": _BEGIN_S + start, "end": _BEGIN_S + end}
+
+
+@pytest.fixture(scope="module")
+def damaged(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two minutes in splits of 10 s; chunks of the second and the last but three are damaged."""
+    folder = tmp_path_factory.mktemp("damaged")
+    write_moving_map(folder, 3)
+    for number in (1, 8):
+        (split,) = folder.rglob(f"*_{number}.mcap")
+        data = bytearray(split.read_bytes())
+        for at in range(len(data) // 3, len(data) // 3 + 60):
+            data[at] ^= 0xFF
+        split.write_bytes(data)
+    return folder
+
+
+_ABOVE = {"topic": "/odom", "field": "position.x", "condition_type": "above", "value": 1.0}
+_COMPARED = {"with_start": _BEGIN_S + 40, "with_end": _BEGIN_S + 50}
+
+
+@pytest.mark.parametrize(
+    ("tool", "given"),
+    [
+        ("visits", {"x": 4.0, "y": 0.0, "radius_m": 1.0}),
+        ("find_things", {}),
+        ("recap", {}),
+        ("compare", _COMPARED),
+        ("trajectory_summary", {"frame_id": "map"}),
+        ("find_matches", _ABOVE),
+        ("get_topic_in_range", {"topic": "/odom"}),
+    ],
+)
+def test_a_reply_names_the_damage_of_its_window_alone(
+    damaged: Path, tool: str, given: dict[str, object]
+) -> None:
+    memory = memory_of(damaged)
+    reply = asked(memory, damaged, tool, **given, **within(50, 70))
+    assert "error" not in reply
+    assert not [note for note in reply.get("notes", ()) if "damaged" in note]
+    if tool not in {"visits", "trajectory_summary"}:  # of the stored path nothing is lost
+        reply = asked(memory, damaged, tool, **given, **within(50, 100))
+        (note,) = [note for note in reply["notes"] if "damaged" in note]
+        assert "rec_8.mcap" in note
+        assert "rec_1.mcap" not in note

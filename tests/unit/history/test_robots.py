@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.regions import Circle, Place
-from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.insights.status import memory_status
@@ -22,12 +21,14 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-T0 = 1_700_000_000 * NS_PER_S
+S = 10**9
+T0_S = 1_700_000_000
+T0 = T0_S * S
 
 
 def drive(x: float, *, begin: int = 0, delay: int = 0) -> list[Msg]:
     """A minute of poses; with a delay as another recorder received the same messages."""
-    stamps = [T0 + (begin + n) * NS_PER_S for n in range(61)]
+    stamps = [T0 + (begin + n) * S for n in range(61)]
     return [odom(at, x, n / 10, log_time=at + delay) for n, at in enumerate(stamps)]
 
 
@@ -42,6 +43,12 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, robot in enumerate(("red", "blue")):
         write_mcap(folder / robot / f"{robot}_0.mcap", drive(10.0 * number))
     return folder
+
+
+def driven(memory: Memory, start: int, stop: int) -> Any:
+    """The path from a second to another."""
+    span = {"start": T0_S + start, "end": T0_S + stop}
+    return asked(memory, memory.index.bag_dir, "trajectory_summary", **span)
 
 
 def differing(memory: Memory) -> list[tuple[tuple[str, str], str | None]]:
@@ -79,7 +86,7 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
     assert status["doubts"] == "the clock was set back between recordings (see notes)"
     (note,) = [note for note in status["notes"] if "one recorder made them" in note]
     assert ", ".join(sorted(names)) in note
-    path = asked(memory, tmp_path, "trajectory_summary", start=0, end=2 * T0 / NS_PER_S)
+    path = asked(memory, tmp_path, "trajectory_summary", start=0, end=2 * T0_S)
     assert path["distance_m"] == pytest.approx(6.0, abs=0.1)
     assert "as after a clock was set back" in str(path["notes"])
     visited = asked(memory, tmp_path, "visits", x=0.0, y=3.0, radius_m=1.0)
@@ -104,8 +111,8 @@ def test_what_one_recorder_made_one_after_the_other_is_of_one_robot(tmp_path: Pa
         ("get_topic_in_range", {"by": "hour", "fields": ["position.x"]}),
         ("find_last_match", {}),
         ("get_value_when", {}),
-        ("get_position_at", {"timestamp": T0 / NS_PER_S + 9}),
-        ("recap", {"start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 60}),
+        ("get_position_at", {"timestamp": T0_S + 9}),
+        ("recap", {"start": T0_S, "end": T0_S + 60}),
     ],
 )
 def test_answers_from_messages_of_both_robots_say_so(
@@ -117,7 +124,7 @@ def test_answers_from_messages_of_both_robots_say_so(
     if name == "get_value_when":
         asks = {"value_topic": "/odom", "condition_topic": "/odom", **condition}
     if name == "get_topic_in_range":
-        asks = {"topic": "/odom", "start": T0 / NS_PER_S, "end": T0 / NS_PER_S + 60, **asks}
+        asks = {"topic": "/odom", "start": T0_S, "end": T0_S + 60, **asks}
     answer = asked(memory_of(both), both, name, **asks)
     assert [
         note for note in answer["notes"] if re.search("as from several robots.*blue, red", note)
@@ -128,7 +135,7 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
     tmp_path: Path,
 ) -> None:
     for number, robot in enumerate(("red", "blue")):
-        said = [text(T0 + (60 * n + 30 * number) * NS_PER_S, f"{robot} {n}") for n in range(9)]
+        said = [text(T0 + (60 * n + 30 * number) * S, f"{robot} {n}") for n in range(9)]
         write_mcap(tmp_path / robot / f"{robot}_0.mcap", said)
     for condition in ("blue 4", "red 5"):
         asks = {"topic": "/chatter", "condition_type": "equals", "value": condition}
@@ -141,13 +148,13 @@ def test_a_match_on_a_topic_with_a_message_a_minute_says_that_it_is_of_two_robot
     "asks", [{}, {"where": {"x": [-99, 99], "y": [-99, 99]}}], ids=["all", "where"]
 )
 def test_a_way_over_both_robots_is_not_known(both: Path, asks: dict[str, object]) -> None:
-    memory, begin = memory_of(both), T0 / NS_PER_S
-    window = {"start": begin, "end": begin + 60, **asks}
+    memory = memory_of(both)
+    window = {"start": T0_S, "end": T0_S + 60, **asks}
     told = asked(memory, both, "recap", **window)
     assert [told.get(each) for each in ("distance_m", "max_speed", "stood_s")] == [None] * 3
     assert not [each for each in told["events"] if each["kind"] in {"stop", "drop"}]
     assert any("the path is unknown: 2 recordings" in note for note in told["notes"])
-    compared = asked(memory, both, "compare", **window, with_start=begin, with_end=begin + 30)
+    compared = asked(memory, both, "compare", **window, with_start=T0_S, with_end=T0_S + 30)
     assert any("the path is unknown: 2 recordings" in note for note in compared["notes"])
     assert "distance_m" not in compared.get("way", {})
 
@@ -157,7 +164,7 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
     tmp_path: Path, resting: int
 ) -> None:
     for speed in (1.0, 2.0):
-        name, times = f"run_{speed:.0f}", range(NS_PER_S, 61 * NS_PER_S, NS_PER_S)
+        name, times = f"run_{speed:.0f}", range(S, 61 * S, S)
         poses = [odom(at, max(n - resting + 1, 0) * speed, 0.0) for n, at in enumerate(times)]
         write_mcap(tmp_path / name / f"{name}_0.mcap", poses)
     memory = memory_of(tmp_path)
@@ -170,17 +177,17 @@ def test_two_runs_of_a_simulation_that_begin_alike_are_two_robots(
     "asks", [{}, {"where": {"x": 0, "y": 0, "radius_m": 9}}, {"by": "hour"}, {"by": "place"}]
 )
 def test_metres_of_both_robots_are_not_counted(both: Path, asks: dict[str, object]) -> None:
-    memory, begin = memory_of(both), T0 / NS_PER_S
+    memory = memory_of(both)
     memory = replace(
         memory, limits=replace(memory.limits, places=(Place("a", "odom", Circle(0, 0, 1)),))
     )
-    told = asked(memory, both, "trajectory_summary", start=begin, end=begin + 60, **asks)
+    told = asked(memory, both, "trajectory_summary", start=T0_S, end=T0_S + 60, **asks)
     assert told["reason"] == "mixed"
 
 
 def driving(begin: int, stop: int, x: float) -> list[Msg]:
     """Poses from a second to another, 0.5 m/s along x from a place."""
-    return [odom(T0 + n * NS_PER_S, x + (n - begin) / 2, 0.0) for n in range(begin, stop + 1)]
+    return [odom(T0 + n * S, x + (n - begin) / 2, 0.0) for n in range(begin, stop + 1)]
 
 
 @pytest.mark.parametrize("fills", [False, True])
@@ -190,11 +197,11 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     write_mcap(tmp_path / "run_0" / "run_0_0.mcap", driving(0, 120, 0.0))
     # Where the first one ends, by a clock that is set back by 40 s.
     write_mcap(tmp_path / "run_1" / "run_1_0.mcap", driving(81, 200, 60.5))
-    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    memory = memory_of(tmp_path)
     if fills:
         memory = with_store(memory, tmp_path)
-    window = {"start": begin, "end": begin + 200}
-    told = asked(memory, tmp_path, "trajectory_summary", **window)
+    window = {"start": T0_S, "end": T0_S + 200}
+    told = driven(memory, 0, 200)
     # Of 60 m and 59.5 m, without the 20 m of the 40 s that are twice: a gap is no way.
     assert told["distance_m"] == pytest.approx(100.0, abs=0.6)
     [note] = [each for each in told["notes"] if "run_0 and run_1" in each]
@@ -205,7 +212,7 @@ def test_the_path_of_a_day_is_known_though_the_clock_was_set_back_between_record
     by_hour = asked(memory, tmp_path, "trajectory_summary", **window, by="hour")
     [[*_, metres]] = by_hour["rows"]
     assert metres == pytest.approx(told["distance_m"], abs=0.02)
-    alone = asked(memory, tmp_path, "trajectory_summary", start=begin + 130, end=begin + 200)
+    alone = driven(memory, 130, 200)
     assert not [each for each in alone.get("notes", ()) if "run_0" in each]
 
 
@@ -217,19 +224,19 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     write_mcap(run / "run_1_1.mcap", driving(40, 60, 50.5))
     # What follows begins before the end of the first split by the same clock.
     write_mcap(tmp_path / "run_2" / "run_2_0.mcap", driving(61, 200, 61.0))
-    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
+    memory = memory_of(tmp_path)
     assert differing(memory) == [(("run_1", "run_2"), None)]
     assert warned(memory) == []
-    told = asked(memory, tmp_path, "trajectory_summary", start=begin + 95, end=begin + 200)
+    told = driven(memory, 95, 200)
     assert told["distance_m"] == pytest.approx(52.0, abs=0.6)
     assert any("run_1 and run_2 have different messages" in each for each in told["notes"])
     # What lies in a time that the recording had before is left out, and nothing is a jump back.
     for known in (memory, with_store(memory, tmp_path)):
-        whole = asked(known, tmp_path, "trajectory_summary", start=begin, end=begin + 200)
+        whole = driven(known, 0, 200)
         assert whole["distance_m"] == pytest.approx(99.5, abs=0.6)
         assert any("run_1 has the time from" in each for each in whole["notes"])
         for at, is_twice in ((50, True), (150, False)):
-            there = asked(known, tmp_path, "get_position_at", timestamp=begin + at)
+            there = asked(known, tmp_path, "get_position_at", timestamp=T0_S + at)
             assert ("run_1 has the time from" in str(there.get("notes"))) is is_twice
         assert len(whole["waypoints"]) == 4
 
@@ -239,7 +246,7 @@ def test_a_clock_that_is_set_back_while_a_recording_runs_makes_no_second_robot(
     [
         [*(each for n, each in enumerate(drive(0.0, delay=3_000_000)) if n != 1), text(T0, "b")],
         drive(0.0, delay=3_000_000)[5::10],
-        [text(T0 + n * NS_PER_S, str(n)) for n in range(60)],
+        [text(T0 + n * S, str(n)) for n in range(60)],
     ],
     ids=["two recorders of one robot", "one that recorded a tenth", "different topics"],
 )
@@ -264,7 +271,7 @@ def test_what_a_handover_joins_is_not(tmp_path: Path) -> None:
 
 def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
     write_mcap(tmp_path / "red" / "red_0.mcap", [mounted("base_link")])
-    later = T0 + 3600 * NS_PER_S
+    later = T0 + 3600 * S
     write_mcap(tmp_path / "blue" / "blue_0.mcap", [mounted("torso", later)])
     memory = memory_of(tmp_path)
     (found,) = contradicting_frames(memory, Call())
@@ -280,7 +287,7 @@ def test_a_frame_with_two_parents_is_two_robots(tmp_path: Path) -> None:
 def test_a_frame_that_was_moved_within_one_deployment_is_not(tmp_path: Path) -> None:
     for number, parent in enumerate(("base_link", "torso")):
         name = f"rec_20231114T22132{number}Z"
-        at = T0 + number * 3600 * NS_PER_S
+        at = T0 + number * 3600 * S
         write_mcap(tmp_path / name / f"{name}_0.mcap", [mounted(parent, at)])
     assert contradicting_frames(memory_of(tmp_path), Call()) == ()
 
@@ -290,11 +297,9 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
     tmp_path: Path, kind: str
 ) -> None:
     """100 s at 0.5 m/s; after 50 s the clock is set back by 30 s."""
-    begin = T0 / NS_PER_S
-    poses = [odom(T0 + n * NS_PER_S // 10, n / 20, 0.0) for n in range(1000)]
+    poses = [odom(T0 + n * S // 10, n / 20, 0.0) for n in range(1000)]
     logged = [
-        replace(pose, log_time=pose.log_time - 30 * NS_PER_S * (n >= 500))
-        for n, pose in enumerate(poses)
+        replace(pose, log_time=pose.log_time - 30 * S * (n >= 500)) for n, pose in enumerate(poses)
     ]
     if kind == "db3":
         write_db3(tmp_path / "run" / "run_0.db3", logged)
@@ -304,9 +309,9 @@ def test_what_a_file_has_twice_since_the_clock_was_set_back_is_no_part_of_a_path
     plain = memory_of(tmp_path, storage="sqlite3" if kind == "db3" else "mcap")
     for memory in (plain, with_store(plain, tmp_path)):
         (step,) = asked(memory, tmp_path, "data_time_range")["clock_steps"]
-        assert step["at"] == pytest.approx(begin + 20, abs=1)
+        assert step["at"] == pytest.approx(T0_S + 20, abs=1)
         assert step["step_s"] == pytest.approx(-29.9, abs=2)
-        path = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 70)
+        path = driven(memory, 0, 70)
         assert path["distance_m"] == pytest.approx(20.0, abs=1.2)
         assert path["gap_m"] == pytest.approx(30.0, abs=1.2)
         assert any("run has the time from" in note for note in path["notes"])
@@ -320,11 +325,11 @@ def test_a_path_by_transforms_over_a_clock_that_was_set_back_is_not_known(tmp_pa
     for number in range(4):
         moves = []
         for second in range(20 * number, 20 * number + 20):
-            at = T0 + (second - 30 * (number > 1)) * NS_PER_S
+            at = T0 + (second - 30 * (number > 1)) * S
             moves.append(tf(at, transform(at, "odom", "base_link", (second / 5, 0.0, 0.0))))
         write_mcap(tmp_path / "run" / f"run_{number}.mcap", moves)
-    memory, begin = memory_of(tmp_path), T0 / NS_PER_S
-    refused = asked(memory, tmp_path, "trajectory_summary", start=begin, end=begin + 60)
+    memory = memory_of(tmp_path)
+    refused = driven(memory, 0, 60)
     assert (refused["reason"], refused["detail"][:11]) == ("mixed", "1 recording")
-    after = asked(memory, tmp_path, "trajectory_summary", start=begin + 41, end=begin + 60)
+    after = driven(memory, 41, 60)
     assert after["distance_m"] == pytest.approx(1.6, abs=0.1)

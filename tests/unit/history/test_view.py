@@ -1,30 +1,39 @@
-"""Many bags read as one history."""
+"""Many bags read as one history, in which each message counts once."""
 
 from __future__ import annotations
 
+import random
+from collections import Counter
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.model import TimeWindow
-from ros2_memory.history.context import Call
-from ros2_memory.history.counting import pick
-from ros2_memory.history.view import View
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.spans import COPY_HORIZON_NS
+from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.duplicates import StoredMessage, deduplicate_backward, deduplicate_forward
+from ros2_memory.history.scan import pick
+from ros2_memory.history.view import TimeRange, View
+from ros2_memory.index import timeline
+from ros2_memory.insights.recap import recap
 from ros2_memory.messages.to_json import evenly
+from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, boolean, odom, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
 from tests.support.examples import examples
-from tests.support.memories import memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
-
-    from ros2_memory.storage.base import Record
+    from collections.abc import Collection, Iterator, Sequence
 
 T0 = 1_700_000_000 * 10**9
 S = 10**9
@@ -112,7 +121,6 @@ def takeovers(draw: st.DrawFn) -> tuple[list[list[Msg]], list[int]]:
 
 @settings(
     max_examples=examples(60),
-    deadline=None,
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(takeovers())
@@ -126,7 +134,240 @@ def test_every_message_counts_exactly_once_however_recordings_overlap(
     view = view_of(bag_dir)
     assert times(view, "/bumper") == expected
     assert times(view, "/bumper", newest_first=True) == expected[::-1]
-    assert view.census("/bumper")["std_msgs/msg/Bool"].count == len(expected)
+    assert view.census("/bumper")["std_msgs/msg/Bool"].messages == len(expected)
     total, chosen = pick(view, "/bumper", TimeWindow.everything(), 8)
     assert total == len(expected)
     assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]
+
+
+CHANNEL = Channel("/bumper", "cdr", Schema("std_msgs/msg/Bool"))
+EVERYWHERE = [(MIN_NS, MAX_NS)]
+
+
+def found(recording: str, time: int, said: bytes = b"x") -> StoredMessage:
+    bag = BagFile(f"/{recording}/0.mcap", 1, 1, BagState.CLOSED, BagSummary(()), 0, 0)
+    return StoredMessage(bag, Record(CHANNEL, time, 0, said))
+
+
+@st.composite
+def histories(draw: st.DrawFn) -> list[StoredMessage]:
+    """Rows of a few messages that are alike, in two recordings or three, some rows close by.
+
+    Those without a pause are shorter than the horizon.
+    """
+    messages = []
+    start = 0
+    for _ in range(draw(st.integers(1, 4))):
+        start += draw(st.sampled_from([MS, 3 * S, 20 * S]))
+        for _ in range(draw(st.integers(1, 6))):
+            at = start + draw(st.integers(0, 3)) * draw(st.sampled_from([1, 150 * MS]))
+            said = draw(st.sampled_from([b"x", b"y"]))
+            messages.append(found(draw(st.sampled_from("aabbc")), at, said))
+        start = max(each.time for each in messages)
+    return sorted(messages, key=lambda each: each.time)
+
+
+@given(histories())
+@example([found("a", 0), found("b", 1), found("b", 2)])
+@example([found("a", 0), found("b", 1), found("a", 2)])
+def test_the_same_copies_are_kept_newest_first(messages: list[StoredMessage]) -> None:
+    forwards = list(deduplicate_forward(messages, EVERYWHERE))
+    backwards = list(deduplicate_backward(reversed(messages), EVERYWHERE))
+    assert backwards[::-1] == forwards
+
+
+@given(histories(), st.integers(0, 30 * S), st.integers(0, 30 * S))
+def test_what_lies_outside_of_the_overlap_is_kept_both_ways(
+    messages: list[StoredMessage], one: int, other: int
+) -> None:
+    spans = [(min(one, other), max(one, other))]
+    forwards = list(deduplicate_forward(messages, spans))
+    assert list(deduplicate_backward(reversed(messages), spans))[::-1] == forwards
+    outside = [each for each in messages if not spans[0][0] <= each.time < spans[0][1]]
+    assert not Counter(map(id, outside)) - Counter(map(id, forwards))
+
+
+@each_way
+def test_messages_without_a_publish_time_are_no_copies(tmp_path: Path, recalls: bool) -> None:
+    """Some writers state 0 for a publish time that they do not know."""
+    for nth, robot in enumerate(("ann", "bob")):
+        alike = [boolean(S + n * S // 10 + nth * MS, data=False) for n in range(20)]
+        unknown = [replace(message, publish_time=0) for message in alike]
+        write_mcap(tmp_path / robot / f"{robot}_0.mcap", unknown)
+    memory = memory_of(tmp_path, recalls=recalls)
+    [bumper] = asked(memory, tmp_path, "list_recorded_topics")
+    assert bumper["count"] == 40
+
+
+def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:
+    taken = 0
+
+    def endless() -> Iterator[StoredMessage]:
+        nonlocal taken
+        for number in range(10_000):
+            taken += 1
+            yield found("ab"[number % 2], (10_000 - number) * 100 * MS)
+
+    kept = deduplicate_backward(endless(), EVERYWHERE)
+    next(kept)
+    assert taken * 100 * MS < 4 * COPY_HORIZON_NS
+    assert 4_900 < 1 + sum(1 for _ in kept) < 5_600
+
+
+TOPIC = "/rosout"
+LAYOUT = McapLayout(latched=frozenset({TOPIC}))
+SPLIT = 10 * S
+Stored = tuple[int, int, str, int]
+"""Log time, publish time, text, and the number of the recording."""
+
+
+def write_recordings(root: Path, draw: random.Random, *, stamped: bool = True) -> list[Stored]:
+    """Recordings one after the other, each of which begins with messages received again.
+
+    Where they are not stamped, all were published at 0, as some bridges have it: when is unknown.
+    """
+    stored: list[Stored] = []
+    published: list[tuple[int, str]] = []
+    at = 1_000 * S
+    for number in range(draw.randint(2, 4)):
+        messages: list[tuple[int, int, str]] = []
+        start = at
+        again = draw.sample(published, min(len(published), draw.choice([0, 1, 5, 12])))
+        for nth, (was, said) in enumerate(sorted(again)):
+            messages.append((start + S + nth * 10**6, was, said))
+        for _ in range(draw.randint(3, 25)):
+            at += draw.choice([S // 5, S, 4 * S])
+            said = draw.choice(["ready", "blocked", "lost"])
+            messages.append((at, at if stamped else 0, said))
+            published.append((at if stamped else 0, said))
+        if draw.random() < 0.3 and again:  # a publisher that was lost for a while
+            was, said = draw.choice(again)
+            messages.append((at + S, was, said))
+        at = max(at, *(each[0] for each in messages))
+        for log_time, was, said in sorted(messages):
+            stored.append((log_time, was or log_time, said, number))
+        write_splits(root / f"rec{number}", sorted(messages), start, at)
+        at += draw.choice([5, 60, 400]) * S
+    return stored
+
+
+def write_splits(
+    folder: Path, messages: Sequence[tuple[int, int, str]], start: int, stop: int
+) -> None:
+    for nth, begin in enumerate(range(start, stop + 1, SPLIT)):
+        inside = [
+            replace(said(log_time, text, was), log_time=log_time, publish_time=was)
+            for log_time, was, text in messages
+            if begin <= log_time < begin + SPLIT
+        ]
+        poses = [odom(begin, 0.0, 0.0), odom(min(begin + SPLIT - 1, stop), 1.0, 0.0)]
+        write_mcap(folder / f"{folder.name}_{nth}.mcap", [*inside, *poses], LAYOUT)
+
+
+def said(log_time: int, text: str, was: int) -> Msg:
+    return log_entry(was, 40 if text == "lost" else 20, "nav", text)
+
+
+def once(stored: Sequence[Stored]) -> list[Stored]:
+    """The messages that count, by a look at each pair: not where another recording was first."""
+    return [
+        each
+        for each in stored
+        if each[0] - each[1] <= S
+        or min(other for other in stored if other[1:3] == each[1:3])[3] == each[3]
+    ]
+
+
+def texts(memory: Memory, window: TimeWindow) -> list[tuple[int, int]]:
+    stream = View(memory, Call()).stream
+    return [(each.time, each.record.publish_time) for each in stream.messages([TOPIC], window)]
+
+
+def picked(memory: Memory, window: TimeWindow) -> list[int]:
+    total, chosen = pick(View(memory, Call()), TOPIC, window, 10_000)
+    times = [each.time for each in chosen]
+    assert len(times) == total
+    return times
+
+
+@settings(
+    max_examples=examples(12),
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 0.5, 1.0]), stamped=st.booleans())
+@example(seed=3, part=1.0, stamped=True)
+def test_each_message_counts_once_whatever_the_catalogue_knows(
+    seed: int, part: float, *, stamped: bool
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        root = Path(folder)
+        stored = write_recordings(root, draw, stamped=stamped)
+        counted = once(stored)
+        memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
+        edges = sorted(draw.choice(stored)[0] + draw.choice([0, 1]) for _ in range(2))
+        for window in (TimeWindow.everything(), TimeWindow(edges[0], edges[1] + 1)):
+            inside = [each for each in counted if window.contains(each[0])]
+            assert texts(memory, window) == [each[:2] for each in inside]
+            assert picked(memory, window) == [each[0] for each in inside]
+        [census] = View(memory, Call()).census(TOPIC).values()
+        assert (census.first, census.last, census.messages) == (
+            counted[0][0],
+            counted[-1][0],
+            len(counted),
+        )
+        last = View(memory, Call()).stream.newest(TOPIC, TimeWindow.everything())
+        assert last is not None
+        assert last.time == counted[-1][0]
+
+
+@settings(max_examples=examples(6))
+@given(seed=st.integers(0, 10**6), part=st.sampled_from([0.0, 1.0]))
+def test_what_was_counted_before_is_right_after_bags_come_and_go(seed: int, part: float) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(timeline, "SEGMENT_BAGS", 2)
+        root, aside = Path(folder) / "bags", Path(folder) / "aside"
+        write_recordings(root, draw)
+        aside.mkdir()
+        bags = sorted(root.glob("*/*.mcap"), key=lambda each: (each.parent, int(each.stem[5:])))
+        for bag in bags[-3:]:
+            bag.rename(aside / bag.name)
+        memory = with_store(memory_of(root, reader=McapReader()), root, part=part)
+
+        def check() -> None:
+            census = View(memory, Call()).census(TOPIC)
+            found = texts(memory, TimeWindow.everything())
+            assert sum(each.messages for each in census.values()) == len(found)
+            fresh = memory_of(root, reader=McapReader())
+            assert found == texts(fresh, TimeWindow.everything())
+            assert census == View(fresh, Call()).census(TOPIC)
+
+        check()
+        for bag in bags[-3:]:
+            (aside / bag.name).rename(bag)
+            check()
+        for bag in bags[:3]:
+            bag.unlink()
+            check()
+
+
+def test_what_was_an_original_no_longer_matters_once_its_recording_is_gone(tmp_path: Path) -> None:
+    """No joined answer outlives the bags that it depends on."""
+    write_splits(tmp_path / "a", [(1_001 * S, 1_001 * S, "lost")], 1_000 * S, 1_005 * S)
+    write_splits(
+        tmp_path / "b",
+        [(2_001 * S, 1_001 * S, "lost"), (2_120 * S, 2_120 * S, "lost")],
+        2_000 * S,
+        2_125 * S,
+    )
+    memory = with_store(memory_of(tmp_path, reader=McapReader()), tmp_path)
+
+    def errors() -> list[int]:
+        events = recap(memory, Call(), TimeRange(0.0, 1e5)).events
+        return [each.start // S for each in events if each.kind == "error"]
+
+    before = errors()
+    (tmp_path / "a" / "a_0.mcap").unlink()
+    memory.index.refresh()
+    assert (before, errors()) == ([1_001], [2_001])

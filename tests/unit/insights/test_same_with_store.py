@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, Rectangle
 from ros2_memory.history.context import Call, Memory, QuerySettings
-from ros2_memory.history.counting import pick
+from ros2_memory.history.scan import pick
 from ros2_memory.history.view import View
 from tests.support.bags import write_splits
 from tests.support.clocks import FixedClock

@@ -1,4 +1,4 @@
-"""What the robot drove while it was in a place, and waypoints in another frame."""
+"""What the robot drove while it was in a place, waypoints in another frame, the farthest pose."""
 
 from __future__ import annotations
 
@@ -6,8 +6,13 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from random import Random
+from tempfile import TemporaryDirectory
+from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Place, Rectangle
@@ -16,8 +21,11 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
 from tests.support.bags import odom, write_mcap
-from tests.support.memories import asked, memory_of
+from tests.support.examples import examples
+from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
+from tests.support.rooms import BEGIN as ROOMS_BEGIN
+from tests.support.rooms import ROOMS, asked_of, draw, write
 
 LEFT = {"x": [-1, 2], "y": [-1, 4]}
 ALL = TimeRange(BEGIN / S, BEGIN / S + 1000)
@@ -132,7 +140,7 @@ def test_a_jump_out_of_a_place_and_back_adds_nothing_to_what_few_poses_drove_ins
     assert reply["max_speed"] == pytest.approx(0.2, abs=0.05)
 
 
-@pytest.mark.parametrize("recalls", [False, True], ids=["plain", "catalogue"])
+@each_way
 def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of_a_place(
     tmp_path: Path, recalls: bool
 ) -> None:
@@ -147,3 +155,120 @@ def test_a_robot_that_turns_on_a_straight_way_has_its_own_heading_at_the_edge_of
     for each in inside["waypoints"]:
         there = asked(memory, tmp_path, "get_position_at", timestamp=each["timestamp"])
         assert each["yaw_deg"] == there["yaw_deg"]
+
+
+SECONDS = 200
+
+
+@settings(max_examples=examples(8), suppress_health_check=[HealthCheck.too_slow])
+@given(
+    seed=st.integers(0, 10_000),
+    stored=st.booleans(),
+    x=st.floats(-3, 15),
+    first=st.integers(0, 120),
+    rooms=st.lists(st.sampled_from([*ROOMS]), max_size=2, unique=True),
+)
+def test_it_is_the_pose_of_the_window_or_of_a_place_that_is_farthest(
+    seed: int, stored: bool, x: float, first: int, rooms: list[str]
+) -> None:
+    world = draw(seed, SECONDS)
+    with TemporaryDirectory() as name:
+        write(world, Path(name))
+        memory = asked_of(Path(name), stored=stored)
+        bounds = {"start": ROOMS_BEGIN + first, "end": ROOMS_BEGIN + first + 60}
+        given: dict[str, Any] = {"where": ", ".join(rooms)} if rooms else {}
+        point = {"x": x, "y": 1.0}
+        reply = asked(
+            memory, Path(name), "trajectory_summary", farthest_from=point, **bounds, **given
+        )
+        poses = {
+            nth: math.hypot(world.x[nth] - x, 1.0)
+            for nth in range(first, first + 61)
+            if not rooms or world.room(nth) in rooms
+        }
+        if not poses:
+            assert "farthest" not in reply
+            return
+        farthest = reply["farthest"]
+        assert farthest["distance_m"] == pytest.approx(max(poses.values()), abs=0.001)
+        at = round(farthest["timestamp"] - ROOMS_BEGIN)
+        assert poses[at] == pytest.approx(max(poses.values()), abs=1e-6)
+        assert (farthest["x"], farthest["frame_id"]) == (world.x[at], "odom")
+        assert farthest["from"] == {"x": pytest.approx(x, abs=1e-3), "y": 1.0}
+        assert farthest.get("in") == world.room(at)
+
+
+def test_where_there_is_a_map_the_point_is_in_it(tmp_path: Path) -> None:
+    truth = write_moving_map(tmp_path, 3, seconds=60)
+    memory = with_store(memory_of(tmp_path), tmp_path)
+    span = {"start": BEGIN / S + 1, "end": BEGIN / S + 60}
+    times = [at / S for at in truth.times if at >= BEGIN + S]  # transforms lead there from then
+    reply = asked(memory, tmp_path, "trajectory_summary", farthest_from={"x": 0, "y": 0}, **span)
+    farthest = reply["farthest"]
+    assert (reply["frame_id"], farthest["frame_id"]) == ("odom", "map")
+    positions = [
+        row
+        for nth in range(0, len(times), 20)
+        for row in asked(
+            memory,
+            tmp_path,
+            "get_position_at",
+            timestamps=times[nth : nth + 20],
+            frame_id="map",
+        )["results"]
+    ]
+    away = [math.hypot(row["x"], row["y"]) for row in positions]
+    assert len(away) == len(times)
+    assert farthest["distance_m"] == pytest.approx(max(away), abs=0.01)
+
+
+@pytest.fixture
+def memory(tmp_path: Path) -> Memory:
+    write(draw(1, 60), tmp_path)
+    return asked_of(tmp_path, stored=False)
+
+
+def test_the_middle_of_a_named_place_is_a_point(memory: Memory, tmp_path: Path) -> None:
+    span = {"start": ROOMS_BEGIN, "end": ROOMS_BEGIN + 60}
+    named, point = (
+        asked(memory, tmp_path, "trajectory_summary", farthest_from=each, **span)["farthest"]
+        for each in ("kitchen", {"x": 1.5, "y": 0.0})
+    )
+    assert named == point
+
+
+def test_a_single_pose_far_away_is_none_that_the_robot_was_at(tmp_path: Path) -> None:
+    x = [Random(nth).uniform(0, 3) for nth in range(50)]
+    x[20] = 900.0
+    poses = [odom((ROOMS_BEGIN * S) + nth * S, each, 0.0) for nth, each in enumerate(x)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
+    memory = with_store(memory_of(tmp_path), tmp_path)
+    for each in (memory, memory_of(tmp_path)):
+        reply = asked(
+            each,
+            tmp_path,
+            "trajectory_summary",
+            farthest_from={"x": 0, "y": 0},
+            start=ROOMS_BEGIN,
+            end=ROOMS_BEGIN + 60,
+        )
+        assert reply["farthest"]["distance_m"] < 3
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"farthest_from": "attic"}, "farthest_from: no place is named"),
+        ({"farthest_from": "kitchen, hall"}, "farthest_from has several places; give one"),
+        ({"farthest_from": {"x": 1}}, "farthest_from was"),
+        ({"farthest_from": "hall", "topic": "/other"}, "/other"),
+        ({"farthest_from": "hall", "by": "hour"}, "farthest_from cannot be combined with by"),
+        ({"farthest_from": {"x": 1, "y": 2}, "frame_id": "moon"}, 'frame_id was "moon"'),
+    ],
+)
+def test_what_is_no_point_is_named(
+    memory: Memory, tmp_path: Path, given: dict[str, Any], said: str
+) -> None:
+    span = {"start": ROOMS_BEGIN, "end": ROOMS_BEGIN + 60}
+    reply = asked(memory, tmp_path, "trajectory_summary", **span, **given)
+    assert said in reply["detail"]

@@ -69,15 +69,20 @@ def test_a_way_between_two_poses_that_leaves_a_place_is_one_visit(
     assert (visit.arrived, visit.departed) == (at[3], at[4])
 
 
-def test_without_a_place_all_named_ones_are_told_at_once(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 1, seconds=300)
-    memory = in_places(memory_of(tmp_path))
-    found = visits(memory, Call())
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    folder = tmp_path_factory.mktemp("moving")
+    write_moving_map(folder, 1, seconds=300)
+    return in_places(memory_of(folder))
+
+
+def test_without_a_place_all_named_ones_are_told_at_once(moving: Memory) -> None:
+    found = visits(moving, Call())
     assert found.places is not None
     by_name = {each.place: each for each in found.places}
     assert set(by_name) == {"corner", "start", "far side", "garden"}
     for name in ("corner", "start", "far side"):
-        alone = visits(memory, Call(), where=name, limit=100)
+        alone = visits(moving, Call(), where=name, limit=100)
         assert (by_name[name].entries, by_name[name].exits) == (alone.entries, alone.exits)
         assert by_name[name].duration == alone.duration
         arrivals = [each.arrived for each in alone.visits]
@@ -90,11 +95,9 @@ def test_without_a_place_all_named_ones_are_told_at_once(tmp_path: Path) -> None
     assert any("yard is left out" in note for note in found.notes)
 
 
-def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(tmp_path: Path) -> None:
-    write_moving_map(tmp_path, 1, seconds=300)
+def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(moving: Memory) -> None:
     own = Place("dock", "odom", Rectangle(-0.6, 0.6, -0.6, 0.6))
-    memory = memory_of(tmp_path)
-    memory = replace(memory, limits=replace(memory.limits, places=(*PLACES, own)))
+    memory = replace(moving, limits=replace(moving.limits, places=(*PLACES, own)))
     found = visits(memory, Call())
     assert found.places is not None
     [dock] = [each for each in found.places if each.place == "dock"]
@@ -102,8 +105,8 @@ def test_places_in_the_poses_own_frame_are_counted_with_those_of_the_map(tmp_pat
     assert alone.duration > 0
     assert (dock.entries, dock.duration) == (alone.entries, alone.duration)
     window = {"start": BEGIN / S, "end": BEGIN / S + 300}
-    assert "dock" in str(asked(memory, tmp_path, "visits", by="place", **window))
-    assert "dock" in str(asked(memory, tmp_path, "visits", by="day", **window))
+    for by in ("place", "day"):
+        assert "dock" in str(asked(memory, memory.index.bag_dir, "visits", by=by, **window))
 
 
 def test_without_named_places_a_place_must_be_given(tmp_path: Path) -> None:

@@ -55,7 +55,7 @@ ways = st.lists(st.tuples(st.floats(-3, 3), st.floats(-3, 3)), min_size=1, max_s
 )
 
 
-@settings(max_examples=examples(25), deadline=None)
+@settings(max_examples=examples(25))
 @given(ways, ways)
 @example([(0.0, 0.0, 0.0)], [(0.0, 0.0, 0.0)])
 @example([(0.0, 0.0, 0.0), (5.0, 3.0, 0.0)], [(0.0, 1.0, 1.0), (5.0, 1.0, -3.0)])
@@ -121,7 +121,7 @@ stands = st.lists(
 )
 
 
-@settings(max_examples=examples(40), deadline=None)
+@settings(max_examples=examples(40))
 @given(stands, stands)
 def test_every_standstill_is_of_one_place_and_near_to_it(
     one: list[PlacedStandstill], two: list[PlacedStandstill]

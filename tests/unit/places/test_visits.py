@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 import os
 import random
@@ -21,7 +20,6 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.places.visits import visits
-from ros2_memory.tools.replies import Replies
 from tests.support.bags import Msg, odom, text, tf, transform, write_mcap, write_splits
 from tests.support.clocks import SettableClock
 from tests.support.closed_form import SESSIONS, written_session
@@ -32,6 +30,7 @@ from tests.support.shared_bags import needs_recorded
 S = 10**9
 BEGIN = 1_784_000_000 * S
 EXAMPLES = 12 if LONG else 4
+THERE = {"x": 10.0, "y": 0.0, "radius_m": 1.0}
 
 
 def line(*legs: tuple[float, float], begin: float = 0.0, x: float = 0.0) -> list[Msg]:
@@ -103,8 +102,7 @@ def test_a_robot_that_is_there_still_has_not_departed(
     memory = replace(memory, limits=replace(memory.limits, now=now))
     if now == "wall":
         memory = at(memory, BEGIN + 75 * S)
-    answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
-    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    shown = asked(memory, tmp_path, "visits", **THERE)
     assert shown["there_now"] is True
     [visit] = shown["visits"]
     assert visit["departed"] is None
@@ -118,8 +116,7 @@ def test_a_time_that_ends_before_the_newest_pose_does_not_say_where_the_robot_is
     tmp_path: Path, x: float
 ) -> None:
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
-    answer = visits(memory, Call(), x, 0.0, radius_m=1.0, end_s=BEGIN / S + 40)
-    shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+    shown = asked(memory, tmp_path, "visits", x=x, y=0.0, radius_m=1.0, end=BEGIN / S + 40)
     assert "there_now" not in shown
     [visit] = shown["visits"]
     assert visit.get("still_inside", False) is (x == 10.0)
@@ -130,8 +127,7 @@ def test_where_a_robot_was_long_ago_is_not_where_it_is(tmp_path: Path) -> None:
     memory = remembering(tmp_path, line((20, 0.5), (30, 0.0)))
     newest = BEGIN + round(49.8 * S)
     for later in (31 * S, 365 * 86_400 * S):
-        answer = visits(at(memory, newest + later), Call(), 10.0, 0.0, radius_m=1.0)
-        shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+        shown = asked(at(memory, newest + later), tmp_path, "visits", **THERE)
         assert shown["there_now"] is False
         [visit] = shown["visits"]
         assert visit["departed"] == pytest.approx(newest / S)
@@ -158,8 +154,7 @@ def test_a_robot_that_no_pose_shows_while_others_go_on_may_have_left(tmp_path: P
         words = [text(BEGIN + at * S, "on") for at in range(said)]
         memory = remembering(tmp_path / str(said), [*poses, *words])
         memory = at(memory, BEGIN + said * S)
-        answer = visits(memory, Call(), 10.0, 0.0, radius_m=1.0)
-        shown = json.loads(Replies(tmp_path, 24_000).answer(answer).text)
+        shown = asked(memory, tmp_path, "visits", **THERE)
         assert shown["there_now"] is is_there
         assert (shown["visits"][0]["departed"] is None) is is_there
 
@@ -248,7 +243,17 @@ def test_coordinates_of_odometry_that_are_nowhere_in_the_map_are_hinted_at(tmp_p
         assert not any("were taken in" in note for note in found.notes)
 
 
-@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+def walk(draw: random.Random, count: int, step: float) -> list[tuple[int, float, float]]:
+    """Poses at random steps along x and y, some of them after a silence."""
+    poses, x, y, at = [], 0.0, 0.0, BEGIN
+    for _ in range(count):
+        x, y = x + draw.uniform(-step, step), y + draw.uniform(-step, step)
+        poses.append((at, x, y))
+        at += draw.choice([S // 5] * 24 + [2 * S] * 6 + [12 * S])
+    return poses
+
+
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 2**32),
     step=st.sampled_from([0.0, 0.002, 0.05, 0.3]),
@@ -260,11 +265,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
 ) -> None:
     """Held to every pose there is, whether the catalogue knows the bags or not."""
     draw = random.Random(seed)
-    poses, x, y, at = [], 0.0, 0.0, BEGIN
-    for _ in range(200):
-        x, y = x + draw.uniform(-step, step), y + draw.uniform(-step, step)
-        poses.append((at, x, y))
-        at += draw.choice([S // 5] * 20 + [2 * S] * 8 + [12 * S])
+    poses = walk(draw, 200, step)
     with TemporaryDirectory() as folder:
         bag_dir = Path(folder)
         plain = remembering(bag_dir, [odom(t, x, y, 0.0) for t, x, y in poses], split_s=split_s)
@@ -276,7 +277,7 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
             inside = [(math.dist((px, py), place), t) for t, px, py in poses if first <= t <= last]
             distance, _ = min(inside)
             # It is a pose, as near as the track knows.
-            [(at, px, py)] = [pose for pose in poses if pose[0] == visit.closest_at]
+            [(_, px, py)] = [pose for pose in poses if pose[0] == visit.closest_at]
             assert visit.closest_m is not None
             assert visit.closest_m == pytest.approx(math.dist((px, py), place), abs=1e-4)
             assert visit.closest_m <= distance + 2 * TOLERANCE_M
@@ -287,19 +288,15 @@ def test_the_closest_approach_is_that_of_the_recorded_poses(
         )
 
 
-@settings(max_examples=EXAMPLES, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=EXAMPLES, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 2**32), split_s=st.sampled_from([5.0, 12.0, 60.0]))
 @example(seed=2013, split_s=5.0)
 @example(seed=7197, split_s=5.0)
 def test_a_window_cuts_the_visits_of_all_times(seed: int, split_s: float) -> None:
     """The same times with and without bounds; a visit under way at one of them is marked."""
     draw = random.Random(seed)
-    poses, x, y, at = [], 0.0, 0.0, BEGIN
-    for _ in range(300):
-        x, y = x + draw.uniform(-0.3, 0.3), y + draw.uniform(-0.3, 0.3)
-        poses.append((at, x, y))
-        at += draw.choice([S // 5] * 24 + [2 * S] * 6 + [12 * S])
-    start, end = sorted(draw.sample(range(BEGIN // S, at // S), 2))
+    poses = walk(draw, 300, 0.3)
+    start, end = sorted(draw.sample(range(BEGIN // S, poses[-1][0] // S), 2))
     # A window of which nothing was recorded is refused.
     assume(any(start * S <= t <= end * S for t, _, _ in poses))
     with TemporaryDirectory() as folder:
@@ -362,12 +359,9 @@ def test_a_pose_that_cannot_be_decoded_hides_no_visit(
     assert len(found.visits) == 1
     assert found.frame_id == "odom"
     assert [note for note in found.notes if "cannot be decoded" in note]
-
-
-def test_of_poses_of_which_none_can_be_decoded_it_is_reported_that(tmp_path: Path) -> None:
-    way = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
+    torn = [replace(each, body=each.payload[:40]) for each in line((3.0, 0.1))]
     with pytest.raises(UndecodableError, match="does not fit"):
-        visits(remembering(tmp_path, way), Call(), 0.0, 0.0)
+        visits(remembering(tmp_path / "torn", torn), Call(), 0.0, 0.0)
 
 
 def test_a_bag_left_open_is_named_only_where_its_time_is_asked_for(tmp_path: Path) -> None:

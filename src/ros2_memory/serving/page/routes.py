@@ -23,7 +23,6 @@ from starlette.routing import Route
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.history.transforms import sessions_of, static_transforms
 from ros2_memory.history.view import View
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.moment import moment_shown, sightings_shown, stretch_shown
@@ -141,7 +140,7 @@ def warm_up(dispatcher: Dispatcher) -> bool:
     try:
         view = View(memory, call)
         for bag in view.snapshot.bags[-1:]:
-            static_transforms(view, sessions_of(view).of(bag.recording))
+            view.sessions.static(view.sessions.of(bag.recording))
         Recordings(memory).shown(memory, call)
         for _ in range(_MOST_TRIES):
             shown = span_shown(memory, call, request)

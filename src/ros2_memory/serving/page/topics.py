@@ -225,7 +225,7 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
     return {
         "topic": topic,
         "type": newest_type,
-        "count": by_type[newest_type].count,
+        "count": by_type[newest_type].messages,
         "rate_hz": _rate(view, topic),
         "spoke": _spoke(view, topic, window).tolist(),
         "numbers": [*_numbers(view, topic)],
