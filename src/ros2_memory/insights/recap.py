@@ -40,9 +40,15 @@ from ros2_memory.insights.changes_before import (
     is_routine,
 )
 from ros2_memory.insights.drive import Drive, Stop, drive_in
-from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
-from ros2_memory.insights.topic_events import events_in, note_limits, toggled
+from ros2_memory.insights.topic_events import (
+    FAILURES,
+    GoalRun,
+    events_in,
+    goals_in,
+    note_limits,
+    toggled,
+)
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places

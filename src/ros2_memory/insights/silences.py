@@ -46,15 +46,13 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
     """Returns those that bags show, and those that deleted bags showed, in order of time."""
-    shown: dict[str, list[Silence]] = {}
-    for silence in snapshot.silences:
-        shown.setdefault(silence.topic, []).append(silence)
+    # Until its bags are deleted, they show it as well.
     deleted = [
         silence
         for silence in map(Silence._make, read_thinned(bag_dir).silences)
-        # Until its bags are deleted, they show it as well.
-        if all(
-            silence.within(kept.start, kept.end) is None for kept in shown.get(silence.topic, ())
+        if not any(
+            kept.topic == silence.topic and silence.within(kept.start, kept.end)
+            for kept in snapshot.silences
         )
     ]
     return sorted(
@@ -120,16 +118,15 @@ def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
     """Returns silences, in order, with those of several topics at about the same time together."""
     groups: list[list[Silence]] = []
     for silence in silences:
-        alike = [group for group in groups if _is_alike(silence, group[0])]
+        # They fell silent together, and returned together.
+        alike = [
+            group
+            for group in groups
+            if silence.start - group[0].start <= _ALIKE_NS
+            and abs(silence.end - group[0].end) <= _ALIKE_NS
+        ]
         if alike:
             alike[-1].append(silence)
         else:
             groups.append([silence])
     return groups
-
-
-def _is_alike(silence: Silence, earlier: Silence) -> bool:
-    """Whether two topics fell silent together, and returned together."""
-    return (
-        silence.start - earlier.start <= _ALIKE_NS and abs(silence.end - earlier.end) <= _ALIKE_NS
-    )

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
-from hypothesis import strategies as st
 
-from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.regions import Place, Rectangle
 from ros2_memory.core.text import abbreviate
-from ros2_memory.history.context import Memory, QuerySettings
+from ros2_memory.history.context import QuerySettings
 from tests.support.bags import (
     Msg,
     detections,
@@ -28,7 +26,6 @@ from tests.support.bags import (
     transform,
     write_splits,
 )
-from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, replied
 
 if TYPE_CHECKING:
@@ -108,14 +105,6 @@ def ask(bag_dir: Path, limits: QuerySettings = NAMED, **given: object) -> Any:
     return asked(memory, bag_dir, "find_things", **given)
 
 
-def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
-    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
-    table = Place("table", "map", Circle(3.0, 0.0, 1.0))
-    reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
-    [mug] = reply["things"]
-    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])
-
-
 def test_a_thing_is_found_in_the_map_with_all_that_is_known_of_it(tmp_path: Path) -> None:
     write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
     reply = ask(tmp_path, label="coffee mug")
@@ -155,11 +144,6 @@ def test_of_detections_without_a_label_it_is_said_that_none_is_known(
     reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
     [note] = reply["notes"]
     assert "no message has a detection" in note
-
-
-def test_a_detector_that_sees_nothing_is_no_lack_of_one(tmp_path: Path) -> None:
-    write_splits(tmp_path, looked(0, 3, HERE))
-    assert "notes" not in ask(tmp_path)
 
 
 CUP_AS_JSON = json.dumps(
@@ -674,20 +658,6 @@ def test_the_limit_bounds_what_is_listed_and_not_what_is_counted(tmp_path: Path)
     assert (len(reply["things"]), reply["total"]) == (2, 3)
 
 
-def test_a_long_list_has_each_thing_shortly_and_says_how_to_ask_for_more(tmp_path: Path) -> None:
-    many = [(f"thing {nth:02}", 1.0 + 1.2 * (nth % 7), 1.2 * (nth // 7) - 6) for nth in range(70)]
-    write_splits(tmp_path, looked(0, 8, HERE, *many))
-    reply = replied(memory_of(tmp_path, limits=NAMED), tmp_path, "find_things", {"limit": 100})
-    answer = json.loads(reply.text)
-    rows = answer["things"]
-    assert 4_000 < len(reply.text) <= 6_000
-    assert answer["total"] == 70
-    assert 20 < len(rows) < 70
-    assert set(rows[0]) == {"label", "place", "last_seen", "local"}
-    assert set(rows[1]) == {"label", "place", "last_seen"}
-    assert answer["notes"][0].startswith(f"{len(rows)} of 70 things are listed")
-
-
 def test_a_short_list_says_since_when_what_moved_is_there_and_what_is_left_out(
     tmp_path: Path,
 ) -> None:
@@ -736,43 +706,6 @@ def random_messages(draw: Random) -> list[Msg]:
         ]
         messages += scene(at, robot, seen, in_map=in_map, score=draw.uniform(0.2, 0.9))
     return messages
-
-
-def answer(memory: Memory, bag_dir: Path, question: dict[str, object]) -> Any:
-    return asked(memory, bag_dir, "find_things", **question)
-
-
-@settings(
-    max_examples=examples(6),
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(
-    moved=st.integers(45, 60),
-    split_s=st.sampled_from([4.0, 10.0, 17.0]),
-    back=st.booleans(),
-)
-@example(moved=45, split_s=10.0, back=True)
-@example(moved=54, split_s=10.0, back=False)
-def test_things_are_the_same_in_one_file_and_in_many(
-    tmp_path_factory: pytest.TempPathFactory, moved: int, split_s: float, back: bool
-) -> None:
-    """A cup is taken away while the robot looks elsewhere; then the robot looks again, or not."""
-    cup, book, mug = ("cup", 3.0, 0.5), ("book", 3.5, -1.0), ("mug", -1.5, 1.0)
-    messages = looked(0, moved, HERE, cup, book) + looked(moved, moved + 25, AWAY, mug)
-    if back:
-        messages += looked(moved + 25, moved + 50, HERE, book)
-    answers, missed_by = [], []
-    for each in (split_s, 1e6):
-        bag_dir = tmp_path_factory.mktemp("bags")
-        write_splits(bag_dir, messages, each)
-        answers.append(answer(memory_of(bag_dir, limits=NAMED), bag_dir, {}))
-        [lost] = [each for each in answers[-1]["things"] if each["label"] == "cup"]
-        missed_by.append(lost["still_there"].pop("not_seen_where_expected", None))
-    assert answers[0] == answers[1]
-    assert [each is not None for each in missed_by] == [back, back]
-    if back:  # by when is known to a split, or a slice of one
-        assert abs(missed_by[0] - missed_by[1]) <= max(split_s, 15.0)
 
 
 def test_a_window_in_which_no_detector_published_is_said_to_be_one(tmp_path: Path) -> None:
