@@ -25,6 +25,7 @@ from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place, places_at
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import Quoted
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.history.coverage import (
@@ -301,14 +302,14 @@ class _ThingsBetween:
             label = self.known.estimate.names[mover.key]
             before = self._mover_in(mover, self.earlier, self.later.start)
             after = self._mover_in(mover, self.later)
-            if before is not None and after is not None:
+            if before and after:
                 away_m = math.dist(before.place[:2], after.place[:2])
                 if before.at_once != after.at_once or away_m > _SAME_MOVER_M:
                     yield ComparedMover(label, before, after)
                 continue
             befores, afters = by_label.setdefault(label, ([], []))
-            befores += [before] if before is not None else []
-            afters += [after] if after is not None else []
+            befores += filter(None, [before])
+            afters += filter(None, [after])
         for label, (befores, afters) in by_label.items():
             # In each run of odometry it is another mover: one of each window is one row.
             for before, after in zip_longest(befores, afters):
@@ -462,22 +463,17 @@ def _minutes_in_places(
     minutes_of_windows: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            asked = [
-                (place.name, place.region, joined)
-                for place, joined in places_in(view, places, placement, window)
-            ]
+            tracks = places_in(view, places, placement, window)
+            asked = [(place.name, place.region, joined) for place, joined in tracks]
         else:
+            frame = placement.frame_id
             asked = [
-                (
-                    place.title,
-                    place.region,
-                    joined_in(view, place.frame_id or placement.frame_id, window),
-                )
+                (place.title, place.region, joined_in(view, place.frame_id or frame, window))
                 for place in where.each
             ]
         minutes: dict[str, float | None] = {}
         for name, region, joined in asked:
-            lasted = passed.among((stay.start, stay.stop) for stay in joined.inside(region, window))
+            lasted = passed.among(stay[:2] for stay in joined.inside(region, window))
             minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
         minutes_of_windows.append(minutes)
     # Where it was in neither window, as far as is known, nothing differs.
@@ -511,15 +507,10 @@ def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is None or latest is None:
         return 0.0
-    first, last = max(start, earliest), min(end, latest)
-    if last <= first:
-        return 0.0
-    gaps = sum(
-        elapsed.between(max(begin, first), min(stop, last))
-        for begin, stop in recording_gaps(view, window)
-        if begin < last and first < stop
+    recorded = without(
+        [(max(start, earliest), min(end, latest))], united(recording_gaps(view, window))
     )
-    return unix_from_ns(max(0, elapsed.between(first, last) - gaps))
+    return unix_from_ns(elapsed.among(recorded))
 
 
 def _differing(

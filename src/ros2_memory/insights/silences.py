@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -69,9 +69,7 @@ def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Ite
         return
     if silence.length < silence.end - silence.start:
         return  # the robot was off for a while, and which part that was in is not known
-    begins = [silence.start, *(stop for _, stop in deleted)]
-    ends = [*(start for start, _ in deleted), silence.end]
-    for start, end in zip(begins, ends, strict=True):
+    for start, end in without([(silence.start, silence.end)], deleted):
         if end - start >= snapshot.shortest_silence(silence.topic):
             goes_on = silence.goes_on and end == silence.end
             yield Silence(silence.topic, start, end, end - start, goes_on)
