@@ -346,8 +346,7 @@ def _sighting(
     What happens is where the robot was when it began; a thing is where it was last seen from.
     """
     message = view.memory.reader.decode(newest.record)
-    value = condition.counted(view.extractor.exact(message, newest.type))
-    detections = detections_of(value, view.extractor.frame(message))
+    value, detections = _counted(view, condition, newest.type, message)
     labels = {detection.label for detection in detections}
     thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun
@@ -373,6 +372,14 @@ def _sighting(
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
     )
+
+
+def _counted(
+    view: View, condition: Condition, type_name: str, message: object
+) -> tuple[JsonValue, Sequence[Detection]]:
+    """Returns what of a message counts for a condition, and the detections in that."""
+    value = condition.counted(view.extractor.exact(message, type_name))
+    return value, detections_of(value, view.extractor.frame(message))
 
 
 def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
@@ -457,19 +464,16 @@ def _place_of_thing(
             return spot
     except QueryTimeoutError:
         return spot
-    topic = newest.topic
     window = TimeWindow(first, newest.time)
-    extractor = view.extractor
-    before = view.stream.messages([topic], window, newest_first=True)
+    before = view.stream.messages([newest.topic], window, newest_first=True)
     for stored in islice(before, _MOST_TRIED):
         message = view.bags.decode(stored)
         if message is None:
             continue
-        value = condition.counted(extractor.exact(message, stored.type))
+        value, detections = _counted(view, condition, stored.type, message)
         if condition.matches(value):
-            detections = detections_of(value, extractor.frame(message))
-            earlier_thing = _sought_detection(detections, condition)
-            earlier = _place_of_detection(view, earlier_thing, stored, targets)
+            thing = _sought_detection(detections, condition)
+            earlier = _place_of_detection(view, thing, stored, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(

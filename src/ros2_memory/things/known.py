@@ -231,7 +231,7 @@ class _Loader:
     def _put(self, known: KnownThings | Ns) -> None:
         """Caches the answer, unless an open bag or a failure had a part in it."""
         if not self._view.call.used_active and self._view.notes.added == self._notes_before:
-            size = known.estimate.memory_bytes if isinstance(known, KnownThings) else _KEPT_BYTES
+            size = _KEPT_BYTES if isinstance(known, int) else known.estimate.memory_bytes
             self._cache.put(self._things_key, (self._view.timeline, known), size)
 
     def _estimated_in_time(self) -> KnownThings:

@@ -109,7 +109,11 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         is_claimed[cell] = True
         weight = float(mass[is_claimed].sum())
         is_free[is_claimed] = False
-        heavy = peaks[:count][_with_noise_at(peak, weight, peaks[:count], masses[:count])]
+        # Peaks that are so heavy that one this light may be their noise.
+        away, others = _away_squared(peaks[:count], peak), masses[:count]
+        is_halo = (away <= GATE_MM**2) & (others > weight / _HALO_SHARE)
+        is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
+        heavy = peaks[:count][is_halo | is_scatter]
         if all(
             weight >= _FEW
             and spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
@@ -134,15 +138,6 @@ def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
         if (before == peak).all():
             break
     return peak
-
-
-def _with_noise_at(peak: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
-    """Returns which peaks are so heavy that one this light may be their noise."""
-    away = _away_squared(peaks, peak)
-    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
-    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    may_be_noise: Flags = is_halo | is_scatter
-    return may_be_noise
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:

@@ -237,19 +237,6 @@ def test_poses_that_are_no_place_say_the_same_as_in_trajectory_summary(tmp_path:
     assert {note for note in some.notes if "pose" in note} <= set(of_summary)
 
 
-def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> None:
-    said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
-    messages = [log_entry(BEGIN + at * S, level, "planner", msg) for at, level, msg in said]
-    write_mcap(tmp_path / "bag.mcap", messages)
-    answer = over(memory_of(tmp_path), 0, 10)
-    assert times(answer.events, "error") == [
-        ("error: planner: no path (2 times)", 2.0),
-        ("error: planner: giving up", 4.0),
-    ]
-    assert answer.distance_m is None
-    assert any("the path is unknown" in note for note in answer.notes)
-
-
 def _status(at: float, *set_flags: str, topic: str = "/fmu/out/vehicle_status") -> Msg:
     """The status of a vehicle after so many seconds, with these of its 40 booleans true."""
     body = make(
@@ -300,6 +287,13 @@ def test_toggles_that_are_too_many_to_list_are_counted(tmp_path: Path) -> None:
         f"left out, because there are too many: {4 * 40 - 25} on/off changes" in note
         for note in answer.notes
     )
+
+
+def test_an_error_that_is_cut_shows_that_it_is(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [log_entry(BEGIN + S, 40, "planner", "no path " * 40)])
+    [event] = over(memory_of(tmp_path), 0, 10).events
+    assert event.text.startswith("error: planner: no path no path")
+    assert event.text.endswith("…")
 
 
 def test_a_detector_that_publishes_only_what_it_sees_saw_nothing_throughout(tmp_path: Path) -> None:

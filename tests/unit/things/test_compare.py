@@ -252,6 +252,11 @@ def test_two_runs_of_a_route_differ_by_where_they_are_farthest_apart(tmp_path: P
     assert "farthest_apart" not in beyond
 
 
+def test_two_equal_runs_do_not_differ_in_space(tmp_path: Path) -> None:
+    reply = compared(tmp_path, [*drive(0, *DETOUR), *drive(60, *DETOUR)])
+    assert not reply.keys() & {"farthest_apart", "stood_at", "way"}
+
+
 def test_standstills_are_compared_by_place_and_length(tmp_path: Path) -> None:
     """Ten seconds at the door and fifteen at the end, against half a minute at the end."""
     end = (4.0, 1.0, 0.0)
