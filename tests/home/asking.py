@@ -1,43 +1,211 @@
-"""Asks a memory over a world's bags all questions by the script, and counts what that took."""
+"""Questions of an owner, each with the call that a script asks it by, and what its reply must have.
+
+A question is asked at the end of the data. Nothing is reckoned: values are compared as they stand
+in the reply. What a call may be given is in the question, never in another reply.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, Final, Protocol, TypeAlias
+
+import numpy as np
 
 from ros2_memory.bootstrap import build_backfill, build_memory, build_server
 from ros2_memory.cli.maintenance.index import fill_store
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.logging_setup import configure_logging
-from tests.home import replies
-from tests.home.judging import wrong_fields
+from tests.home.days import CLOCK_STEP_S
+from tests.home.things import DAY
+from tests.home.world import START_S, World
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from pathlib import Path
 
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from tests.home.questions import Question
+    from tests.home.truth import PlaceOfThing, ThingTruth, Truth
 
-RIGHT: Final = "right"
-WRONG: Final = "wrong"
-NOT_YET: Final = "not answered yet"
-_REFUSED: Final = "invalid_arguments"
+Row: TypeAlias = "dict[str, Any]"
+SINCE: Final = ("since", "from", "first_seen")
+
+
+class Expected(Protocol):
+    """What is true of a value in a reply."""
+
+    def accepts(self, given: Any) -> bool:
+        """Returns whether a value is right."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
-    """What became of a question; `why` says what was wrong or is missing."""
+class Is:
+    """A value that is right alone."""
 
-    question: Question
-    result: str
-    why: str
-    calls: int
-    characters: int
-    """Of arguments and replies together."""
-    longest_reply: int
+    value: object
+
+    def accepts(self, given: object) -> bool:
+        """Returns whether it is the same."""
+        return given == self.value
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """A number, right within a tolerance."""
+
+    value: float
+    within: float = 0.0
+
+    def accepts(self, given: float) -> bool:
+        """Returns whether a number is near enough."""
+        return abs(given - self.value) <= self.within + 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """A text that holds one of some words, if there are any; else none of others."""
+
+    any_of: tuple[str, ...]
+    none_of: tuple[str, ...] = ()
+
+    def accepts(self, given: object) -> bool:
+        """Returns whether the text of a value is right."""
+        text = json.dumps(given).casefold()
+        is_any = not self.any_of or any(word in text for word in self.any_of)
+        return is_any and not any(word in text for word in self.none_of)
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """A set of names: all of some, and besides them none but those of others."""
+
+    all_of: frozenset[str]
+    maybe: frozenset[str] = frozenset()
+
+    def accepts(self, given: Sequence[str]) -> bool:
+        """Returns whether the set is right; names may come twice, and in any order."""
+        return self.all_of <= {*given} <= self.all_of | self.maybe
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """A value for each of some names; a name that is left out counts as 0."""
+
+    values: Mapping[str, Expected]
+
+    def accepts(self, given: Mapping[str, Any]) -> bool:
+        """Returns whether every value is right, and no other name has one but 0."""
+        return not any(value for name, value in given.items() if name not in self.values) and all(
+            expected.accepts(given.get(name, 0)) for name, expected in self.values.items()
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Question:
+    """A question in words, the call of the script, and what its reply must have."""
+
+    text: str
+    tool: str
+    arguments: Mapping[str, Any]
+    checks: Sequence[tuple[Expected, Callable[[Row], Any]]]
+
+    def wrong(self, reply: Row) -> list[tuple[object, Expected]]:
+        """Returns the values of a reply that are wrong, each with what it must be."""
+        given = [(read(reply), expected) for expected, read in self.checks]
+        return [(value, expected) for value, expected in given if not expected.accepts(value)]
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What questions are made of: the world, the truth about it, and the calendar."""
+
+    world: World
+    truth: Truth
+
+    @property
+    def last(self) -> int:
+        """Returns the number of the day on which is asked."""
+        return self.world.scale.days - 1
+
+    def day(self, number: int, hour: float = 0.0) -> float:
+        """Returns a moment of a day; day 0 is the first, and days before it are day 0."""
+        return START_S + max(number, 0) * DAY + hour * 3600.0
+
+    def days(self, first: int, after: int) -> Row:
+        """Returns the time from one midnight to another, as tools take it."""
+        return {"start": self.day(first), "end": self.day(after)}
+
+    @property
+    def today(self) -> Row:
+        """Returns the time since midnight."""
+        return self.days(self.last, self.last + 1)
+
+    @property
+    def all_days(self) -> Row:
+        """Returns all the time."""
+        return self.days(0, self.last + 1)
+
+    def thing(self, label: str) -> ThingTruth:
+        """Returns the only thing of a label."""
+        (thing,) = self.truth.of(label)
+        return thing
+
+    def since(self, stays: Sequence[PlaceOfThing]) -> Number:
+        """Returns since when a thing stands at the last of its known places.
+
+        It was moved after it was last seen at the place before; that it was moved is known when it
+        is next seen, to within a split.
+        """
+        first = stays[-1].sight.first_detected or 0.0
+        before = stays[-2].sight.last_detected if len(stays) > 1 else None
+        return between((before or stays[-1].start) - 1.0, first + self.world.scale.split_s)
+
+    def at(self, moment: float) -> tuple[float, float]:
+        """Returns where the robot is in the map at a moment of its clock."""
+        t = moment - START_S
+        if moment >= self.truth.clock_step + CLOCK_STEP_S:
+            t -= CLOCK_STEP_S
+        pose = self.world.robot(np.array([t]))
+        return float(pose.x[0]), float(pose.y[0])
+
+
+def between(earliest: float, latest: float) -> Number:
+    """Returns a number that lies between two others."""
+    return Number((earliest + latest) / 2, (latest - earliest) / 2)
+
+
+def in_words(moment: float) -> str:
+    """Returns a moment as an owner writes it: "08:12:30 on 3 March"."""
+    at = datetime.fromtimestamp(moment, UTC)
+    return f"{at:%H:%M:%S} on {at.day} {at:%B}"
+
+
+def stays(thing: Row) -> list[Row]:
+    """Returns the places of a thing, oldest first; a thing that was not moved has one."""
+    return sorted(thing.get("moved", [thing]), key=since)
+
+
+def since(stay: Row) -> float:
+    """Returns since when a thing is at a place."""
+    return next(float(stay[name]) for name in SINCE if name in stay)
+
+
+def bins(name: str) -> Callable[[Row], Row]:
+    """Returns a reader of a column, also as what is said of a field (`charge.min`), by its bins."""
+
+    def read(reply: Row) -> Row:
+        [at] = [nth for nth, column in enumerate(reply["columns"]) if column.split(".")[-1] == name]
+        return {str(row[0]): _plain(row[at]) for row in reply["rows"]}
+
+    return read
+
+
+def _plain(value: Any) -> Any:
+    """Returns a value, a local time as Unix seconds."""
+    return datetime.fromisoformat(value).timestamp() if isinstance(value, str) else value
 
 
 def settings_for(world: Path, split_s: float) -> Settings:
@@ -61,37 +229,22 @@ def server_over(settings: Settings) -> EpisodicServer:
     return build_server(settings, memory)
 
 
-def ask_all(server: EpisodicServer, questions: Sequence[Question]) -> list[Outcome]:
-    """Returns the outcome of each question."""
-    return [_ask(server, question) for question in questions]
+def text_of(server: EpisodicServer, tool: str, arguments: Mapping[str, Any]) -> str:
+    """Returns the text of a reply."""
+    reply = asyncio.run(server.dispatcher.answer(tool, arguments))
+    assert not reply.is_error, (tool, arguments, reply.text)
+    return reply.text
 
 
-def _ask(server: EpisodicServer, question: Question) -> Outcome:
-    found: list[replies.Row] = []
-    characters, longest = 0, 0
-    for call in question.calls:
-        reply = asyncio.run(server.dispatcher.answer(call.tool, call.arguments)).text
-        characters += len(json.dumps(dict(call.arguments))) + len(reply)
-        longest = max(longest, len(reply))
-        parsed = json.loads(reply)
-        found.append(parsed if isinstance(parsed, dict) else {"items": parsed})
-    result, why = _judged(question, found)
-    return Outcome(question, result, why, len(found), characters, longest)
-
-
-def _judged(question: Question, found: Sequence[replies.Row]) -> tuple[str, str]:
-    for reply in found:
-        if reply.get("error") == _REFUSED:
-            return NOT_YET, str(reply.get("detail", ""))
-    try:
-        answer = question.read(found)
-    except replies.UnreadableError as error:
-        return NOT_YET, str(error)
-    except (LookupError, ValueError) as error:
-        return WRONG, str(error)
-    wrong = wrong_fields(question.truth, answer)
-    if wrong:
-        expected = {name: question.truth[name].as_json() for name in wrong}
-        given = {name: answer.get(name) for name in wrong}
-        return WRONG, f"{json.dumps(given)}, but {json.dumps(expected)}"
-    return RIGHT, ""
+def missed(server: EpisodicServer, questions: Sequence[Question]) -> Row:
+    """Returns the questions whose answer is not right, and what is wrong of it."""
+    found: Row = {}
+    for question in questions:
+        reply = json.loads(text_of(server, question.tool, question.arguments))
+        try:
+            wrong: object = question.wrong(reply)
+        except (LookupError, TypeError, ValueError) as error:
+            wrong = repr(error)
+        if wrong:
+            found[question.text] = wrong
+    return found

@@ -54,13 +54,6 @@ class Frame(NamedTuple):
         return Frame(self.x + x, self.y + y, self.yaw)
 
 
-class Correction(NamedTuple):
-    """The localiser moved `odom` in the map by a large step, seen at the robot."""
-
-    t: float
-    metres: float
-
-
 @dataclass(frozen=True)
 class Drift:
     """Both frames, as steps: row n holds from `times[n]` to the next."""
@@ -68,7 +61,6 @@ class Drift:
     times: Floats
     true: NDArray[np.float64]
     believed: NDArray[np.float64]
-    corrections: tuple[Correction, ...]
 
     def at(self, t: Floats, *, believed: bool) -> Pose:
         """Returns the frame that was true, or believed in, at each moment."""
@@ -86,7 +78,7 @@ def drift(scale: Scale, life: Life, moving: Sequence[tuple[float, float]]) -> Dr
     pose, gone = life.path.at(grid), life.path.driven(grid)
     start = life.path.at(np.array([-1.0]))
     true = believed = Frame(float(start.x[0]), float(start.y[0]), float(start.yaw[0]))
-    rows, steps, corrections = [(-10.0, true, believed)], np.diff(gone, prepend=gone[0]), []
+    rows, steps = [(-10.0, true, believed)], np.diff(gone, prepend=gone[0])
     done_at, done_yaw, blind_until, rebooted = 0.0, 0.0, -math.inf, False
     for nth, t in enumerate(grid.tolist()):
         x, y, yaw = float(pose.x[nth]), float(pose.y[nth]), float(pose.yaw[nth])
@@ -105,28 +97,10 @@ def drift(scale: Scale, life: Life, moving: Sequence[tuple[float, float]]) -> Dr
             blind_until = slips.pop(0) + NOTICED_S
         moved = abs(gone[nth] - done_at) >= _UPDATE_M or abs(yaw - done_yaw) >= _UPDATE_RAD
         if moved and t >= blind_until:
-            before = believed
             turn, east, north = chance.normal(size=3).tolist()
             believed = true.turned(_ERROR_RAD * turn, x, y)
             believed = believed.shifted(_ERROR_M * east, _ERROR_M * north)
             done_at, done_yaw = float(gone[nth]), yaw
-            jump = _step(before, believed, x, y)
-            if jump > SLIP_M / 2:
-                corrections.append(Correction(t, jump))
         if rows[-1][1:] != (true, believed):
             rows.append((t, true, believed))
-    return Drift(
-        np.array([row[0] for row in rows]),
-        np.array([row[1] for row in rows]),
-        np.array([row[2] for row in rows]),
-        tuple(corrections),
-    )
-
-
-def _step(before: Frame, after: Frame, x: float, y: float) -> float:
-    """Returns how far the robot at a point of the map moves when one frame replaces the other."""
-    turned = Frame(x, y, 0.0).turned(after.yaw - before.yaw, before.x, before.y)
-    return math.hypot(
-        turned.x + after.x - before.x - x,
-        turned.y + after.y - before.y - y,
-    )
+    return Drift(*map(np.array, zip(*rows, strict=True)))

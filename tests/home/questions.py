@@ -1,137 +1,116 @@
-"""Sixty questions of an owner, each with its truth, and the calls that a script answers it by.
-
-A question is asked at the end of the data. `calls` may not need a sum by hand: `read` takes values
-out of replies as they stand. What a call may be given is in the question, never in another reply.
-"""
+"""Sixty questions of an owner: of things, places and habits, of reasons, and of trust."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from tests.home.days import CLOCK_STEP_S, Scale
-from tests.home.judging import Answer, Expected, Time
-from tests.home.replies import Row
-from tests.home.things import DAY
-from tests.home.truth import PlaceOfThing, ThingTruth, Truth, truth_of
-from tests.home.world import START_S, World, world_of
+from tests.home.about_places import about_places
+from tests.home.about_things import about_things
+from tests.home.asking import Asked, Is, Number, Question, Words, between, in_words
+from tests.home.days import CLOCK_STEP_S
+from tests.home.truth import truth_of
+from tests.home.world import VISION, world_of
 
 if TYPE_CHECKING:
-    from ros2_memory.core.model import JsonValue
+    from collections.abc import Iterator
 
-KINDS: Final = ("spatial", "temporal", "counting", "change", "routine", "why", "reliability")
-Reader: TypeAlias = Callable[[Sequence[Row]], Answer]
+    from tests.home.asking import Row
+    from tests.home.days import Scale
 
-
-class ToolCall(NamedTuple):
-    """One call of the script."""
-
-    tool: str
-    arguments: Mapping[str, JsonValue]
-
-
-@dataclass(frozen=True, slots=True)
-class Question:
-    """A question in words; `truth` has what each field of the answer must be."""
-
-    id: str
-    kind: str
-    text: str
-    truth: Mapping[str, Expected]
-    calls: tuple[ToolCall, ...]
-    read: Reader
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What questions are made of: the world, the truth about it, and the calendar."""
-
-    world: World
-    truth: Truth
-
-    @property
-    def last(self) -> int:
-        """Returns the number of the day on which is asked."""
-        return self.world.scale.days - 1
-
-    @property
-    def split_s(self) -> float:
-        """Returns how long a split is; what is known of a moment is known to within one."""
-        return self.world.scale.split_s
-
-    def day(self, number: int, hour: float = 0.0) -> float:
-        """Returns a moment of a day; day 0 is the first, and days before it are day 0."""
-        return START_S + max(number, 0) * DAY + hour * 3600.0
-
-    @property
-    def today(self) -> dict[str, JsonValue]:
-        """Returns the time since midnight, as tools take it."""
-        return {"start": self.day(self.last), "end": self.day(self.last + 1)}
-
-    @property
-    def yesterday(self) -> dict[str, JsonValue]:
-        """Returns the day before, as tools take it."""
-        return {"start": self.day(self.last - 1), "end": self.day(max(self.last, 1))}
-
-    @property
-    def all_days(self) -> dict[str, JsonValue]:
-        """Returns all the time, as tools take it."""
-        return {"start": self.day(0), "end": self.day(self.last + 1)}
-
-    def thing(self, label: str) -> ThingTruth:
-        """Returns the only thing of a label."""
-        (thing,) = self.truth.of(label)
-        return thing
-
-    def since(self, stays: Sequence[PlaceOfThing]) -> Time:
-        """Returns since when a thing stands at the last of its known places.
-
-        It was moved after it was last seen at the place before; that it was moved is known when it
-        is next seen.
-        """
-        first = stays[-1].sight.first_detected or 0.0
-        before = stays[-2].sight.last_detected if len(stays) > 1 else None
-        return Time((before or stays[-1].start) - 1.0, first + self.split_s)
-
-    def at(self, moment: float) -> tuple[float, float]:
-        """Returns where the robot is in the map at a moment of its clock."""
-        t = moment - START_S
-        if moment >= self.truth.clock_step + CLOCK_STEP_S:
-            t -= CLOCK_STEP_S
-        pose = self.world.robot(np.array([t]))
-        return float(pose.x[0]), float(pose.y[0])
-
-
-def ask(tool: str, **arguments: JsonValue) -> tuple[ToolCall, ...]:
-    """Returns the one call of a question."""
-    return (ToolCall(tool, arguments),)
-
-
-def in_words(moment: float) -> str:
-    """Returns a moment as an owner writes it: "08:12:30 on 3 March"."""
-    at = datetime.fromtimestamp(moment, UTC)
-    return f"{at:%H:%M:%S} on {at.day} {at:%B}"
+_REASONS = {
+    "blocked": ("block", "abort", "no way", "no path", "failed to create plan"),
+    "bump": ("bump",),
+    "hot": ("overheat", "motor"),
+    "low battery": ("battery", "cancel"),
+    "pause": (),
+}
+"""Why the robot stopped, and the words of the answer; for the pause nothing was recorded."""
+_OTHERS = ("abort", "bumper", "overheat", "battery", "cancel")
 
 
 def questions(scale: Scale) -> list[Question]:
-    """Returns the questions about the world of a scale.
-
-    Raises:
-        ValueError: it has one day, which is to be compared with no other.
-    """
-    if scale.days < 2:
-        raise ValueError("the questions need 2 days or more")
-    # Their makers import this module.
-    from tests.home import about_places, about_reasons, about_things  # noqa: PLC0415
-
+    """Returns the questions about the world of a scale, which has two days or more."""
     asked = Asked(world_of(scale), truth_of(scale))
-    found = [
-        *about_things.questions(asked),
-        *about_places.questions(asked),
-        *about_reasons.questions(asked),
-    ]
-    return sorted(found, key=lambda each: KINDS.index(each.kind))
+    return [*about_things(asked), *about_places(asked), *_why(asked), *_trust(asked)]
+
+
+def _why(asked: Asked) -> Iterator[Question]:
+    for reason, words in _REASONS.items():
+        stood = [each for each in asked.truth.standstills if each.reason == reason][-1]
+        at = round(stood.start + 1.0)
+        yield Question(
+            f"Why did you stop at {in_words(at)} in the {stood.room}?",
+            "recap",
+            {"around": at},
+            # What came before; an empty list is an answer.
+            [(Words(words, () if words else _OTHERS), lambda reply: reply["before"])],
+        )
+
+
+def _trust(asked: Asked) -> Iterator[Question]:
+    truth, midnight = asked.truth, asked.day(asked.last)
+    start, stop = truth.blind
+    # Silence is known between messages of a recorded time: as far as that reaches.
+    recorded = [(a, b) for a, b in truth.recorded if a < stop and b > start]
+    first, last = max(start, recorded[0][0]), min(stop, recorded[-1][1])
+    gap_from = max(b for _, b in truth.recorded if b <= truth.outage[0] + 1.0)
+    gap_to = min(a for a, _ in truth.recorded if a >= truth.outage[1] - 1.0)
+    middle = sum(truth.outage) / 2
+
+    def blind(reply: Row) -> list[Row]:
+        return [silence for silence in reply["silences"] if silence["topic"] == VISION.topic]
+
+    def today(reply: Row) -> Row:
+        (silence,) = [silence for silence in blind(reply) if silence["end"] > midnight]
+        return silence
+
+    def outage(reply: Row) -> Row:
+        gap: Row
+        (gap,) = [gap for gap in reply["gaps"] if gap["start"] <= middle <= gap["end"]]
+        return gap
+
+    def step(reply: Row) -> Row:
+        one: Row
+        (one,) = reply["clock_steps"]
+        return one
+
+    until = max(stop, last) + (3600.0 if asked.world.scale.short else 150.0)
+    for text, tool, *checks in (
+        (
+            "Were you blind today, and from when to when?",
+            "data_time_range",
+            (between(min(start, first) - 150.0, first + 10.0), lambda reply: today(reply)["start"]),
+            (between(last - 10.0, until), lambda reply: today(reply)["end"]),
+        ),
+        (
+            "Did your detector fall silent on any day before today?",
+            "data_time_range",
+            (Is([]), lambda reply: [each for each in blind(reply) if each["start"] < midnight]),
+        ),
+        (
+            f"What is missing around {in_words(middle)}: from when to when?",
+            "data_time_range",
+            (Number(gap_from, 3.0), lambda reply: outage(reply)["start"]),
+            (Number(gap_to, 3.0), lambda reply: outage(reply)["end"]),
+        ),
+        (
+            "Was your clock ever set, when, and by how many seconds?",
+            "data_time_range",
+            (Number(CLOCK_STEP_S, 1.0), lambda reply: step(reply)["step_s"]),
+            (
+                between(truth.clock_step - 10.0, truth.clock_step + CLOCK_STEP_S + 10.0),
+                lambda reply: step(reply)["at"],
+            ),
+        ),
+        (
+            "How many recordings were left open by a crash?",
+            "memory_status",
+            (Is(1), lambda reply: reply["incomplete"]),
+        ),
+        (
+            "How far back do you remember?",
+            "data_time_range",
+            (Number(truth.recorded[0][0], 2.0), lambda reply: reply["earliest"]),
+        ),
+    ):
+        yield Question(text, tool, {}, checks)

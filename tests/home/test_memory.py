@@ -17,7 +17,6 @@ from tests.home.year import Year, about, write_later_days
 from tests.support.examples import LONG
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
     from pathlib import Path
 
 pytestmark = [pytest.mark.xdist_group("home"), pytest.mark.usefixtures("in_utc")]
@@ -26,15 +25,14 @@ SCALE = Scale()
 YEAR: Final = 365
 ASKED: Final = {7: "a week", 31: "a month", YEAR: "a year"}
 """At the end of which days is asked; 0 is the first."""
-OF_ALL_DAYS: Final = {"crash"}
+OF_ALL_DAYS: Final = {"How many recordings were left open by a crash?"}
 """Later days have crashes of their own."""
 
 
-def missed(world: Path) -> Mapping[str, str]:
+def missed(world: Path) -> dict[str, object]:
     """The questions whose answer is not right, and why."""
     server = asking.server_over(asking.settings_for(world, SCALE.split_s))
-    outcomes = asking.ask_all(server, [about(question, SCALE) for question in questions(SCALE)])
-    return {each.question.id: each.why for each in outcomes if each.result != asking.RIGHT}
+    return asking.missed(server, [about(question, SCALE) for question in questions(SCALE)])
 
 
 def test_questions_are_answered_alike_when_bags_are_gone(home: Path, thinned_home: Path) -> None:

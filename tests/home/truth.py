@@ -8,6 +8,7 @@ the detector ran and the recorder as well; `detected` adds the detector's own lu
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import cache
@@ -17,7 +18,7 @@ import numpy as np
 
 from tests.home import flat
 from tests.home.days import CLOCK_STEP_S, Scale
-from tests.home.things import DAY, Place, Thing
+from tests.home.things import DAY, Place
 from tests.home.world import START_S, World, world_of
 
 if TYPE_CHECKING:
@@ -39,8 +40,6 @@ class Sight:
     """How one stay of a thing was seen."""
 
     in_view: list[Span] = field(default_factory=list)
-    messages: int = 0
-    detections: int = 0
     first_detected: float | None = None
     last_detected: float | None = None
 
@@ -59,7 +58,6 @@ class PlaceOfThing:
 class ThingTruth:
     """A thing with all its stays."""
 
-    name: str
     label: str
     stays: tuple[PlaceOfThing, ...]
 
@@ -95,7 +93,6 @@ class DayTruth:
     driven_m: float
     departures: tuple[float, ...]
     lowest_battery: float
-    lowest_battery_at: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,22 +102,12 @@ class Truth:
     recorded: tuple[Span, ...]
     days: tuple[DayTruth, ...]
     things: tuple[ThingTruth, ...]
-    people_in_view: int
     visits: Mapping[str, tuple[Span, ...]]
     standstills: tuple[Standstill, ...]
     bumps: tuple[float, ...]
-    errors: tuple[tuple[float, str], ...]
-    goals: tuple[tuple[float, int, int], ...]
     blind: Span
     outage: Span
-    power_cut: Span
     clock_step: float
-    corrections: tuple[tuple[float, float], ...]
-
-    @property
-    def end(self) -> float:
-        """Returns the last recorded moment; questions are asked then."""
-        return self.recorded[-1][1]
 
     def elapsed(self, start: float, end: float) -> float:
         """Returns how long it truly was from one time of the robot's clock to another."""
@@ -136,41 +123,19 @@ class Truth:
 def truth_of(scale: Scale) -> Truth:
     """Returns the truth about the world of a scale; the same one however often it is asked for."""
     world = world_of(scale)
-    recorded = _recorded(world)
+    recorded = world.on
     life, clock = world.life, world.clock_at
-    step = life.clock_step
     return Truth(
         recorded=tuple((clock(start), clock(stop)) for start, stop in recorded),
         days=tuple(_day(world, recorded, day) for day in range(scale.days)),
         things=_things(world),
-        people_in_view=sum(
-            int(world.sights(each)[1].in_view[:, len(world.things) :].sum())
-            for each in world.recordings
-        ),
         visits=_visits(world, recorded),
         standstills=_standstills(world, recorded),
         bumps=tuple(clock(t) for t in life.bumps if _inside(recorded, t)),
-        errors=tuple(
-            (clock(log.t), log.text)
-            for log in life.logs
-            if log.level >= 40 and _inside(recorded, log.t)
-        ),
-        goals=tuple(
-            (clock(goal.t), goal.goal, goal.status)
-            for goal in life.goals
-            if _inside(recorded, goal.t)
-        ),
         blind=(clock(life.blind[0]), clock(life.blind[1])),
         outage=(clock(life.outage[0]), clock(life.outage[1])),
-        power_cut=(clock(life.power_cut[0]), clock(life.power_cut[1])),
-        clock_step=START_S + step,
-        corrections=tuple((clock(each.t), each.metres) for each in world.drift.corrections),
+        clock_step=START_S + life.clock_step,
     )
-
-
-def _recorded(world: World) -> list[Span]:
-    """Returns the recorded times; recordings that follow each other are one."""
-    return [(start, stop) for start, stop in world.on if stop > start]
 
 
 def _inside(spans: Sequence[Span], t: float) -> bool:
@@ -184,8 +149,6 @@ def _day(world: World, recorded: Sequence[Span], day: int) -> DayTruth:
     ]
     gone = world.life.path.driven(np.array(parts).ravel()).reshape(-1, 2)
     grid = np.concatenate([np.append(np.arange(a, b, 1.0), b) for a, b in parts])
-    charge = world.battery(grid)
-    lowest = int(np.argmin(charge))
     return DayTruth(
         date=datetime.fromtimestamp(START_S + start, UTC).date().isoformat(),
         recorded_s=sum(b - a for a, b in parts),
@@ -195,60 +158,44 @@ def _day(world: World, recorded: Sequence[Span], day: int) -> DayTruth:
             for outing in world.life.outings
             if start <= outing.start < start + DAY and _inside(recorded, outing.start)
         ),
-        lowest_battery=float(charge[lowest]),
-        lowest_battery_at=world.clock_at(float(grid[lowest])),
+        lowest_battery=float(world.battery(grid).min()),
     )
 
 
 def _things(world: World) -> tuple[ThingTruth, ...]:
-    seen: list[dict[int, Sight]] = [
-        {nth: Sight() for nth in range(len(thing.stays))} for thing in world.things
-    ]
+    seen = [[Sight() for _ in thing.stays] for thing in world.things]
+
+    def sight(target: int, t: float) -> Sight:
+        starts = [stay.start for stay in world.things[target].stays]
+        return seen[target][bisect_right(starts, t) - 1]
+
     for recording in world.recordings:
         beats, sights = world.sights(recording)
-        clock = world.clock(beats.stamp).tolist()
-        stamps = beats.stamp.tolist()
-        for message, target in zip(
-            *map(np.ndarray.tolist, np.nonzero(sights.in_view)), strict=True
-        ):
-            if target < len(world.things):
-                nth = _stay(world.things[target], stamps[message])
-                _view(seen[target][nth], clock[message])
+        clock, stamps = world.clock(beats.stamp).tolist(), beats.stamp.tolist()
+        for message, target in np.argwhere(sights.in_view[:, : len(world.things)]).tolist():
+            spans, at = sight(target, stamps[message]).in_view, clock[message]
+            if spans and at - spans[-1][1] <= VIEW_GAP_S:
+                spans[-1] = (spans[-1][0], at)
+            else:
+                spans.append((at, at))
         for each in sights.detected:
             if each.right and each.target < len(world.things):
-                nth = _stay(world.things[each.target], stamps[each.message])
-                _detect(seen[each.target][nth], clock[each.message])
+                of_stay = sight(each.target, stamps[each.message])
+                of_stay.last_detected = clock[each.message]
+                if of_stay.first_detected is None:
+                    of_stay.first_detected = of_stay.last_detected
     return tuple(
         ThingTruth(
-            thing.name,
             thing.label,
             tuple(
                 PlaceOfThing(
-                    world.clock_at(stay.start), world.clock_at(stay.stop), stay.place, mine[nth]
+                    world.clock_at(stay.start), world.clock_at(stay.stop), stay.place, of_stay
                 )
-                for nth, stay in enumerate(thing.stays)
+                for stay, of_stay in zip(thing.stays, of_thing, strict=True)
             ),
         )
-        for thing, mine in zip(world.things, seen, strict=True)
+        for thing, of_thing in zip(world.things, seen, strict=True)
     )
-
-
-def _stay(thing: Thing, t: float) -> int:
-    return max(nth for nth, stay in enumerate(thing.stays) if stay.start <= t)
-
-
-def _view(sight: Sight, at: float) -> None:
-    sight.messages += 1
-    if sight.in_view and at - sight.in_view[-1][1] <= VIEW_GAP_S:
-        sight.in_view[-1] = (sight.in_view[-1][0], at)
-    else:
-        sight.in_view.append((at, at))
-
-
-def _detect(sight: Sight, at: float) -> None:
-    sight.detections += 1
-    sight.first_detected = at if sight.first_detected is None else sight.first_detected
-    sight.last_detected = at
 
 
 def _visits(world: World, recorded: Sequence[Span]) -> dict[str, tuple[Span, ...]]:

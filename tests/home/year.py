@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     import pytest
 
-    from tests.home.questions import Question
+    from tests.home.asking import Question
 
 DAY_S: Final = 86_400
 _LATER_S: Final = 60
@@ -99,8 +99,6 @@ class Year:
 def about(question: Question, first: Scale) -> Question:
     """Returns a question about a world's days, also when it is asked much later."""
     window = {"start": world.START_S, "end": world.START_S + first.days * DAY_S + _LATER_S}
-    calls = [
-        call._replace(arguments={**window, **call.arguments}) if call.tool in _BOUNDED else call
-        for call in question.calls
-    ]
-    return replace(question, calls=tuple(calls))
+    if question.tool not in _BOUNDED:
+        return question
+    return replace(question, arguments={**window, **question.arguments})

@@ -25,7 +25,7 @@ from ros2_memory.analysis.facts import (
     has_changes,
     has_events,
 )
-from ros2_memory.analysis.topic_events import Change, Report, TopicEvents, joined_events
+from ros2_memory.analysis.topic_events import Change, TopicEvents, joined_events
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import Quoted
@@ -33,11 +33,13 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.coverage import note_edges, note_unread
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.view import View, ns_argument, open_view
-from ros2_memory.insights.goals import GOAL_WORDS, action_of, last_listed
 from ros2_memory.insights.topic_events import (
+    GOAL_WORDS,
+    action_of,
     events_in,
     events_of_messages,
     flag_name,
+    last_listed,
     note_left_out,
     toggled,
 )
@@ -239,10 +241,14 @@ def _with_lead(
 
 def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]:
     for report in events.reports:
-        yield _DatedChange(report.first, report.last, _report_sentence(report))
+        span_s, often = unix_from_ns(report.last - report.first), report.reports
+        again = f" ({often} times in {span_s:.0f} s)" if often > 1 else ""
+        yield _DatedChange(report.first, report.last, Quoted(report.text + again))
     level = next((state.first for state in events.known if state.kind == CHARGE), 0)
     for change in events.changes:
-        text = _change_sentence(topic, change, level)
+        text = toggled(topic, change) if change.kind == FLAG else ""
+        if change.kind != GOAL or change.value in GOAL_WORDS:
+            text = text or _change_sentence(topic, change, level)
         if change.kind == CHARGE:
             level = change.value
         if text:
@@ -250,46 +256,24 @@ def _changes_of_topic(topic: str, events: TopicEvents) -> Iterator[_DatedChange]
     for state in events.known:
         # Where earlier messages are without it, a goal is new, and a status that is not ok; and a
         # charge had been just above a limit.
-        if state.at == events.first:
-            continue
-        if state.kind == GOAL:
-            word = GOAL_WORDS.get(state.first, "accepted")
-            yield _DatedChange(state.at, state.at, f"{action_of(topic)} goal {word}")
-        elif state.kind == STATUS and state.first:
-            sentence = _status_sentence(state.name, state.first, state.text)
-            yield _DatedChange(state.at, state.at, sentence)
-        elif state.kind == CHARGE and state.first:
-            yield _DatedChange(state.at, state.at, _low_charge_sentence(topic, state.first))
+        if state.at != events.first and (state.kind == GOAL or state.first):
+            change = Change(state.kind, state.name, state.at, state.first, state.text)
+            if text := _change_sentence(topic, change, 0):
+                yield _DatedChange(state.at, state.at, text)
 
 
 def _change_sentence(topic: str, change: Change, level_before: int) -> str:
-    """Returns a sentence for a change; empty for one that is not reported."""
-    if change.kind == FLAG:
-        return toggled(topic, change)
+    """Returns a sentence for a status, a goal or a charge; empty for what is not reported."""
     if change.kind == STATUS:
-        return _status_sentence(change.name, change.value, change.text)
-    if change.kind == GOAL and change.value in GOAL_WORDS:
-        return f"{action_of(topic)} goal {GOAL_WORDS[change.value]}"
+        is_known = 0 <= change.value < len(_LEVELS)
+        word = _LEVELS[change.value] if is_known else f"level {change.value}"
+        more = f": {change.text}" if change.text else ""
+        return Quoted(f"status of {change.name} became {word}{more}"[:_MAX_LOG_CHARS])
+    if change.kind == GOAL:
+        return f"{action_of(topic)} goal {GOAL_WORDS.get(change.value, 'accepted')}"
     if change.kind == CHARGE and change.value > level_before:
-        return _low_charge_sentence(topic, change.value)
+        return f"{topic} fell below {LOW_CHARGES[change.value - 1]:.0%}"
     return ""
-
-
-def _low_charge_sentence(topic: str, level: int) -> str:
-    return f"{topic} fell below {LOW_CHARGES[level - 1]:.0%}"
-
-
-def _status_sentence(name: str, level: int, text: str) -> str:
-    word = _LEVELS[level] if 0 <= level < len(_LEVELS) else f"level {level}"
-    more = f": {text}" if text else ""
-    return Quoted(f"status of {name} became {word}{more}"[:_MAX_LOG_CHARS])
-
-
-def _report_sentence(report: Report) -> str:
-    if report.reports == 1:
-        return Quoted(report.text)
-    span = unix_from_ns(report.last - report.first)
-    return Quoted(f"{report.text} ({report.reports} times in {span:.0f} s)")
 
 
 def _goal_activity(events: TopicEvents) -> Iterator[tuple[Ns, bool]]:

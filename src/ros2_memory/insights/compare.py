@@ -1,20 +1,33 @@
 """What differs between two windows: things, way, standstills, time in places, errors, silences.
 
+A thing that was seen in both is compared by where it was seen last in each. One that was seen in
+the later alone *appeared* only where its place was looked at in the earlier one, from where it is
+seen, so often that missing it by chance is below 1 %. One that was seen in the earlier alone is
+reported as not seen where expected by the same rule, and else as not looked at. One of each kind,
+with one label, in odometry that began again between them may be one thing: it was seen in both, and
+its places cannot be compared. What moves by itself has no place: it is compared by whether it was
+seen, how many at once, and where last.
+
 Two numbers differ where they are apart by more than a tenth of the larger, and by more than what
 noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from typing import TYPE_CHECKING, Final, NamedTuple
+import math
+from collections import Counter, defaultdict
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.analysis.facts import has_errors
+from ros2_memory.analysis.sights import Spot
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Place, places_at
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import Quoted
-from ros2_memory.core.timebase import unix_from_ns
+from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.history.coverage import (
     gap_around,
     note_unread,
@@ -37,13 +50,24 @@ from ros2_memory.places.pose_frames import (
 )
 from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
 from ros2_memory.places.where import Where, parse_where, places_asked
-from ros2_memory.results import ComparedThings, Comparison, FarFromOther, Pair, StandstillPlace
-from ros2_memory.things.compared import ThingsBetween
-from ros2_memory.things.known import known_things, note_other_frames
+from ros2_memory.results import (
+    ComparedMover,
+    ComparedThing,
+    ComparedThings,
+    Comparison,
+    FarFromOther,
+    MoverSeen,
+    Pair,
+    StandstillPlace,
+    ThingStay,
+)
+from ros2_memory.things.instances import Instance, Mover, PlacedStay, most_at_once
+from ros2_memory.things.known import KnownThings, known_things, note_other_frames
+from ros2_memory.things.places import LEAST_MM
 from ros2_memory.things.unseen import note_undecoded, unplaced_notes, vague_notes
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
@@ -54,6 +78,8 @@ _LEAST_APART_M: Final = 0.5
 _LEAST_MINUTES: Final = 0.2
 _LEAST_SILENT_S: Final = 10.0
 _LEAST_COUNT: Final = 0.5
+_SAME_MOVER_M: Final = 1.0
+"""What moves by itself, and was last seen so near to where it was before, is where it was."""
 
 
 def compare(
@@ -93,44 +119,38 @@ def compare(
     windows = clamped(view, asked), clamped(view, other)
     frame, things = _compare_things(view, windows, region)
     drives = [drive_in(view, window) for window in windows]
-    path_numbers = [
-        _path_numbers(view, drive, window) for drive, window in zip(drives, windows, strict=True)
-    ]
-    placement = known_placement(view)
     elapsed = [drive.elapsed for drive in drives]
-    places = _minutes_in_places(view, placement, windows, region, elapsed)
-    apart = _path_differences(view, placement, drives, windows, region)
+    way = [_path_numbers(view, *of_one) for of_one in zip(drives, windows, strict=True)]
+    placement = known_placement(view)
+    minutes = _minutes_in_places(view, placement, windows, region, elapsed)
+    way_frame, stood, farthest = _path_differences(view, placement, drives, windows, region)
     errors = [_error_counts(view, window) for window in windows]
     silences = [_silent_seconds(view, window) for window in windows]
     note_unread(view, windows[0], of="from start to end: ", gaps=False)
     note_unread(view, windows[1], of="from with_start to with_end: ", gaps=False)
-    lengths = (
-        unix_from_ns(passed.between(*window.asked()))
-        for window, passed in zip(windows, elapsed, strict=True)
-    )
-    recorded = [
-        _recorded_seconds(view, window, passed)
-        for window, passed in zip(windows, elapsed, strict=True)
-    ]
+    recorded = [_recorded_seconds(view, *of_one) for of_one in zip(windows, elapsed, strict=True)]
     if differ(recorded[0], recorded[1], 10.0):
         view.notes.add("not as much was recorded in both windows (recorded_s): sums differ by that")
     view.notes.retract_outside(*windows)
     if region is not None:
         view.notes.add("way, errors and silent_s are not only of that place")
+    lengths = [
+        passed.between(*window.asked()) for window, passed in zip(windows, elapsed, strict=True)
+    ]
     return Comparison(
         oldest=min(window.start for window in windows),
         newest=max(window.stop for window in windows),
-        lengths=Pair(*lengths),
+        lengths=Pair(*map(unix_from_ns, lengths)),
         recorded=Pair(*recorded),
         frame_id=frame,
         things=things,
-        way=_differing(*path_numbers, least=_LEAST),
-        places=_differing(*places, least=_LEAST_MINUTES),
+        way=_differing(*way, least=_LEAST),
+        places=_differing(*minutes, least=_LEAST_MINUTES),
         errors=_differing(*errors, least=_LEAST_COUNT, unlisted=unlisted),
         silences=_differing(*silences, least=_LEAST_SILENT_S, unlisted=unlisted),
-        way_frame_id=apart.frame_id,
-        stood=apart.stood,
-        farthest=apart.farthest,
+        way_frame_id=way_frame,
+        stood=stood,
+        farthest=farthest,
         notes=view.notes.sentences(),
     )
 
@@ -174,7 +194,178 @@ def _compare_things(
         )
     view.notes.add(*vague_notes(things, windows), *unplaced_notes(things, (first, second)))
     places = places_asked(limits, where, things.frames)
-    return frame, ThingsBetween(things, first, second, where, places).compared()
+    return frame, _ThingsBetween(things, first, second, where, places).compared()
+
+
+class _StayInWindow(NamedTuple):
+    """A thing's last stay in a window, and that part of the stay; how many there were at once."""
+
+    stay: PlacedStay
+    part: ThingStay
+    at_once: int
+
+    def is_elsewhere(self, other: _StayInWindow) -> bool:
+        """Whether a thing was moved between this and another: to and fro is no move."""
+        away_m = math.dist(self.part.place[:2], other.part.place[:2])
+        return self.stay.place != other.stay.place and away_m >= LEAST_MM / 1000
+
+
+@dataclass(frozen=True, slots=True)
+class _ThingsBetween:
+    """Compares the things of two windows. Slices (10 s) count whole, a shared one in the later.
+
+    Attributes:
+        earlier, later: the windows.
+        where: what was there in either window counts; None for all.
+        places: the named ones.
+    """
+
+    known: KnownThings
+    earlier: TimeWindow
+    later: TimeWindow
+    where: Where | None
+    places: Sequence[Place]
+
+    def compared(self) -> ComparedThings:
+        """Returns what differs, each list with those seen last first."""
+        kinds: dict[str, list[tuple[Instance, ComparedThing]]] = defaultdict(list)
+        for instance in self.known.estimate.instances:
+            before = self._stay_in(instance, self.earlier, self.later.start)
+            after = self._stay_in(instance, self.later)
+            shared = self._stay_in(instance, self.earlier)
+            if before is None and after and shared and shared.is_elsewhere(after):
+                before = shared  # in slices of both windows, but elsewhere
+            frame = self.known.frames[instance.epoch]
+            if any(
+                self.where is None or self.where.contains(frame, *stay.part.place[:2])
+                for stay in (before, after)
+                if stay is not None
+            ):
+                kind, thing = self._difference(instance, before, after)
+                kinds[kind].append((instance, thing))
+        same = len(kinds.pop("same", ()))
+        alone, both = _paired(kinds.pop("not_looked_at", ()))
+        lists = {kind: [thing for _, thing in things] for kind, things in kinds.items()}
+        lists |= {"not_looked_at": alone, "not_comparable": both}
+        ordered = {kind: tuple(sorted(things, key=_newest_first)) for kind, things in lists.items()}
+        movers = tuple(sorted(self._movers(), key=_newest_first))
+        return ComparedThings(**ordered, same=same, movers=movers)
+
+    def _difference(
+        self, instance: Instance, before: _StayInWindow | None, after: _StayInWindow | None
+    ) -> tuple[str, ComparedThing]:
+        """Returns what became of a thing: kind and description."""
+        thing = ComparedThing(
+            label=instance.label,
+            before=None if before is None else before.part,
+            after=None if after is None else after.part,
+        )
+        estimate = self.known.estimate
+        if before is None and after is not None:
+            window = self.earlier.start, min(self.earlier.stop, self.later.start)
+            _, crossed = estimate.missing(instance, after.stay, window)
+            return "not_looked_at" if crossed is None else "appeared", thing
+        if before is not None and after is None:
+            # At its place of the earlier window, before the later one.
+            *_, last_there = (
+                stay
+                for stay in instance.stays
+                if stay.place == before.stay.place and stay.first < self.later.start
+            )
+            looks, crossed = estimate.missing(instance, last_there)
+            if crossed is None or crossed >= self.later.stop:
+                return "not_looked_at", thing
+            return "missed", replace(thing, missed=crossed, looks=looks)
+        if before is None or after is None or before.is_elsewhere(after):
+            return "moved", thing
+        if before.at_once == after.at_once:
+            return "same", thing
+        was, now = (replace(stay.part, at_once=stay.at_once) for stay in (before, after))
+        return "more_or_fewer", replace(thing, before=was, after=now)
+
+    def _stay_in(
+        self, instance: Instance, window: TimeWindow, before: Ns = MAX_NS
+    ) -> _StayInWindow | None:
+        estimate, frame = self.known.estimate, self.known.frames[instance.epoch]
+        for stay in reversed(instance.stays):
+            rows = estimate.seen_in(stay.spots, window, before)
+            if len(rows):
+                place = estimate.place_of(stay, rows)
+                part = self.known.stay(rows, place, frame, self.places)
+                return _StayInWindow(stay, part, estimate.side_by_side(rows))
+        return None
+
+    def _movers(self) -> Iterator[ComparedMover]:
+        """Yields what moves by itself and was not seen alike in both windows."""
+        by_label: dict[str, tuple[list[MoverSeen], list[MoverSeen]]] = {}
+        for mover in self.known.estimate.movers:
+            label = self.known.estimate.names[mover.key]
+            before = self._mover_in(mover, self.earlier, self.later.start)
+            after = self._mover_in(mover, self.later)
+            if before and after:
+                away_m = math.dist(before.place[:2], after.place[:2])
+                if before.at_once != after.at_once or away_m > _SAME_MOVER_M:
+                    yield ComparedMover(label, before, after)
+                continue
+            befores, afters = by_label.setdefault(label, ([], []))
+            befores += filter(None, [before])
+            afters += filter(None, [after])
+        for label, (befores, afters) in by_label.items():
+            # In each run of odometry it is another mover: one of each window is one row.
+            for before, after in zip_longest(befores, afters):
+                yield ComparedMover(label, before, after)
+
+    def _mover_in(self, mover: Mover, window: TimeWindow, before: Ns = MAX_NS) -> MoverSeen | None:
+        estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
+        rows = self.known.seen_there(mover, window, self.where, before)
+        if not len(rows):
+            return None
+        spots = estimate.sights.spots[rows]
+        newest = spots[spots[:, Spot.LAST].argmax()]
+        x, y, z, last = newest[[Spot.X, Spot.Y, Spot.Z, Spot.LAST]].tolist()
+        place = x / 1000, y / 1000, z / 1000
+        return MoverSeen(
+            at_once=most_at_once(spots),
+            count=int(estimate.counts[rows].sum()),
+            place=place,
+            inside=places_at(self.places, frame, *place[:2]),
+            last=last,
+        )
+
+
+def _paired(
+    things: Sequence[tuple[Instance, ComparedThing]],
+) -> tuple[list[ComparedThing], list[ComparedThing]]:
+    """Returns the things that were seen in one window alone, and those that were seen in both.
+
+    A thing of the earlier window and one of the later with its label, in another odometry, are
+    taken as one.
+    """
+    later: dict[str, list[tuple[int, ComparedThing]]] = {}
+    for instance, thing in things:
+        if thing.before is None:
+            later.setdefault(instance.key, []).append((instance.epoch, thing))
+    alone: list[ComparedThing] = []
+    both: list[ComparedThing] = []
+    for instance, thing in things:
+        if thing.before is None:
+            continue
+        candidates = later.get(instance.key, [])
+        for position, (epoch, candidate) in enumerate(candidates):
+            if epoch != instance.epoch:
+                del candidates[position]
+                both.append(replace(thing, after=candidate.after))
+                break
+        else:
+            alone.append(thing)
+    return alone + [thing for rest in later.values() for _, thing in rest], both
+
+
+def _newest_first(thing: ComparedThing | ComparedMover) -> tuple[int, str]:
+    seen = thing.after or thing.before
+    if seen is None:
+        return 0, thing.label
+    return -(seen.end if isinstance(seen, ThingStay) else seen.last), thing.label
 
 
 def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, float | None]:
@@ -193,12 +384,8 @@ def _path_numbers(view: View, drive: Drive, window: TimeWindow) -> dict[str, flo
     }
 
 
-class _PathDifferences(NamedTuple):
-    """The differences between two paths in space, and the frame of their places."""
-
-    frame_id: str = ""
-    stood: tuple[StandstillPlace, ...] = ()
-    farthest: tuple[FarFromOther | None, FarFromOther | None] = (None, None)
+_Farthest: TypeAlias = tuple[FarFromOther | None, FarFromOther | None]
+_PathDifferences: TypeAlias = tuple[str, tuple[StandstillPlace, ...], _Farthest]
 
 
 def _path_differences(
@@ -208,18 +395,22 @@ def _path_differences(
     windows: tuple[TimeWindow, TimeWindow],
     where: Where | None,
 ) -> _PathDifferences:
-    """Returns where the robot stood, and where it drove, in one window and not in the other."""
+    """Returns where the robot stood, and where it drove, in one window and not in the other.
+
+    First the frame of these places.
+    """
+    unknown: _PathDifferences = "", (), (None, None)
     if placement is None or any(drive.path is None for drive in drives):
-        return _PathDifferences()
+        return unknown
     frame = placement.frame_id
     if where is not None and where.frame_id not in {None, frame}:
-        return _PathDifferences()
+        return unknown
     if not placement.is_map and not is_one_run(view, resolve_path_topic(view), windows):
         view.notes.add(
             f"standstills and paths are not compared: {changing_origin(frame)}, and no transforms "
             "lead to a map"
         )
-        return _PathDifferences()
+        return unknown
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
     tracks = [joined_in(view, frame, window).track for window in windows]
@@ -242,7 +433,7 @@ def _path_differences(
     stood.sort(key=lambda stand: -abs((stand.seconds.this or 0.0) - (stand.seconds.other or 0.0)))
     points = farthest_apart((tracks[0], windows[0]), (tracks[1], windows[1]), region)
     this, other = (_with_named_place(places, frame, point) for point in points)
-    return _PathDifferences(frame, tuple(stood), (this, other))
+    return frame, tuple(stood), (this, other)
 
 
 def _with_named_place(
@@ -272,22 +463,17 @@ def _minutes_in_places(
     minutes_of_windows: list[dict[str, float | None]] = []
     for window, passed in zip(windows, elapsed, strict=True):
         if where is None:
-            asked = [
-                (place.name, place.region, joined)
-                for place, joined in places_in(view, places, placement, window)
-            ]
+            tracks = places_in(view, places, placement, window)
+            asked = [(place.name, place.region, joined) for place, joined in tracks]
         else:
+            frame = placement.frame_id
             asked = [
-                (
-                    place.title,
-                    place.region,
-                    joined_in(view, place.frame_id or placement.frame_id, window),
-                )
+                (place.title, place.region, joined_in(view, place.frame_id or frame, window))
                 for place in where.each
             ]
         minutes: dict[str, float | None] = {}
         for name, region, joined in asked:
-            lasted = passed.among((stay.start, stay.stop) for stay in joined.inside(region, window))
+            lasted = passed.among(stay[:2] for stay in joined.inside(region, window))
             minutes[name] = unix_from_ns(lasted) / 60 if joined.reaches(window) else None
         minutes_of_windows.append(minutes)
     # Where it was in neither window, as far as is known, nothing differs.
@@ -300,7 +486,7 @@ def _minutes_in_places(
 
 def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported."""
-    counts: dict[str, float] = defaultdict(float)
+    counts = Counter[str]()
     for events in found_events(view, window, has_errors).values():
         for error in () if events is None else events.errors:
             counts[Quoted(error.text)] += error.reports
@@ -321,15 +507,10 @@ def _recorded_seconds(view: View, window: TimeWindow, elapsed: Elapsed) -> float
     earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is None or latest is None:
         return 0.0
-    first, last = max(start, earliest), min(end, latest)
-    if last <= first:
-        return 0.0
-    gaps = sum(
-        elapsed.between(max(begin, first), min(stop, last))
-        for begin, stop in recording_gaps(view, window)
-        if begin < last and first < stop
+    recorded = without(
+        [(max(start, earliest), min(end, latest))], united(recording_gaps(view, window))
     )
-    return unix_from_ns(max(0, elapsed.between(first, last) - gaps))
+    return unix_from_ns(elapsed.among(recorded))
 
 
 def _differing(

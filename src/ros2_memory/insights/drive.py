@@ -49,7 +49,7 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.places.pose_frames import NEWEST_POSE_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from ros2_memory.history.view import View
 
@@ -169,23 +169,17 @@ def _standstills_in(
         == bisect_left(starts, drop.time + _BRAKING_NS)
     )
     last = max((stand.last for stand in stands), default=MIN_NS)
-    return tuple(_stops_between(view, standing, start, end, last)), drops
-
-
-def _stops_between(
-    view: View, standing: Sequence[Standstill], start: Ns, end: Ns, last: Ns
-) -> Iterator[Stop]:
-    """Yields standstills as far as they are between two times; `last` is that of the last pose."""
     later = min(last, MAX_NS - NEWEST_POSE_NS) + NEWEST_POSE_NS
     was_recorded_later = bool(view.timeline.overlapping(TimeWindow(later, later + 1)))
-    for standstill in standing:
-        if standstill.start < end and standstill.end > start:
-            yield Stop(
-                standstill._replace(
-                    start=max(standstill.start, start), end=min(standstill.end, end)
-                ),
-                standstill.end > end or (standstill.end == last and not was_recorded_later),
-            )
+    stops = tuple(
+        Stop(
+            stood._replace(start=max(stood.start, start), end=min(stood.end, end)),
+            stood.end > end or (stood.end == last and not was_recorded_later),
+        )
+        for stood in standing
+        if stood.start < end and stood.end > start
+    )
+    return stops, drops
 
 
 def _stands_of_slices(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, Stands]]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import replace
 from itertools import islice, takewhile
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.text import shortened
@@ -40,20 +40,6 @@ MOST_COUNTED: Final = 20_000
 """Episodes that are counted over time."""
 
 
-class FoundEpisodes(NamedTuple):
-    """The episodes that a search found, in the order that was asked for.
-
-    Attributes:
-        episodes: the newest or the oldest of them.
-        total: how many there are; None where the search ended before it had counted all.
-        since: what is before was not searched; None where all of the window was.
-    """
-
-    episodes: tuple[Episode, ...]
-    total: int | None
-    since: Ns | None
-
-
 def says_episodes(view: View, topics: Sequence[str]) -> bool:
     """Returns whether these are one topic of texts that an empty one ends.
 
@@ -80,8 +66,11 @@ def says_episodes(view: View, topics: Sequence[str]) -> bool:
 
 def find_episodes(
     view: View, topic: str, condition: Condition, scope: Scope, *, limit: int, oldest_first: bool
-) -> FoundEpisodes:
-    """Returns the newest episodes whose text meets a condition, or the oldest with their total.
+) -> tuple[list[Episode], int | None, Ns | None]:
+    """Returns the newest episodes whose text meets a condition, newest first, or the oldest.
+
+    With them how many there are, None where the search ended before it had counted all; and since
+    when all was searched, None where all of the window was.
 
     Raises:
         InvalidArgumentsError: no text can meet the condition.
@@ -110,7 +99,7 @@ def find_episodes(
     if not episodes:
         search.require_testable()
     chosen = [*reversed(episodes)] if oldest_first else [*episodes][:limit]
-    return FoundEpisodes(tuple(chosen), total if since is None else None, since)
+    return chosen, total if since is None else None, since
 
 
 def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -> Iterator[Episode]:
@@ -139,18 +128,6 @@ def _matching_episodes(values: HeldValues, condition: Condition, scope: Scope) -
             after = None if following is None else spell_of(following)
             pending = Episode(spell_of(held), None, after)
         newer = held
-
-
-def episode_times(
-    view: View, topic: str, condition: Condition, scope: Scope
-) -> tuple[list[tuple[Ns, Ns]], Ns | None]:
-    """Returns when all episodes of a scope held, oldest first, as `read_sightings` does.
-
-    Raises:
-        QueryTimeoutError: the call's time is over before one was result.
-    """
-    result = find_episodes(view, topic, condition, scope, limit=MOST_COUNTED, oldest_first=True)
-    return [(episode.first, episode.until) for episode in result.episodes], result.since
 
 
 def spell_of(held: Held) -> Spell:

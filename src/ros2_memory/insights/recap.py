@@ -40,9 +40,15 @@ from ros2_memory.insights.changes_before import (
     is_routine,
 )
 from ros2_memory.insights.drive import Drive, Stop, drive_in
-from ros2_memory.insights.goals import FAILURES, GoalRun, goals_in
 from ros2_memory.insights.silences import grouped, silences_in, unrecorded_times
-from ros2_memory.insights.topic_events import events_in, note_limits, toggled
+from ros2_memory.insights.topic_events import (
+    FAILURES,
+    GoalRun,
+    events_in,
+    goals_in,
+    note_limits,
+    toggled,
+)
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
@@ -244,9 +250,8 @@ class _RegionStays:
 
     def has(self, event: Event) -> bool:
         """Returns whether an event happened then; how long a boolean held is of no matter."""
-        if event.kind == "gap":
-            return False
-        return self.overlaps(event.start, None if event.kind == "flip" else event.end)
+        end = None if event.kind == "flip" else event.end
+        return event.kind != "gap" and self.overlaps(event.start, end)
 
     def covers(self, start: Ns, end: Ns) -> bool:
         """Returns whether a time is in one of them as a whole, or in none at all."""
@@ -255,8 +260,8 @@ class _RegionStays:
 
     def length_of(self, standstills: Iterable[Stop]) -> Ns:
         """Returns how long the robot stood in them."""
-        return sum(
-            self._elapsed.between(max(stood.start, stay.start), min(stood.end, stay.stop))
+        return self._elapsed.among(
+            (max(stood.start, stay.start), min(stood.end, stay.stop))
             for stood, _ in standstills
             for stay in self.spans
             if stood.start < stay.stop and stay.start < stood.end
@@ -279,17 +284,16 @@ def _with_path(view: View, answer: Recap, drive: Drive) -> Recap:
 
 def _with_path_in_region(answer: Recap, drive: Drive, region_stays: _RegionStays) -> Recap:
     """Returns a recap with the path in a region, and how often and how long the robot was there."""
-    path = drive.path
-    driven = (
-        None if path is None or not path.poses else totals_inside(path.line, region_stays.spans)
-    )
+    path, driven = drive.path, None
+    if path is not None and path.poses:
+        driven = totals_inside(path.line, region_stays.spans)
     return replace(
         answer,
         distance_m=None if driven is None else driven.distance_m,
         max_speed=None if driven is None else driven.max_speed,
         stood=None if answer.stood is None else region_stays.length_of(drive.standstills),
         visits=len(region_stays.spans),
-        inside=drive.elapsed.among((stay.start, stay.stop) for stay in region_stays.spans),
+        inside=drive.elapsed.among(stay[:2] for stay in region_stays.spans),
     )
 
 
@@ -363,9 +367,7 @@ def _things_in_view(
     throughout: set[str] = set()
     last_seen: dict[str, Ns] = {}
     below = 0
-    for topic_events in events_of_topics.values():
-        if topic_events is None:
-            continue
+    for topic_events in filter(None, events_of_topics.values()):
         seen = topic_events.visible.scoring(min_score) if min_score else topic_events.visible
         below += topic_events.visible.size - seen.size
         visible.append(seen)
@@ -373,14 +375,15 @@ def _things_in_view(
         for label in seen.at_end(topic_events.last, known_to):
             last_seen[label] = max(topic_events.last, last_seen.get(label, topic_events.last))
     if below:
-        sights = counted(below, "sighting", "sightings")
-        view.notes.add(f"{sights} left out: no score in it reaches min_score {min_score:g}")
+        view.notes.add(
+            f"{counted(below, 'sighting')} left out: no score in it reaches min_score {min_score:g}"
+        )
     things = united(visible)
     if region_stays is None:
         things = things.without(throughout)
     else:
         throughout = set()
-        things = things.during([(stay.start, stay.stop) for stay in region_stays.spans])
+        things = things.during([stay[:2] for stay in region_stays.spans])
     events = [
         Event(
             "thing",
@@ -493,19 +496,16 @@ def _error_event(error: Report) -> Event:
 
 def _with_changes(changes: ChangesBefore, events: Sequence[Event]) -> list[Event]:
     """Returns the events, and with each stop, speed drop and toggle what changed before."""
-    changes_of_events: dict[Event, tuple[PastChange, ...]] = {}
-    for event in events:
-        if event.kind in {"stop", "drop"}:
-            changes_of_events[event] = changes.before(event.start, slack=SLACK_NS)
-        elif event.kind == "flip":
-            changes_of_events[event] = changes.before(
-                event.start, without=event.text.rpartition(" ")[0]
-            )
-    counts_shown = _counts_shown(changes_of_events)
+    past = {
+        event: changes.before(event.start, without=event.text.rpartition(" ")[0])
+        if event.kind == "flip"
+        else changes.before(event.start, slack=SLACK_NS)
+        for event in events
+        if event.kind in {"stop", "drop", "flip"}
+    }
+    counts_shown = _counts_shown(past)
     return [
-        replace(event, before=changes_of_events[event][: counts_shown[event]])
-        if event in changes_of_events
-        else event
+        replace(event, before=past[event][: counts_shown[event]]) if event in past else event
         for event in events
     ]
 
@@ -536,10 +536,7 @@ def _most_important(
     """
     ranked = sorted(
         events,
-        key=lambda event: (
-            _KINDS.index(event.kind),
-            0 if event.end is None else event.start - event.end,
-        ),
+        key=lambda event: (_KINDS.index(event.kind), event.start - (event.end or event.start)),
     )
     shown = ranked[:most]
     left_out = counts - Counter(event.kind for event in shown)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
+from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
@@ -22,7 +24,7 @@ from ros2_memory.history.view import View
 from ros2_memory.results import FiredRule, MomentList, RememberedMoment, ShownMoment
 
 if TYPE_CHECKING:
-    from pathlib import Path
+    from collections.abc import Iterator
 
     from ros2_memory.history.context import Call, Memory
 
@@ -78,10 +80,7 @@ def list_moments(memory: Memory, call: Call) -> MomentList:
     Raises:
         RefusedError: they cannot be listed.
     """
-    try:
-        return newest_moments(memory, _now(memory, call), MAX_LISTED)
-    except OSError as error:
-        raise RefusedError(unlisted(error)) from error
+    return newest_moments(memory, _now(memory, call), MAX_LISTED)
 
 
 def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
@@ -91,10 +90,8 @@ def show_moment(memory: Memory, call: Call, name: str) -> ShownMoment:
         InvalidArgumentsError: there is none of this name.
         RefusedError: they cannot be listed.
     """
-    try:
+    with _refused_where_unreadable():
         moments = {moment.folder.name: moment for moment in _moments_of(memory)}
-    except OSError as error:
-        raise RefusedError(unlisted(error)) from error
     if name not in moments:
         near = get_close_matches(name, moments, n=3, cutoff=0.3)
         hint = f"do you mean {' or '.join(near)}?" if near else f"{len(moments)} moments are saved"
@@ -106,12 +103,24 @@ def newest_moments(memory: Memory, now: Ns, at_most: int) -> MomentList:
     """Returns the newest saved moments, the newest first; `now` is what "ago" counts from.
 
     Raises:
-        OSError: they cannot be listed; see `unlisted`.
+        RefusedError: they cannot be listed.
     """
-    stored = _moments_of(memory)
+    with _refused_where_unreadable():
+        stored = _moments_of(memory)
+        rules = fired_rules(memory.index.bag_dir)
     stored.sort(key=lambda moment: (moment.moment.request.end, moment.folder.name), reverse=True)
-    rules = fired_rules(memory.index.bag_dir)
     return MomentList(tuple(stored[:at_most]), len(stored[at_most:]), now, rules)
+
+
+@contextmanager
+def _refused_where_unreadable() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise RefusedError(
+            f"the moments cannot be listed: {error.strerror or error}; this server must be allowed "
+            "to read moments/ of the bag directory"
+        ) from error
 
 
 def _moments_of(memory: Memory) -> list[StoredMoment]:
@@ -126,12 +135,8 @@ def _moments_of(memory: Memory) -> list[StoredMoment]:
 
 def _has_bags_of(folder: Path, recording: str) -> bool:
     """Whether a moment's folder holds bags of a recording, or is the recording itself."""
-    moment_path = f"{MOMENTS_FOLDER}/{folder.name}"
-    return (
-        recording == moment_path
-        or recording.startswith(f"{moment_path}/")
-        or (folder / recording).is_dir()
-    )
+    own = Path(MOMENTS_FOLDER, folder.name)
+    return Path(recording).is_relative_to(own) or (folder / recording).is_dir()
 
 
 def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
@@ -155,14 +160,6 @@ def fired_rules(bag_dir: Path) -> tuple[FiredRule, ...]:
             rule.problem,
         )
         for name, rule in sorted(({} if state is None else state.rules).items())
-    )
-
-
-def unlisted(error: OSError) -> str:
-    """Returns the sentence on moments that cannot be listed."""
-    return (
-        f"the moments cannot be listed: {error.strerror or error}; this server must be allowed to "
-        "read moments/ of the bag directory"
     )
 
 

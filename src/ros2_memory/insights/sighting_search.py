@@ -354,7 +354,8 @@ def find_runs(
             for topic_runs in runs_by_topic.values():
                 topic_runs.end_in(view, TimeWindow(window.stop, searched))
             searched = window.start
-            for block in _merged_blocks(tester, runs_by_topic, window):
+            blocks = (tester.newest_first(topic, window) for topic in runs_by_topic)
+            for block in heapq.merge(*blocks, key=lambda block: -block.last):
                 is_whole = not scope.is_bounded or block.topic in latched
                 counted = block if is_whole else _scoped(block, scope)
                 runs_by_topic[block.topic].add(counted)
@@ -398,14 +399,6 @@ def _parts_in(
                 last = max(first, min(run.last, stop))
                 begun = run.begun and first == run.first
                 yield Run(run.topic, first, last, messages, run.until, begun)
-
-
-def _merged_blocks(
-    tester: MatchTester, topics: Iterable[str], window: TimeWindow
-) -> Iterator[Block]:
-    """Returns the blocks of all topics, the newest first."""
-    sources = (tester.newest_first(topic, window) for topic in topics)
-    return heapq.merge(*sources, key=lambda block: -block.last)
 
 
 def _scoped(block: Block, scope: Scope) -> Block:

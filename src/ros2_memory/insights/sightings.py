@@ -9,9 +9,10 @@ status of an action each goal is a sighting, of a log each message.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import islice
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
 from ros2_memory.analysis.frames import TF_CACHE_NS
@@ -41,22 +42,22 @@ from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.episodes import (
+    MOST_COUNTED,
     SaidMeanwhile,
-    episode_times,
     find_episodes,
     says_episodes,
     with_robot,
 )
-from ros2_memory.insights.goals import GoalRun, goals_asked
 from ros2_memory.insights.sighting_search import Run, find_runs
 from ros2_memory.insights.silences import describe_silences
+from ros2_memory.insights.topic_events import GoalRun, goals_asked
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
@@ -117,35 +118,31 @@ def find_matches(
     topics, shown = matching_topics(view, topic), _Selection(limit, oldest_first, frame_id)
     goals = goals_asked(view, topics, condition, scope)
     is_spoken = goals is None and says_episodes(view, topics)
+    sightings: Sequence[Sighting] = ()
+    episodes: Sequence[Episode] = ()
     if goals is not None:
-        rows = _goal_sightings(view, goals, scope, shown)
+        sightings, total, searched = _goal_sightings(view, goals, scope, shown)
     elif is_spoken:
-        rows = _episodes_of_text(view, topics[0], condition, scope, shown)
+        episodes, total, searched = _episodes_of_text(view, topics[0], condition, scope, shown)
     else:
         search = ReverseSearch(view, topic, condition)
-        rows = _runs_as_sightings(view, search, scope, shown, fields)
+        sightings, total, searched = _runs_as_sightings(view, search, scope, shown, fields)
         view.notes.add(*_latched_notes(view, search, window))
-    elapsed = elapsed_in(view, rows.searched)
-    sightings = tuple(_completed(sighting, elapsed, other) for sighting in rows.sightings)
-    episodes = tuple(_completed(episode, elapsed, other) for episode in rows.episodes)
-    shown_rows = len(sightings) + len(episodes)
-    note_robots_on(view, topics, rows.searched)
-    note_unread(
-        view,
-        rows.searched,
-        nothing=rows.is_nothing,
-        search=True,
-    )
-    if rows.is_nothing:
-        silences = describe_silences(view, topics, rows.searched)
+    elapsed = elapsed_in(view, searched)
+    sightings = tuple(_completed(sighting, elapsed, other) for sighting in sightings)
+    episodes = tuple(_completed(episode, elapsed, other) for episode in episodes)
+    rows: list[Sighting | Episode] = [*sightings, *episodes]
+    note_robots_on(view, topics, searched)
+    note_unread(view, searched, nothing=total == 0, search=True)
+    if total == 0:
+        silences = describe_silences(view, topics, searched)
         view.notes.add(*silences, *unasked_limit(condition, min_score))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
-    shown_at = [sighting.first for sighting in sightings] + [episode.first for episode in episodes]
-    start, end = _searched_times(view, window, shown_at)
-    total = rows.total if scope.since is None else None
+    start, end = _searched_times(view, window, [row.first for row in rows])
+    total = total if scope.since is None else None
     return Sightings(
         sightings,
-        more=total is None or total > shown_rows,
+        more=total is None or total > len(rows),
         total=total,
         start=start,
         end=end,
@@ -175,17 +172,9 @@ class _Selection(NamedTuple):
     frame_id: str | None
 
 
-class _FoundRows(NamedTuple):
-    """The rows of a reply; `total` is None where the search ended before it had counted all.
-
-    `searched` is the part of the window in which all matches are known.
-    """
-
-    total: int | None
-    searched: TimeWindow
-    is_nothing: bool
-    sightings: tuple[Sighting, ...] = ()
-    episodes: tuple[Episode, ...] = ()
+_Found: TypeAlias = tuple[Sequence[_SightingOrEpisode], int | None, TimeWindow]
+"""The rows of a reply; how many there are, None where the search ended before it had counted all;
+and the part of the window in which all matches are known."""
 
 
 def _completed(
@@ -201,49 +190,46 @@ def _completed(
 
 def _goal_sightings(
     view: View, goals: list[GoalRun], scope: Scope, shown: _Selection
-) -> _FoundRows:
+) -> _Found[Sighting]:
     """Returns the goals that are shown as sightings; `goals` have the last one first."""
     view.notes.retract_outside(scope.window)
-    sightings = tuple(
+    sightings = [
         _goal_sighting(view, goal, scope, shown.frame_id)
         for goal in (goals[::-1] if shown.oldest_first else goals)[: shown.limit]
         if view.call.wants(goal.last)
-    )
-    return _FoundRows(len(goals), scope.window, not goals, sightings=sightings)
+    ]
+    return sightings, len(goals), scope.window
 
 
 def _episodes_of_text(
     view: View, topic: str, condition: Condition, scope: Scope, shown: _Selection
-) -> _FoundRows:
-    result = find_episodes(
+) -> _Found[Episode]:
+    found, total, since = find_episodes(
         view, topic, condition, scope, limit=shown.limit, oldest_first=shown.oldest_first
     )
-    searched = scope.window
-    if result.since is not None:
-        searched = TimeWindow(result.since, searched.stop)
+    searched = scope.window if since is None else TimeWindow(since, scope.window.stop)
     view.notes.retract_outside(searched)
-    episodes = tuple(
+    episodes = [
         with_robot(view, topic, episode, shown.frame_id)
-        for episode in result.episodes
+        for episode in found
         if view.call.wants(episode.until)
-    )
-    return _FoundRows(result.total, searched, not result.episodes, episodes=episodes)
+    ]
+    return episodes, total, searched
 
 
 def _runs_as_sightings(
     view: View, search: ReverseSearch, scope: Scope, shown: _Selection, fields: Sequence[str]
-) -> _FoundRows:
+) -> _Found[Sighting]:
     result = find_runs(view, search, scope, enough=None if shown.oldest_first else shown.limit)
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
-        view.notes.complete = False
-        reached = unix_text(result.searched_to or MIN_NS)
-        view.notes.add(
-            f"the search ran out of time at {reached}: to continue, pass that time as end"
+        view.notes.add_lack(
+            f"the search ran out of time at {unix_text(result.searched_to or MIN_NS)}: to "
+            "continue, pass that time as end"
         )
     runs = result.runs[-shown.limit :][::-1] if shown.oldest_first else result.runs[: shown.limit]
-    searched, is_cut = scope.window, result.searched_to is not None
-    if is_cut:
+    searched, total = scope.window, len(result.runs) if result.searched_to is None else None
+    if total is None:
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
     # To say where the robot was takes longest.
@@ -258,7 +244,7 @@ def _runs_as_sightings(
     )
     if fields:
         sightings = _with_fields(view, sightings, [newest for _, newest in wanted], fields)
-    return _FoundRows(None if is_cut else len(result.runs), searched, not runs, sightings=sightings)
+    return sightings, total, searched
 
 
 def read_sightings(
@@ -280,8 +266,10 @@ def read_sightings(
         ends = [(goal.first, _goes_on_until(view, goal, scope), True) for goal in reversed(goals)]
         return ends, None
     if says_episodes(view, topics):
-        times, since = episode_times(view, topics[0], condition, scope)
-        return [(first, until, True) for first, until in times], since
+        found, _, since = find_episodes(
+            view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=True
+        )
+        return [(episode.first, episode.until, True) for episode in found], since
     result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
@@ -358,8 +346,7 @@ def _sighting(
     What happens is where the robot was when it began; a thing is where it was last seen from.
     """
     message = view.memory.reader.decode(newest.record)
-    value = condition.counted(view.extractor.exact(message, newest.type))
-    detections = detections_of(value, view.extractor.frame(message))
+    value, detections = _counted(view, condition, newest.type, message)
     labels = {detection.label for detection in detections}
     thing = _sought_detection(detections, condition)
     robot_at_first = thing is None and run.begun
@@ -385,6 +372,14 @@ def _sighting(
         score=None if thing is None else thing.score,
         robot_at_first=robot_at_first,
     )
+
+
+def _counted(
+    view: View, condition: Condition, type_name: str, message: object
+) -> tuple[JsonValue, Sequence[Detection]]:
+    """Returns what of a message counts for a condition, and the detections in that."""
+    value = condition.counted(view.extractor.exact(message, type_name))
+    return value, detections_of(value, view.extractor.frame(message))
 
 
 def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
@@ -469,19 +464,16 @@ def _place_of_thing(
             return spot
     except QueryTimeoutError:
         return spot
-    topic = newest.topic
     window = TimeWindow(first, newest.time)
-    extractor = view.extractor
-    before = view.stream.messages([topic], window, newest_first=True)
+    before = view.stream.messages([newest.topic], window, newest_first=True)
     for stored in islice(before, _MOST_TRIED):
         message = view.bags.decode(stored)
         if message is None:
             continue
-        value = condition.counted(extractor.exact(message, stored.type))
+        value, detections = _counted(view, condition, stored.type, message)
         if condition.matches(value):
-            detections = detections_of(value, extractor.frame(message))
-            earlier_thing = _sought_detection(detections, condition)
-            earlier = _place_of_detection(view, earlier_thing, stored, targets)
+            thing = _sought_detection(detections, condition)
+            earlier = _place_of_detection(view, thing, stored, targets)
             if earlier is not None and earlier.frame_id in targets:
                 return earlier
     view.notes.add(
@@ -532,8 +524,11 @@ def _sought_detection(detections: Sequence[Detection], condition: Condition) -> 
         about = [detection for detection in detections if test.passes(detection.label)]
     if not about and len(detections) == 1:
         about = list(detections)
-    return max(about, key=_by_place_and_score, default=None)
-
-
-def _by_place_and_score(detection: Detection) -> tuple[bool, float]:
-    return detection.place is not None, -math.inf if detection.score is None else detection.score
+    return max(
+        about,
+        key=lambda detection: (
+            detection.place is not None,
+            -math.inf if detection.score is None else detection.score,
+        ),
+        default=None,
+    )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.silences import Silence
 from ros2_memory.bag_dir.state_files import read_thinned
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.spans import united
+from ros2_memory.core.spans import united, without
 from ros2_memory.core.text import MAX_NAMED, listed
 from ros2_memory.core.timebase import (
     AT_OR_BEFORE_SLACK_NS,
@@ -46,15 +46,13 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
     """Returns those that bags show, and those that deleted bags showed, in order of time."""
-    shown: dict[str, list[Silence]] = {}
-    for silence in snapshot.silences:
-        shown.setdefault(silence.topic, []).append(silence)
+    # Until its bags are deleted, they show it as well.
     deleted = [
         silence
         for silence in map(Silence._make, read_thinned(bag_dir).silences)
-        # Until its bags are deleted, they show it as well.
-        if all(
-            silence.within(kept.start, kept.end) is None for kept in shown.get(silence.topic, ())
+        if not any(
+            kept.topic == silence.topic and silence.within(kept.start, kept.end)
+            for kept in snapshot.silences
         )
     ]
     return sorted(
@@ -71,9 +69,7 @@ def _outside_deleted(bag_dir: Path, snapshot: Snapshot, silence: Silence) -> Ite
         return
     if silence.length < silence.end - silence.start:
         return  # the robot was off for a while, and which part that was in is not known
-    begins = [silence.start, *(stop for _, stop in deleted)]
-    ends = [*(start for start, _ in deleted), silence.end]
-    for start, end in zip(begins, ends, strict=True):
+    for start, end in without([(silence.start, silence.end)], deleted):
         if end - start >= snapshot.shortest_silence(silence.topic):
             goes_on = silence.goes_on and end == silence.end
             yield Silence(silence.topic, start, end, end - start, goes_on)
@@ -120,16 +116,15 @@ def grouped(silences: Iterable[Silence]) -> list[list[Silence]]:
     """Returns silences, in order, with those of several topics at about the same time together."""
     groups: list[list[Silence]] = []
     for silence in silences:
-        alike = [group for group in groups if _is_alike(silence, group[0])]
+        # They fell silent together, and returned together.
+        alike = [
+            group
+            for group in groups
+            if silence.start - group[0].start <= _ALIKE_NS
+            and abs(silence.end - group[0].end) <= _ALIKE_NS
+        ]
         if alike:
             alike[-1].append(silence)
         else:
             groups.append([silence])
     return groups
-
-
-def _is_alike(silence: Silence, earlier: Silence) -> bool:
-    """Whether two topics fell silent together, and returned together."""
-    return (
-        silence.start - earlier.start <= _ALIKE_NS and abs(silence.end - earlier.end) <= _ALIKE_NS
-    )

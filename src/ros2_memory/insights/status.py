@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.silences import length_in
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState
 from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
+from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -24,7 +25,7 @@ from ros2_memory.history.robots import describe_mixed
 from ros2_memory.history.view import View
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.index.listed_splits import describe_absent
-from ros2_memory.insights.saved_moments import newest_moments, unlisted
+from ros2_memory.insights.saved_moments import newest_moments
 from ros2_memory.insights.silences import silences_of
 from ros2_memory.recorder.policies import OWN_TOPICS
 from ros2_memory.results import ANOTHER, Budget, Gap, SilentTopic, Status, Undecodable
@@ -73,8 +74,8 @@ def memory_status(memory: Memory, call: Call) -> Status:
     moments = None
     try:
         moments = newest_moments(memory, now, MAX_MOMENTS)
-    except OSError as error:
-        view.notes.add(unlisted(error))
+    except RefusedError as error:
+        view.notes.add(str(error))
     return Status(
         now=now,
         earliest=snapshot.dating.earliest,

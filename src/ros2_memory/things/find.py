@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -36,9 +35,9 @@ from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.model import JsonValue, Vector3
     from ros2_memory.history.context import Call, Memory, QuerySettings
 
 LIMIT: Final = 12
@@ -96,7 +95,7 @@ def find_things(
     asked = {known.labels.key(label): label for label in labels}
     places = places_asked(limits, region, known.frames)
     finder = _Finder(known, window, region, places, now)
-    found = sorted(finder.find(asked), key=lambda thing: (-thing.last, thing.label, thing.place))
+    found = sorted(finder.find(asked), key=lambda row: (-row.last, row.label, row.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
         key = known.labels.key(beside.label)
@@ -107,21 +106,16 @@ def find_things(
     note_unread(view, whole, nothing=not found, gaps=not found)
     if not found and asked_for != whole:
         view.notes.add(describe_misdated(view.snapshot.misdated))
-    shown = tuple(thing.described() for thing in found[:limit])
-    if beside is not None:
-        shown = tuple(map(finder.at_place_near, found, shown))
+    shown = tuple(map(finder.described, found[:limit]))
     totals: Counter[str] = Counter()
     for thing in found:
         totals[thing.label] += thing.at_once or 1
-    bounds = []
-    if start_s is not None or end_s is not None:
-        bounds.append("window")
-    if region is not None or beside is not None:
-        bounds.append("region")
+    bounds = ["window"] * (start_s is not None or end_s is not None)
+    bounds += ["region"] * (region is not None or beside is not None)
     question = Asked(
         labels=asked,
-        found=frozenset(key for thing in found for key in thing.keys),
-        vague=frozenset(thing.label for thing in found if thing.is_vague),
+        found=frozenset(key for row in found for key in row.keys),
+        vague=frozenset(row.label for row in found if known.estimate.is_vague(row.rows)),
         window=window,
         inside=f" in this {' and '.join(bounds)}" if bounds else "",
         min_score=f"min_score {lowest:g}" + " (data.min_score)" * (min_score is None),
@@ -153,20 +147,20 @@ class _FoundThing(NamedTuple):
         last: when it was seen last in the window.
         place: where it was then (m, in the frame of its epoch).
         at_once: how many are there; None where one is.
-        is_vague: whether localisation was poor then.
+        rows: its spots in the window; `newest` are those of its place.
         also_at: of people and pets, the places (m) of the others in the newest slice.
         near_m: how far it is from what it was to be near.
     """
 
+    thing: Instance | Mover
     label: str
     keys: Collection[str]
     last: Ns
-    place: tuple[float, float, float]
+    place: Vector3
     at_once: int | None
-    is_vague: bool
-    described: Callable[[], Thing]
-    thing: Instance | Mover
-    also_at: tuple[tuple[float, float, float], ...] = ()
+    rows: Ints
+    newest: Ints
+    also_at: tuple[Vector3, ...] = ()
     near_m: float | None = None
 
 
@@ -192,12 +186,11 @@ class Near(NamedTuple):
                     if other.thing is not thing.thing and other.thing.epoch == thing.thing.epoch
                     for place in (other.place, *other.also_at)
                 ]
-            distances = [
-                (min((math.dist(place[:2], point) for point in points), default=math.inf), place)
-                for place in (thing.place, *thing.also_at)
-            ]
             near = [
-                (away_m, place) for away_m, place in distances if away_m <= self.circle.radius_m
+                (away_m, place)
+                for place in (thing.place, *thing.also_at)
+                for away_m in [min((math.dist(place[:2], at) for at in points), default=math.inf)]
+                if away_m <= self.circle.radius_m
             ]
             if near:
                 near_m, place = min(near)
@@ -252,31 +245,29 @@ class _Finder:
 
     def find(self, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields the things of these keys, or all where there are none."""
-        for instance in self.known.estimate.instances:
-            own_keys = {self.known.labels.key(name) for name in instance.labels}
-            if not keys or not own_keys.isdisjoint(keys):
-                yield from self._found_instance(instance, own_keys)
-        for mover in self.known.estimate.movers:
-            own_keys = {self.known.labels.key(name) for name in self._labels(mover.spots)}
-            if not keys or not own_keys.isdisjoint(keys):
-                yield from self._found_mover(mover, own_keys)
+        estimate, labels = self.known.estimate, self.known.labels
+        things: list[Instance | Mover] = [*estimate.instances, *estimate.movers]
+        for thing in things:
+            names = thing.labels if isinstance(thing, Instance) else self._labels(thing.spots)
+            own_keys = {labels.key(name) for name in names}
+            if keys and own_keys.isdisjoint(keys):
+                continue
+            if isinstance(thing, Instance):
+                yield from self._found_instance(thing, own_keys)
+            else:
+                yield from self._found_mover(thing, own_keys)
 
-    def at_place_near(self, found: _FoundThing, shown: Thing) -> Thing:
-        """Returns a thing as shown, at that of its places which is near what was asked for."""
-        inside = places_at(self.places, self.known.frames[found.thing.epoch], *found.place[:2])
-        return replace(
-            shown,
-            place=found.place,
-            inside=inside,
-            at_once=found.at_once,
-            near_m=found.near_m,
-        )
+    def _parts(self, instance: Instance) -> list[tuple[PlacedStay, Ints]]:
+        """Returns the stays of a thing in the window, each with its spots."""
+        return [
+            (stay, rows)
+            for stay in instance.stays
+            if len(rows := self.known.estimate.seen_in(stay.spots, self.window))
+        ]
 
     def _found_instance(self, instance: Instance, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields a thing if it was seen in the window, and was inside the region at its end."""
-        estimate = self.known.estimate
-        seen = ((stay, estimate.seen_in(stay.spots, self.window)) for stay in instance.stays)
-        parts = [(stay, rows) for stay, rows in seen if len(rows)]
+        estimate, parts = self.known.estimate, self._parts(instance)
         if not parts:
             return
         stay, newest = parts[-1]
@@ -286,86 +277,12 @@ class _Finder:
         rows = np.concatenate([rows for _, rows in parts])
         number = estimate.side_by_side(newest)
         at_once = number if number > 1 else None
-        yield _FoundThing(
-            label=instance.label,
-            keys=keys,
-            last=int(estimate.sights.spots[rows, Spot.LAST].max()),
-            place=stay.at,
-            at_once=at_once,
-            is_vague=estimate.is_vague(rows),
-            described=partial(self._described, instance, parts, at_once),
-            thing=instance,
-        )
-
-    def _described(
-        self, instance: Instance, parts: Sequence[tuple[PlacedStay, Ints]], at_once: int | None
-    ) -> Thing:
-        """Returns a thing by its stays in the window, each with its spots."""
-        last, newest = parts[-1]
-        frame = self.known.frames[instance.epoch]
-        # The stays at one place in a row, as one.
-        stays = [
-            self.known.stay(
-                np.concatenate([rows for _, rows in group]), group[-1][0].at, frame, self.places
-            )
-            for group in _by_place(parts)
-        ]
-        rows = np.concatenate([rows for _, rows in parts])
-        labels = self._labels(rows)
-        estimate = self.known.estimate
-        rows_of_all = np.concatenate([stay.spots for stay in instance.stays])
-        written = spellings(estimate.sights, estimate.counts, rows_of_all)
-        misread = Counter[str]()
-        for stay in instance.stays:
-            misread.update(stay.also)
-        return replace(
-            self._thing(instance.label, frame, last.at, rows, newest),
-            labels=tuple(labels.items()) if len(labels) > 1 else (),
-            also_seen_as=_commonest(written, instance.labels),
-            misread_as=_commonest(misread, instance.labels),
-            spread_m=last.dev_mm / _MM,
-            still_there=self._still_there(instance, last, newest),
-            moved=tuple(stays) if len(stays) > 1 else (),
-            at_once=at_once,
-            usually=self._usually(frame, rows) if len(stays) > 1 else None,
-        )
-
-    def _thing(
-        self,
-        label: str,
-        frame: str,
-        place: tuple[float, float, float],
-        rows: Ints,
-        newest: Ints,
-    ) -> Thing:
-        """Returns what spots say of a thing; `newest` are those of its place."""
-        spots = self.known.estimate.sights.spots[rows]
-        best, median = self._scores(rows)
-        return Thing(
-            label=label,
-            also_seen_as=(),
-            place=place,
-            spread_m=0.0,
-            frame_id=frame,
-            inside=places_at(self.places, frame, *place[:2]),
-            first=int(spots[:, Spot.FIRST].min()),
-            last=int(spots[:, Spot.LAST].max()),
-            count=int(self.known.estimate.counts[rows].sum()),
-            best=best,
-            median=median,
-            robot=self.known.estimate.seen_from(newest),
-            still_there=None,
-        )
-
-    def _labels(self, rows: Ints) -> dict[str, int]:
-        """Returns how often each label has these spots, the commonest first."""
-        estimate = self.known.estimate
-        written = spellings(estimate.sights, estimate.counts, rows)
-        return named(written, self.known.labels, estimate.names)
+        last = int(estimate.sights.spots[rows, Spot.LAST].max())
+        yield _FoundThing(instance, instance.label, keys, last, stay.at, at_once, rows, newest)
 
     def _found_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields a mover: where it was last seen, inside the region if one is given."""
-        estimate, frame = self.known.estimate, self.known.frames[mover.epoch]
+        estimate = self.known.estimate
         rows = self.known.seen_there(mover, self.window, self.where)
         if not len(rows):
             return
@@ -373,23 +290,73 @@ class _Finder:
         newest = int(spots[:, Spot.LAST].argmax())
         places = [(x, y, z) for x, y, z in (spots[:, [Spot.X, Spot.Y, Spot.Z]] / _MM).tolist()]
         in_slice = np.flatnonzero(spots[:, Spot.SLICE] == spots[newest, Spot.SLICE]).tolist()
-        thing = replace(
-            self._thing(estimate.names[mover.key], frame, places[newest], rows, rows[[newest]]),
-            spread_m=int(spots[newest, Spot.DEV]) / _MM,
-            at_once=most_at_once(spots),
-            moves=True,
-        )
         yield _FoundThing(
-            label=thing.label,
-            keys=keys,
-            last=thing.last,
-            place=thing.place,
-            at_once=thing.at_once,
-            is_vague=estimate.is_vague(rows),
-            described=lambda: replace(thing, usually=self._usually(frame, rows)),
-            thing=mover,
+            mover,
+            estimate.names[mover.key],
+            keys,
+            int(spots[newest, Spot.LAST]),
+            places[newest],
+            most_at_once(spots),
+            rows,
+            rows[[newest]],
             also_at=tuple(places[number] for number in in_slice if number != newest),
         )
+
+    def described(self, found: _FoundThing) -> Thing:
+        """Returns a thing as it is shown."""
+        estimate, thing, rows = self.known.estimate, found.thing, found.rows
+        frame, spots = self.known.frames[thing.epoch], estimate.sights.spots[rows]
+        best, median = self._scores(rows)
+        shown = Thing(
+            label=found.label,
+            also_seen_as=(),
+            place=found.place,
+            spread_m=int(estimate.sights.spots[found.newest[0], Spot.DEV]) / _MM,
+            frame_id=frame,
+            inside=places_at(self.places, frame, *found.place[:2]),
+            first=int(spots[:, Spot.FIRST].min()),
+            last=found.last,
+            count=int(estimate.counts[rows].sum()),
+            best=best,
+            median=median,
+            robot=estimate.seen_from(found.newest),
+            still_there=None,
+            at_once=found.at_once,
+            near_m=found.near_m,
+        )
+        if isinstance(thing, Mover):
+            return replace(shown, moves=True, usually=self._usually(frame, rows))
+        parts = self._parts(thing)
+        last, newest = parts[-1]
+        # The stays at one place in a row, as one.
+        stays = [
+            self.known.stay(
+                np.concatenate([rows for _, rows in group]), group[-1][0].at, frame, self.places
+            )
+            for group in _by_place(parts)
+        ]
+        labels = self._labels(rows)
+        rows_of_all = np.concatenate([stay.spots for stay in thing.stays])
+        written = spellings(estimate.sights, estimate.counts, rows_of_all)
+        misread = Counter[str]()
+        for stay in thing.stays:
+            misread.update(stay.also)
+        return replace(
+            shown,
+            labels=tuple(labels.items()) if len(labels) > 1 else (),
+            also_seen_as=_commonest(written, thing.labels),
+            misread_as=_commonest(misread, thing.labels),
+            spread_m=last.dev_mm / _MM,
+            still_there=self._still_there(thing, last, newest),
+            moved=tuple(stays) if len(stays) > 1 else (),
+            usually=self._usually(frame, rows) if len(stays) > 1 else None,
+        )
+
+    def _labels(self, rows: Ints) -> dict[str, int]:
+        """Returns how often each label has these spots, the commonest first."""
+        estimate = self.known.estimate
+        written = spellings(estimate.sights, estimate.counts, rows)
+        return named(written, self.known.labels, estimate.names)
 
     def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
         """Returns where a thing usually is, by its spots."""
@@ -461,10 +428,10 @@ def _by_place(
     brought back.
     """
     groups: list[list[tuple[PlacedStay, Ints]]] = []
+    last: PlacedStay | None = None
     for part in parts:
-        before = groups[-1][-1][0] if groups else None
-        if before is not None and before.place == part[0].place and before.left is None:
-            groups[-1].append(part)
-        else:
-            groups.append([part])
+        if last is None or last.place != part[0].place or last.left is not None:
+            groups.append([])
+        groups[-1].append(part)
+        last = part[0]
     return groups

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -19,7 +19,6 @@ from ros2_memory.analysis.sights import (
     SCORE_BINS,
     STOREY_MM,
     Flags,
-    Floats,
     Hit,
     Ints,
     Score,
@@ -30,26 +29,29 @@ from ros2_memory.analysis.sights import (
 from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
-from ros2_memory.things.localisation import poorly_localised
-from ros2_memory.things.moves import Sightings, stays_in
-from ros2_memory.things.places import GATE_MM, places_of
+from ros2_memory.things.places import (
+    GATE_MM,
+    Sightings,
+    places_of,
+    poorly_localised,
+    stays_in,
+    with_synonyms,
+)
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
-    FieldOfView,
     Stay,
     evidence_at,
-    field_of_view,
+    fields_of_view,
     in_ranges,
     looks_without,
     stays_at,
 )
-from ros2_memory.things.synonyms import with_synonyms
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
 
-    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.model import TimeWindow, Vector3
 
 
 _FEWEST: Final = 3
@@ -106,7 +108,7 @@ class PlacedStay:
     also: Counter[str] = field(default_factory=Counter)
 
     @property
-    def at(self) -> tuple[float, float, float]:
+    def at(self) -> Vector3:
         """The mean of its detections (m)."""
         return self.x / 1000, self.y / 1000, self.z / 1000
 
@@ -191,7 +193,7 @@ class Estimate:
         """Whether the newest of some spots was seen while localisation was poor."""
         return bool(self.poor[rows[self.sights.spots[rows, Spot.LAST].argmax()]])
 
-    def place_of(self, stay: PlacedStay, rows: Ints) -> tuple[float, float, float]:
+    def place_of(self, stay: PlacedStay, rows: Ints) -> Vector3:
         """Returns the mean place (m) of some spots of a stay; of all of it if these are poor."""
         rows = rows[~self.poor[rows]]
         if not len(rows):
@@ -200,7 +202,7 @@ class Estimate:
         x, y, z = (np.average(spots, axis=0, weights=self.counts[rows]) / 1000).tolist()
         return x, y, z
 
-    def seen_from(self, spots: Ints) -> tuple[float, float, float] | None:
+    def seen_from(self, spots: Ints) -> Vector3 | None:
         """Returns the pose (m, rad) from which most messages saw some spots; None if unknown.
 
         That is the mean pose in one cell; of two with equal numbers, in the one that saw it later.
@@ -279,7 +281,7 @@ class _Group:
     unplaced: Ints
     places: list[Ints] = field(default_factory=list)
     stays: list[PlacedStay] = field(default_factory=list)
-    evidence: Evidence | None = None
+    evidence: Evidence = field(init=False)
 
 
 def estimate(
@@ -313,9 +315,13 @@ def estimate(
         _add_poorly_localised(group, linked, observed)
         if not _are_of_mover(group, linked):
             instances += linked
-            evidence |= _evidence_of(group, linked)
-        elif _is_no_false_mover(group, observed):
-            movers.append(Mover(group.key, group.epoch, group.rows))
+            # Of most places the evidence is of false detections, and not needed.
+            for place in {stay.place for thing in linked for stay in thing.stays}:
+                evidence[group.key, group.epoch, place] = group.evidence.at(place)
+        else:
+            n = observed.counts[group.rows]
+            if n[n >= _FEWEST].sum() >= _FEWEST_OF_MOVERS:
+                movers.append(Mover(group.key, group.epoch, group.rows))
     for instance in instances:
         rows = np.concatenate([stay.spots for stay in instance.stays])
         instance.labels = named(spellings(sights, observed.counts, rows), labels, names)
@@ -335,16 +341,6 @@ def estimate(
     for instance in instances:
         instance.looks, instance.missed_by = result.missing(instance, instance.stays[-1])
     return result
-
-
-def _evidence_of(
-    group: _Group, instances: Sequence[Instance]
-) -> dict[tuple[str, int, int], Evidence]:
-    """Returns the evidence for the places of things: most places are of false detections."""
-    if group.evidence is None:
-        return {}
-    places = {stay.place for instance in instances for stay in instance.stays}
-    return {(group.key, group.epoch, place): group.evidence.at(place) for place in places}
 
 
 def spellings(sights: Sights, counts: Ints, rows: Ints) -> Counter[str]:
@@ -372,8 +368,9 @@ class _Observations:
         hits: the hits of detections that count, by spot; `hit_starts` is where each spot's begin.
             Without a look where localisation was poor.
         groups: of each spot a number; those of one slice, topic and label have the same.
-        fields_of_view: by topic the one that its detections show.
-        side: of each spot, the mean of the unit vectors to it from where it was seen.
+        fields: the field of view of each topic, as of `fields_of_view`.
+        side: of each spot, the mean of the unit vectors to it from where it was seen; 0 where that
+            is not known.
         go_on: as of `estimate`.
     """
 
@@ -381,9 +378,15 @@ class _Observations:
         self, sights: Sights, epoch: Ints, min_score: float, go_on: Callable[[], None]
     ) -> None:
         spots, self.sights, self.go_on = sights.spots, sights, go_on
-        self.counts = _detections_that_count(sights, min_score)
+        # How many have no score that is too low.
+        self.counts = spots[:, Spot.N].copy()
+        low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
+        np.subtract.at(self.counts, low[:, Score.SPOT], low[:, Score.N])
         self.poor, poor_looks = poorly_localised(sights)
-        self.hits, self.hit_starts = _by_spot(_hits_that_count(sights, self.counts), sights)
+        # Those of detections that count: in proportion, rounded up.
+        hits, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
+        hits[:, Hit.N] = -(-hits[:, Hit.N] * self.counts[spot] // spots[spot, Spot.N])
+        self.hits, self.hit_starts = _by_spot(hits[hits[:, Hit.N] > 0], sights)
         self.hits[np.append(poor_looks, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
         self.groups = distinct_rows(
             [spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL]]
@@ -392,9 +395,13 @@ class _Observations:
         hits = self.hits[self.hits[:, Hit.LOOK] >= 0]
         spot, look, n = hits[:, Hit.SPOT], hits[:, Hit.LOOK], hits[:, Hit.N]
         distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
-        self.fields_of_view = _fields_of_view(spots[spot, Spot.TOPIC], distance, bearing, n)
+        topic = spots[spot, Spot.TOPIC]
+        self.fields = fields_of_view(topic, distance, bearing, n, len(sights.topics))
         heading = bearing + (self.cells.yaw + self.cells.pan)[look]
-        self.side = _mean_directions(spot, np.radians(heading), n, len(spots))
+        angle = np.radians(heading)
+        sums = [np.bincount(spot, n * part, len(spots)) for part in (np.cos(angle), np.sin(angle))]
+        total = np.maximum(np.bincount(spot, n, len(spots)), 1)
+        self.side = np.stack(sums, axis=1) / total[:, None]
 
     def firm(self, rows: Ints) -> Ints:
         """Returns the spots that were seen while localisation was good; all if too few were."""
@@ -407,40 +414,6 @@ class _Observations:
         place = spots[:, [Spot.X, Spot.Y]].astype(np.float64)
         times = spots[:, Spot.FIRST], spots[:, Spot.LAST]
         return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
-
-
-def _detections_that_count(sights: Sights, min_score: float) -> Ints:
-    """Returns how many detections of each spot have no score that is too low."""
-    counts = sights.spots[:, Spot.N].copy()
-    low = sights.scores[sights.scores[:, Score.BIN] < _lowest_bin(min_score)]
-    np.subtract.at(counts, low[:, Score.SPOT], low[:, Score.N])
-    return counts
-
-
-def _hits_that_count(sights: Sights, counts: Ints) -> Ints:
-    """Returns the hits of detections that count: in proportion, rounded up."""
-    hits, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
-    hits[:, Hit.N] = -(-hits[:, Hit.N] * counts[spot] // sights.spots[spot, Spot.N])
-    counting: Ints = hits[hits[:, Hit.N] > 0]
-    return counting
-
-
-def _fields_of_view(
-    topics: Ints, distance: Floats, bearing: Floats, n: Ints
-) -> dict[int, FieldOfView]:
-    """Returns by topic the field of view of hits (mm, degrees) of `n` messages each."""
-    fields: dict[int, FieldOfView] = {}
-    for topic in np.unique(topics).tolist():
-        rows = topics == topic
-        fields[topic] = field_of_view(distance[rows], bearing[rows], n[rows])
-    return fields
-
-
-def _mean_directions(spot: Ints, heading: Floats, n: Ints, spots: int) -> Floats:
-    """Returns for each of so many spots the mean unit vector of its hits (rad); 0 without any."""
-    sums = [np.bincount(spot, n * part, spots) for part in (np.cos(heading), np.sin(heading))]
-    means: Floats = np.stack(sums, axis=1) / np.maximum(np.bincount(spot, n, spots), 1)[:, None]
-    return means
 
 
 def _by_spot(table: Ints, sights: Sights) -> tuple[Ints, Ints]:
@@ -494,7 +467,10 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
     rows = observed.firm(group.rows)
     x, y, z, slices = observed.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z, Spot.SLICE]].T
     place = np.full(len(rows), -1, np.int64)
-    for floor in _floors(z):
+    # Heights that are next to each other on one floor are not far apart.
+    by_height = np.argsort(z, kind="stable")
+    floors = np.split(by_height, np.flatnonzero(np.diff(z[by_height]) > STOREY_MM) + 1)
+    for floor in floors:
         on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
         place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
@@ -507,12 +483,6 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
             group.places.append(rows_there)
         elif counts[number] >= _FEWEST:
             yield rows_there
-
-
-def _floors(z: Ints) -> list[Ints]:
-    """Returns the rows of some heights (mm) that are on one floor: next ones are not far apart."""
-    order = np.argsort(z, kind="stable")
-    return np.split(order, np.flatnonzero(np.diff(z[order]) > STOREY_MM) + 1)
 
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
@@ -538,7 +508,7 @@ def _find_stays(group: _Group, observed: _Observations) -> None:
     place_of_hit = np.repeat(place, observed.hit_starts[rows + 1] - observed.hit_starts[rows])
     group.evidence = evidence_at(
         observed.cells,
-        observed.fields_of_view,
+        observed.fields,
         centres,
         hits,
         place_of_hit,
@@ -600,12 +570,6 @@ def _remove_false_stays(
             group.stays.append(stay)
 
 
-def _is_beside(stay: PlacedStay, hosted: int, observed: _Observations) -> bool:
-    """Whether most messages that have one of a label also have this one, which is no noise then."""
-    together = observed.sights.spots[stay.spots, Spot.TOGETHER]
-    return 2 * stay.count > hosted and bool(np.median(together) > 1)
-
-
 class _Hosts:
     """Finds the stays that others are a wrong name of, or the noise around.
 
@@ -638,7 +602,10 @@ class _Hosts:
             host_group, host = self._stays[host_number]
             share = _HALO_SHARE if host_group is group else _SMALL_SHARE
             is_tiny = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
-            is_tiny &= not (host_group is group and _is_beside(stay, hosted, self._observed))
+            if is_tiny and host_group is group:
+                # Where most messages that have one have both of them, this one is no noise.
+                together = self._observed.sights.spots[stay.spots, Spot.TOGETHER]
+                is_tiny = not (2 * stay.count > hosted and np.median(together) > 1)
             is_part = is_tiny or stay.count <= hosted * share
             if host_number not in self.taken and is_part and hosted > most:
                 best, most = self._stays[host_number], hosted
@@ -716,15 +683,14 @@ def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> lis
             and (not proven or _has_ended(instance.stays[-1], stay))
         ]
         if ended:
-            best = max(ended, key=lambda instance: _preference(instance.stays[-1], stay))
-            best.stays.append(stay)
+            lasts = [instance.stays[-1] for instance in ended]
+            preferred = [
+                (last.place == stay.place, _has_ended(last, stay), last.last) for last in lasts
+            ]
+            ended[preferred.index(max(preferred))].stays.append(stay)
         else:
             instances.append(Instance(group.key, group.epoch, [stay]))
     return instances
-
-
-def _preference(last: PlacedStay, stay: PlacedStay) -> tuple[bool, bool, Ns]:
-    return last.place == stay.place, _has_ended(last, stay), last.last
 
 
 def _has_ended(last: PlacedStay, stay: PlacedStay) -> bool:
@@ -761,8 +727,8 @@ def _split_around_others(stays: Sequence[PlacedStay], observed: _Observations) -
 def _without_overlap(stays: list[PlacedStay], observed: _Observations) -> list[PlacedStay]:
     """Removes single sightings at places that a thing has left: they are false."""
     spots, kept = observed.sights.spots, []
-    for number, stay in enumerate(stays):
-        rows = stay.spots
+    for number, whole in enumerate(stays):
+        stay, rows = whole, whole.spots
         if number + 1 < len(stays):
             end = max(stays[number + 1].firm_first, stay.firm_last)
             rows = rows[spots[rows, Spot.LAST] <= end]
@@ -771,10 +737,8 @@ def _without_overlap(stays: list[PlacedStay], observed: _Observations) -> list[P
             rows = rows[spots[rows, Spot.FIRST] >= begin]
         if len(rows) < len(stay.spots):
             trimmed = _placed(observed, stay.place, stay.stay, rows)
-            trimmed.also, trimmed.left = stay.also, stay.left
-            kept.append(trimmed)
-        else:
-            kept.append(stay)
+            stay = replace(trimmed, also=stay.also, left=stay.left)
+        kept.append(stay)
     return kept
 
 
@@ -813,12 +777,6 @@ def _are_of_mover(group: _Group, linked: Sequence[Instance]) -> bool:
     moves = len(group.stays) - len(linked)
     is_restless = moves >= _RESTLESS_MOVES and moves > _RESTLESS_SHARE * len(group.rows)
     return is_restless or moves_by_itself(group.key)
-
-
-def _is_no_false_mover(group: _Group, observed: _Observations) -> bool:
-    """Whether a mover has more detections than false ones would give."""
-    n = observed.counts[group.rows]
-    return int(n[n >= _FEWEST].sum()) >= _FEWEST_OF_MOVERS
 
 
 def _names(sights: Sights, labels: Labels) -> dict[str, str]:

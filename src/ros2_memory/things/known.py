@@ -30,7 +30,7 @@ from ros2_memory.things.seen import SIGHTS_NS, Stretch, Watching
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
 
-    from ros2_memory.core.model import TimeWindow
+    from ros2_memory.core.model import TimeWindow, Vector3
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
 
@@ -77,10 +77,10 @@ class KnownThings:
     @property
     def reach(self) -> str:
         """Of which time it is, as the end of a sentence; empty where it is of all."""
+        since = "" if self.since is None else unix_text(self.since)
         if self.until == MAX_NS:
-            return "" if self.since is None else f" since {unix_text(self.since)}"
-        since = "" if self.since is None else f" from {unix_text(self.since)}"
-        return f"{since} until {unix_text(self.until)}"
+            return f" since {since}" if since else ""
+        return f"{f' from {since}' if since else ''} until {unix_text(self.until)}"
 
     def reaches_back(self, window: TimeWindow) -> bool:
         """Returns whether the things of a whole window are known."""
@@ -97,9 +97,7 @@ class KnownThings:
         places = (self.estimate.sights.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
         return rows[[where.contains(frame, x, y) for x, y in places]]
 
-    def stay(
-        self, rows: Ints, place: tuple[float, float, float], frame: str, places: Sequence[Place]
-    ) -> ThingStay:
+    def stay(self, rows: Ints, place: Vector3, frame: str, places: Sequence[Place]) -> ThingStay:
         """Returns some spots as the stay of a thing at a place (m) of a frame."""
         spots = self.estimate.sights.spots[rows]
         return ThingStay(
@@ -233,7 +231,7 @@ class _Loader:
     def _put(self, known: KnownThings | Ns) -> None:
         """Caches the answer, unless an open bag or a failure had a part in it."""
         if not self._view.call.used_active and self._view.notes.added == self._notes_before:
-            size = known.estimate.memory_bytes if isinstance(known, KnownThings) else _KEPT_BYTES
+            size = _KEPT_BYTES if isinstance(known, int) else known.estimate.memory_bytes
             self._cache.put(self._things_key, (self._view.timeline, known), size)
 
     def _estimated_in_time(self) -> KnownThings:
@@ -241,8 +239,7 @@ class _Loader:
         parts, crowded = self._gathered
         most = self._most_spots
         if self._read_from is not None:
-            self._view.notes.complete = False
-            self._view.notes.add(
+            self._view.notes.add_lack(
                 f"things are known since {unix_text(self._read_from)} only: reading older bags "
                 f"takes too long; {self._view.bags.filling_progress()}ask again"
             )
@@ -302,8 +299,12 @@ class _Loader:
         """
         stretches = _of_detectors([stretch for part in parts for stretch in part])
         epochs, frames = self._epochs(stretches)
-        sessions = dict.fromkeys(stretch.session for stretch in stretches)
-        numbers = {session: number for number, session in enumerate(sessions)}
+        sessions: dict[Hashable, int] = {}
+        of_parts = [
+            (epoch, sessions.setdefault(stretch.session, len(sessions)))
+            for epoch, stretch in zip(epochs, stretches, strict=True)
+            for _ in stretch.sights
+        ]
         estimating = self._view.call.partial_after(_ESTIMATING_S)
 
         def go_on() -> None:
@@ -315,12 +316,8 @@ class _Loader:
         self._view.memory.large.acquire()
         sights, epoch_of_slice = joined(
             [topic.packed for stretch in stretches for topic in stretch.sights],
-            [
-                epoch
-                for epoch, stretch in zip(epochs, stretches, strict=True)
-                for _ in stretch.sights
-            ],
-            [numbers[stretch.session] for stretch in stretches for _ in stretch.sights],
+            [epoch for epoch, _ in of_parts],
+            [session for _, session in of_parts],
         )
         things = estimate(sights, self._labels, epoch_of_slice, self._min_score, go_on)
         since = self._read_from
@@ -337,33 +334,24 @@ class _Loader:
         All that is in the map is of epoch 0. Odometry starts again in each session.
         """
         map_frame = self._view.limits.map_frame
-        numbers: dict[Hashable, int] = {(map_frame, None): 0}
-        frames = [map_frame or ""]
+        numbers: dict[tuple[str, Hashable], int] = {(map_frame or "", None): 0}
         epochs = []
-        for stretch in stretches:
-            odometry = stretch.frame_id, None if stretch.frame_id == map_frame else stretch.session
-            if odometry not in numbers:
-                numbers[odometry] = len(numbers)
-                frames.append(stretch.frame_id)
-            epochs.append(numbers[odometry])
-        return epochs, tuple(frames)
+        for frame, session in ((stretch.frame_id, stretch.session) for stretch in stretches):
+            odometry = frame, None if frame == map_frame else session
+            epochs.append(numbers.setdefault(odometry, len(numbers)))
+        return epochs, tuple(frame for frame, _ in numbers)
 
 
 def _of_detectors(stretches: Sequence[Stretch]) -> list[Stretch]:
     """Returns stretches with the sights of topics that have detections in any of them."""
     every_topic = [of_topic for stretch in stretches for of_topic in stretch.sights]
     detectors = {topic for of_topic in every_topic if of_topic.detects for topic in of_topic.topics}
-    of_detectors = (
-        stretch._replace(
-            sights=tuple(
-                of_topic for of_topic in stretch.sights if detectors.issuperset(of_topic.topics)
-            )
-        )
-        for stretch in stretches
-    )
-    return [
-        stretch for stretch in of_detectors if any(of_topic.topics for of_topic in stretch.sights)
-    ]
+    found = []
+    for stretch in stretches:
+        sights = tuple(part for part in stretch.sights if detectors.issuperset(part.topics))
+        if any(part.topics for part in sights):
+            found.append(stretch._replace(sights=sights))
+    return found
 
 
 def _spots(part: Sequence[Stretch]) -> int:

@@ -1,22 +1,44 @@
-"""Places of one label: clusters of the spots at which it was seen, over all time.
+"""Places of labels: where the spots of one label belong together, over all time.
 
 Places are what detections scatter around. They are found heaviest first on a grid, and every spot
 then belongs to the nearest one, so that two things a metre apart stay two although the noise of
 far detections overlaps.
+
+Where a thing was moved a little (`stays_in`): a sighting is where something was seen in one slice:
+the mean of some looks. It is off by the noise of each look; by that of its *visit*, whose looks
+share their error of localisation; and by the side that it is seen from, since detectors are biased
+along their view. A regression of all visits on the side and on a step says how large the step is,
+and how exactly that is known.
+
+Which labels a detector uses for one thing in turn (`with_synonyms`): "mug" and "coffee mug", at one
+place. They end in the same word, lie within the scatter of each other, alternate within a visit,
+and are not in one message there. Names that the owner declares apart stay apart, and one that is
+used in turn with both of them is joined with neither.
+
+When localisation was poor (`poorly_localised`): then a detection is not where it seems to be. That
+is while the localiser's covariance is large, and for some seconds before the map jumps under
+odometry, which shows that it had been off.
 """
 
 from __future__ import annotations
 
-from itertools import product
+import math
+from collections import defaultdict
+from itertools import combinations, pairwise, product, starmap
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Sights, Spot
 from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
 if TYPE_CHECKING:
-    from ros2_memory.analysis.sights import Flags, Floats, Ints
+    from collections.abc import Callable, Iterator, Sequence
 
+    from ros2_memory.analysis.sights import Flags, Floats, Ints
+    from ros2_memory.storage.base import Mask
 
 _CELL_MM: Final = 100
 _PEAK_MM: Final = 300
@@ -87,7 +109,11 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         is_claimed[cell] = True
         weight = float(mass[is_claimed].sum())
         is_free[is_claimed] = False
-        heavy = peaks[:count][_with_noise_at(peak, weight, peaks[:count], masses[:count])]
+        # Peaks that are so heavy that one this light may be their noise.
+        away, others = _away_squared(peaks[:count], peak), masses[:count]
+        is_halo = (away <= GATE_MM**2) & (others > weight / _HALO_SHARE)
+        is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
+        heavy = peaks[:count][is_halo | is_scatter]
         if all(
             weight >= _FEW
             and spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
@@ -112,15 +138,6 @@ def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
         if (before == peak).all():
             break
     return peak
-
-
-def _with_noise_at(peak: Floats, weight: float, peaks: Floats, masses: Floats) -> Flags:
-    """Returns which peaks are so heavy that one this light may be their noise."""
-    away = _away_squared(peaks, peak)
-    is_halo = (away <= GATE_MM**2) & (masses > weight / _HALO_SHARE)
-    is_scatter = (away <= _SCATTER_MM**2) & (masses + weight < _FEW)
-    may_be_noise: Flags = is_halo | is_scatter
-    return may_be_noise
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:
@@ -157,3 +174,380 @@ def _nearest(points: Floats, peaks: Floats) -> tuple[Ints, Floats]:
         nearest[is_closer] = number
         least[is_closer] = away[is_closer]
     return nearest, least
+
+
+_PAUSE_NS: Final = 60 * NS_PER_S
+"""A visit ends where nothing is seen for longer."""
+_FEWEST: Final = 3
+"""Fewer looks move nothing."""
+LEAST_MM: Final = 150.0
+"""A step that is shorter is none, however sure it is."""
+_SIGMAS: Final = 5.0
+"""So many standard errors are no chance, although a thing may be moved at any of many times."""
+_BIAS_MM: Final = 40.0
+"""Standard deviation of the bias by side: half of the difference between opposite sides."""
+_LOOK_MM: Final = 50.0
+"""Usual standard deviation of one look, which the looks at a thing correct."""
+_VISIT_MM: Final = 40.0
+"""Usual standard deviation of what the looks of a visit share, which all visits correct."""
+_LEAST_VISIT_MM: Final = 20.0
+"""That of a thing is taken for no less: a few visits may agree by chance."""
+_AT_ONCE: Final = 8_192
+"""Sightings that are looked at together: more take more memory, and no less time."""
+_USUAL: Final = 8
+"""What is usual weighs as much as so many looks, or differences between visits."""
+
+
+class Sightings(NamedTuple):
+    """Sightings of one thing in order of time, at least one.
+
+    Attributes:
+        xy: the mean of `n` looks (mm); `dev` is their root mean square distance from it.
+        side: the mean of the unit vectors from the robot to it; 0 where that is not known.
+        first, last: of the looks (ns).
+    """
+
+    xy: Floats
+    n: Ints
+    dev: Ints | Floats
+    side: Floats
+    first: Ints
+    last: Ints
+
+
+def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
+    """Returns the number of the visit of each sighting, of things in ascending order."""
+    # The latest so far of a thing, as its place among all: these are small numbers.
+    order = np.argsort(last, kind="stable")
+    rank = np.empty(len(last), np.int64)
+    rank[order] = np.arange(len(last))
+    offset = np.broadcast_to(thing, len(last)) * len(last)
+    latest = last[order][np.maximum.accumulate(rank + offset) - offset]
+    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (offset[1:] != offset[:-1])
+    return np.concatenate(([0], np.cumsum(begins)))
+
+
+def stays_in(things: Sequence[Sightings]) -> list[Ints]:
+    """Returns for the sightings of each thing the number of the stay of each, from 0."""
+    if not things:
+        return []
+    series = _Series.of(things)
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    variance = _visit_variances(*_differences(series), len(things))
+    stays = np.cumsum(_are_moved(series, variance))
+    return np.split(stays - stays[begins][series.thing], begins[1:])
+
+
+class _Series(NamedTuple):
+    """Sightings as rows of 1, the side and the place, by the weight of their looks (1/mm²).
+
+    Of all things, which are numbered; visits are numbered through all of them.
+    """
+
+    rows: Floats
+    n: Ints
+    visit: Ints
+    thing: Ints
+
+    @classmethod
+    def of(cls, things: Sequence[Sightings]) -> _Series:
+        sizes = np.array([len(sightings.n) for sightings in things])
+        thing, begins = np.repeat(np.arange(len(things)), sizes), np.cumsum(sizes) - sizes
+        xy, n, dev, side, first, last = map(np.concatenate, zip(*things, strict=True))
+        squares = n * dev**2 / 2
+        looks = np.add.reduceat(n, begins) - sizes + _USUAL
+        usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks
+        weight = n * (n - 1 + _USUAL) / (squares + _USUAL * usual[thing])
+        place = xy - (np.add.reduceat(xy, begins) / sizes[:, None])[thing]
+        rows = np.hstack((np.ones((len(weight), 1)), side, place)) * weight[:, None]
+        return cls(rows, n, visits_of(first, last, thing), thing)
+
+
+def _differences(series: _Series) -> tuple[Floats, Ints]:
+    """Returns what visits add to the variance (mm²), by each two of a thing in a row; its number.
+
+    Not by the two that differ most: between these it may have been moved. Ascending for each thing.
+    """
+    starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
+    sums, thing = np.add.reduceat(series.rows, starts), series.thing[starts]
+    means = sums / sums[:, :1]
+    begins = np.flatnonzero(np.diff(thing, prepend=-1))
+    normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins)
+    fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR[:3]), normal[:, :3, 3:])
+    off = means[:, 3:] - np.einsum("vi,vij->vj", means[:, :3], fit[thing])
+    by_looks = 1 / sums[:-1, 0] + 1 / sums[1:, 0]
+    variance = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
+    is_of_one = thing[1:] == thing[:-1]
+    variance, thing = variance[is_of_one], thing[1:][is_of_one]
+    order = np.lexsort((variance, thing))
+    variance, thing = variance[order], thing[order]
+    is_greatest = np.diff(thing, append=-1) != 0
+    return variance[~is_greatest], thing[~is_greatest]
+
+
+def _visit_variances(differences: Floats, thing: Ints, things: int) -> Floats:
+    """Returns what visits add to the variance (mm²) of each thing."""
+    median = float(np.median(differences)) if len(differences) else 0.0
+    usual = _shrunk(len(differences), median, _VISIT_MM**2)
+    sizes = np.bincount(thing, minlength=things)
+    begins = np.cumsum(sizes) - sizes
+    visited = np.flatnonzero(sizes)
+    medians = np.zeros(things)
+    low = begins[visited] + (sizes[visited] - 1) // 2
+    high = begins[visited] + sizes[visited] // 2
+    medians[visited] = (differences[low] + differences[high]) / 2
+    return _shrunk(sizes, medians, usual)
+
+
+def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Floats:
+    """Returns the median of `n` variances, drawn to what is usual the more the fewer they are."""
+    return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
+
+
+_PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2, 0.0])
+"""What is known (1/mm²) before any look of the place, the bias by side in x and y, and the step.
+
+Of the place next to nothing, so that the equations have a solution; of the step nothing.
+"""
+
+
+def _squares(sums: Floats, visit: Floats | float) -> Floats:
+    """Returns the squares of visits' means, each by its weight; `visit` is their own variance."""
+    weight = np.maximum(sums[:, 0], 1e-30)
+    scale = 1 / weight / (1 + visit * weight)
+    squares: Floats = sums[:, :, None] * sums[:, None, :] * scale[:, None, None]
+    return squares
+
+
+def _are_moved(series: _Series, variance: Floats) -> Flags:
+    """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
+    moved = np.zeros(len(series.n), np.bool_)
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1)).tolist()
+    waiting = [*pairwise([*begins, len(moved)])]
+    while waiting:
+        spans, size = [], 0
+        while waiting and size < _AT_ONCE:
+            start, stop = waiting.pop()
+            spans.append((start, stop))
+            size += stop - start
+        rows = np.concatenate([np.arange(*span) for span in spans])
+        number = np.repeat(np.arange(len(spans)), [stop - start for start, stop in spans])
+        batch = _Series(series.rows[rows], series.n[rows], series.visit[rows], number)
+        for span, row in _steps(batch, variance[series.thing[rows]]):
+            start, stop = spans[span]
+            step = int(rows[row])
+            moved[step] = True
+            waiting += [(start, step), (step, stop)]
+    return moved
+
+
+def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
+    """Yields the things with a step, and the first sighting after the likeliest one.
+
+    `variance` is that of the visit of each sighting.
+    """
+    begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
+    looks = np.cumsum(series.n)
+    of_others, total = (looks - series.n)[begins], np.add.reduceat(series.n, begins)
+    old_looks = looks - of_others[series.thing]
+    new_looks = total[series.thing] - old_looks
+    at = np.flatnonzero((old_looks >= _FEWEST) & (new_looks >= _FEWEST)) + 1
+    if not len(at):
+        return
+    old, new = _before_and_after(series, begins, at, variance)
+    likely = _likelihoods(old, new)
+    # Of each thing the likeliest, of equal ones the first.
+    order = np.lexsort((at, -likely, series.thing[at]))
+    things, first = np.unique(series.thing[at[order]], return_index=True)
+    best = order[first]
+    is_sure = likely[best] > _SIGMAS**2
+    yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
+
+
+def _likelihoods(old: Floats, new: Floats) -> Floats:
+    """Returns for each step, by the squares before and after it, how many standard errors it is.
+
+    Squared; 0 of one that is too short to be any.
+    """
+    both = old + new
+    normal = np.zeros((len(both), 4, 4))
+    normal[:, :3, :3] = both[:, :3, :3]
+    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
+    normal[:, 3, 3] = new[:, 0, 0]
+    right = np.concatenate((both[:, :3, 3:], new[:, :1, 3:]), axis=1)
+    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
+    length_squared = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
+    return np.where(length_squared >= LEAST_MM**2, length_squared / inverse[:, 3, 3], 0.0)
+
+
+def _before_and_after(
+    series: _Series, begins: Ints, at: Ints, variance: Floats
+) -> tuple[Floats, Floats]:
+    """Returns the squares of a thing's visits before and after each step, which may be within one.
+
+    `begins` has where each thing begins.
+    """
+    is_start = np.diff(series.visit, prepend=-1) != 0
+    is_start[begins] = True
+    starts = np.flatnonzero(is_start)
+    ends = np.append(starts, len(series.n))
+    sums = np.vstack((np.zeros((1, 5)), np.cumsum(series.rows, axis=0)))
+    squares = _squares(np.diff(sums[ends], axis=0), variance[starts])
+    until = np.concatenate((np.zeros((1, 5, 5)), np.cumsum(squares, axis=0)))
+    first = np.searchsorted(starts, begins)
+    stop = np.append(first[1:], len(starts))
+    visit, thing, own = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
+    old = until[visit] - until[first[thing]] + _squares(sums[at] - sums[ends[visit]], own)
+    new = until[stop[thing]] - until[visit + 1] + _squares(sums[ends[visit + 1]] - sums[at], own)
+    return old, new
+
+
+_FEWEST_TURNS: Final = 3
+"""A label that took fewer turns is a mistake."""
+_BESIDE_SHARE: Final = 0.02
+"""One message in fifty may have a thing twice."""
+_LEAST_SHARE: Final = 0.05
+"""A label that is given more rarely is a mistake."""
+_SAME_MM: Final = 100.0
+"""Means of two labels in a visit that are no farther apart are of one place."""
+_SCATTERS: Final = 2.0
+"""So are those within as many root mean square distances of the looks, if that is more."""
+
+
+def with_synonyms(
+    sights: Sights,
+    counts: Ints,
+    epoch: Ints,
+    labels: Labels,
+    go_on: Callable[[], None],
+) -> list[str]:
+    """Returns the keys of the labels of sights, one for all that are names of one thing.
+
+    `epoch` has the coordinate system of each spot, and `counts` how many of its detections count.
+    """
+    keys = [labels.key(label) for label in sights.labels]
+    by_word: dict[str, list[str]] = defaultdict(list)
+    for key in sorted(set(keys)):
+        if not moves_by_itself(key):
+            by_word[last_word(key)].append(key)
+    has_key = {key: np.array([key == other for other in keys]) for key in set(keys)}
+
+    def are_two(one: str, other: str) -> bool:
+        go_on()
+        return labels.are_apart(one, other) or _are_beside(sights, has_key[one], has_key[other])
+
+    groups = {key: frozenset({key}) for key in keys}
+    pairs = [pair for alike in by_word.values() for pair in combinations(alike, 2)]
+    for one, other in pairs:
+        masks = has_key[one], has_key[other]
+        if not are_two(one, other) and _alternate(sights.spots, counts, epoch, *masks):
+            group = groups[one] | groups[other]
+            groups |= dict.fromkeys(group, group)
+    # A name that is used for two things does not tell them apart.
+    names = {
+        group: None if any(starmap(are_two, combinations(sorted(group), 2))) else min(group)
+        for group in {*groups.values()}
+    }
+    return [names[groups[key]] or key for key in keys]
+
+
+def _are_beside(sights: Sights, one: Mask, other: Mask) -> bool:
+    """Whether messages have both of two labels at one place, more often than by mistake.
+
+    Each is given as which labels of the sights are names of it.
+    """
+    label, beside = sights.spots[:, Spot.LABEL], sights.beside
+    is_both = one[label[beside[:, Beside.SPOT]]] & other[beside[:, Beside.LABEL]]
+    rarer = min(int(sights.spots[mask[label], Spot.N].sum()) for mask in (one, other))
+    return bool(beside[is_both, Beside.N].sum() > _BESIDE_SHARE * rarer)
+
+
+def _alternate(spots: Ints, counts: Ints, epoch: Ints, one: Mask, other: Mask) -> bool:
+    """Whether two labels take turns at some place, within the scatter of each other."""
+    of_both = np.flatnonzero((one | other)[spots[:, Spot.LABEL]] & (counts > 0))
+    for number in np.unique(epoch[of_both]).tolist():
+        rows = of_both[epoch[of_both] == number]
+        x, y, slices, label = spots[rows][:, [Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL]].T
+        place = places_of(x, y, counts[rows], slices)
+        for here in (place == nearest for nearest in range(int(place.max(initial=-1)) + 1)):
+            is_other = other[label[here]].astype(np.int64)
+            if is_other.any() and not is_other.all():
+                rarer, total = _turns(spots[rows[here]], counts[rows[here]], is_other)
+                if rarer >= max(_FEWEST_TURNS, _LEAST_SHARE * total):
+                    return True
+    return False
+
+
+def _turns(spots: Ints, n: Ints, is_other: Ints) -> tuple[int, int]:
+    """Returns how often the rarer of two labels was seen in visits with turns, and both.
+
+    `spots` are at one place in order of time, with `n` detections each; `is_other` is 0 or 1.
+    """
+    visit = visits_of(spots[:, Spot.FIRST], spots[:, Spot.LAST])
+    cell, size = 2 * visit + is_other, 2 * int(visit[-1]) + 2
+    seen = np.bincount(cell, n, size)
+    means = [
+        (np.bincount(cell, n * spots[:, column], size) / np.maximum(seen, 1)).reshape(-1, 2)
+        for column in (Spot.X, Spot.Y)
+    ]
+    apart = np.hypot(*(mean[:, 1] - mean[:, 0] for mean in means))
+    squares = np.bincount(visit, n * spots[:, Spot.DEV] ** 2)
+    scatter = np.sqrt(squares / np.bincount(visit, n))
+    first, last = np.full(size, np.iinfo(np.int64).max), np.zeros(size, np.int64)
+    np.minimum.at(first, cell, spots[:, Spot.FIRST])
+    np.maximum.at(last, cell, spots[:, Spot.LAST])
+    begin, end = first.reshape(-1, 2), last.reshape(-1, 2)
+    in_turn = (begin[:, 0] < end[:, 1]) & (begin[:, 1] < end[:, 0])
+    in_turn &= apart <= np.maximum(_SAME_MM, _SCATTERS * scatter)
+    turns = seen.reshape(-1, 2)[in_turn].sum(axis=0)
+    return int(turns.min()), int(turns.sum())
+
+
+_POOR_MM: Final = 600
+"""Standard deviation of a point 2 m before the robot."""
+_JUMP_MM: Final = 300.0
+"""So far the map moves that point in a jump."""
+_BEFORE_NS: Final = 5 * NS_PER_S
+_NEXT_NS: Final = 4 * NS_PER_S
+_NEVER_NS: Final = 3600 * NS_PER_S
+_KNOWN_NS: Final = 60 * NS_PER_S
+"""What a localiser said holds as long; it says nothing while the robot stands."""
+
+
+def poorly_localised(sights: Sights) -> tuple[Flags, Flags]:
+    """Returns which spots and which looks are of a slice in which localisation was poor."""
+    fixes = sights.fixes
+    time = fixes[:, Fix.TIME]
+    after = np.diff(time, append=time[-1:])
+    after[after < 0] = _NEVER_NS  # the next one is of another session
+    turn = np.radians((np.diff(fixes[:, Fix.YAW]) + 1800) % 3600 / 10 - 180)
+    off = np.hypot(np.diff(fixes[:, Fix.X]), np.diff(fixes[:, Fix.Y])) + AHEAD_MM * np.abs(turn)
+    jumped = np.flatnonzero((off > _JUMP_MM) & (after[:-1] <= _NEXT_NS))
+    vague = np.flatnonzero(_sigma_said(fixes[:, Fix.SIGMA], after) > _POOR_MM)
+    starts = np.concatenate((time[jumped] - _BEFORE_NS, time[vague]))
+    stops = np.concatenate((time[jumped + 1], time[vague] + np.minimum(after[vague], _KNOWN_NS)))
+    order = np.argsort(starts, kind="stable")
+    starts, stops = starts[order], np.maximum.accumulate(stops[order])
+
+    def are_poor(first: Ints, last: Ints) -> Flags:
+        before = np.searchsorted(starts, last, side="right")
+        poor: Flags = (before > 0) & (np.append(stops, 0)[before - 1] >= first)
+        return poor
+
+    spots, looks = sights.spots, sights.looks
+    poor_spots = are_poor(spots[:, Spot.FIRST], spots[:, Spot.LAST])
+    poor_looks = are_poor(looks[:, Look.FIRST], looks[:, Look.LAST])
+    # Whole slices: else a look from beside would miss what a spot that is left out has seen.
+    slices = np.union1d(spots[poor_spots, Spot.SLICE], looks[poor_looks, Look.SLICE])
+    return np.isin(spots[:, Spot.SLICE], slices), np.isin(looks[:, Look.SLICE], slices)
+
+
+def _sigma_said(sigma: Ints, after: Ints) -> Ints:
+    """Returns the deviation (mm) that the localiser gave last, at each fix; -1 if not known.
+
+    `after` is how long (ns) it is until the next fix.
+    """
+    is_new = sigma >= 0
+    is_new[1:] |= after[:-1] > _KNOWN_NS
+    last = np.maximum.accumulate(np.where(is_new, np.arange(len(sigma)), 0))
+    return sigma[last]

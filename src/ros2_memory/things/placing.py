@@ -8,8 +8,9 @@ looks of all topics that may have detections; `detectors` are those that show it
 from __future__ import annotations
 
 import math
+import re
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -58,7 +59,7 @@ _SAME_M: Final = 0.1
 _COVARIANCE: Final = 36
 
 
-_OF_DETECTORS: Final = ("detection", "recognizedobject")
+_OF_DETECTORS: Final = re.compile("(detection|recognizedobject)[^/]*$", re.IGNORECASE)
 AROUND_NS: Final[Ns] = 12 * NS_PER_S
 """How far around a stretch poses and transforms are read."""
 
@@ -114,7 +115,18 @@ class Placer:
         poses = self._poses(session, window)
         target, frames = self._frames(lender, window, poses)
         sights = [
-            sights_of(topic, _in_target(messages, poses, frames))
+            sights_of(
+                topic,
+                DetectorMessages(
+                    times=messages.log_times,
+                    robot=_robot_at(poses, messages, frames),
+                    rows=messages.found.rows,
+                    labels=messages.found.labels.codes.astype(np.int64),
+                    names=messages.found.labels.words,
+                    places=_places_in_target(messages, frames),
+                    scores=messages.found.scores,
+                ),
+            )
             for topic, messages in detected.items()
         ]
         if target == self._view.limits.map_frame and len(poses):
@@ -132,16 +144,12 @@ class Placer:
         detectors: set[str] = set()
         for topic, of_topic in by_topic.items():
             messages = joined_detected([self.rows.of(rows) for rows in of_topic])
-            is_named = any(map(self._are_of_detector, of_topic))
+            named = [rows for rows in of_topic if _OF_DETECTORS.search(rows.table.channel.type)]
+            is_named = any(map(self.rows.have_labels, named))
             if messages.log_times.size:
                 detected[topic] = messages
                 detectors |= {topic} if is_named or messages.found.rows.size else set()
         return detected, detectors
-
-    def _are_of_detector(self, rows: Rows) -> bool:
-        """Returns whether the type of some rows is named for detections, and has labels."""
-        name = rows.table.channel.type.rpartition("/")[2].casefold()
-        return any(word in name for word in _OF_DETECTORS) and self.rows.have_labels(rows)
 
     def _poses(self, session: Session, window: TimeWindow) -> Poses:
         """Returns the robot's poses in the frame that most of them are in."""
@@ -207,52 +215,31 @@ class Placer:
         return fixes_of(times[is_kept], pose[is_kept], sigma[is_kept])
 
     def _localised(self, session: Session, window: TimeWindow) -> tuple[Ints, Floats]:
-        """Returns what the localiser said: when, and its standard deviation (m)."""
-        timeline = self._view.timeline
-        said = sorted(
-            deviation
-            for topic in timeline.topics()
-            if LOCALISER in timeline.types_of(topic)
-            for deviation in self._deviations(topic, session, window)
-        )
-        times = np.array([time for time, _ in said], np.int64)
-        return times, np.array([sigma for _, sigma in said], np.float64)
-
-    def _deviations(
-        self, topic: str, session: Session, window: TimeWindow
-    ) -> Iterator[tuple[Ns, float]]:
-        """Yields a localiser's standard deviation (m) with its log time, once in `_SAID_NS`.
+        """Returns what localisers said, once in `_SAID_NS`: when, and the standard deviation (m).
 
         From the messages: covariances have no columns.
         """
-        memory = self._view.memory
-        for rows in scan(self._view, topic, window):
-            if self._sessions.of(rows.recording) != session:
+        view, said = self._view, []
+        for topic in view.timeline.topics():
+            if LOCALISER not in view.timeline.types_of(topic):
                 continue
-            slices = rows.times // _SAID_NS
-            firsts = np.flatnonzero(np.diff(slices, prepend=slices[:1] - 1))
-            for stored in messages_of(self._view, rows.some(firsts)):
-                message = self._view.bags.decode(stored)
-                if message is None:
+            for rows in scan(view, topic, window):
+                if self._sessions.of(rows.recording) != session:
                     continue
-                frame = memory.extractor.frame(message).lstrip("/")
-                sigma = _sigma_ahead(getattr(getattr(message, "pose", None), "covariance", None))
-                if sigma is not None and frame == memory.limits.map_frame:
-                    yield stored.time, sigma
-
-
-def _in_target(detected: Detected, poses: Poses, frames: FrameTree) -> DetectorMessages:
-    """Returns messages with the robot's poses and the detections placed in the target frame."""
-    detections = detected.found
-    return DetectorMessages(
-        times=detected.log_times,
-        robot=_robot_at(poses, detected, frames),
-        rows=detections.rows,
-        labels=detections.labels.codes.astype(np.int64),
-        names=detections.labels.words,
-        places=_places_in_target(detected, frames),
-        scores=detections.scores,
-    )
+                slices = rows.times // _SAID_NS
+                firsts = np.flatnonzero(np.diff(slices, prepend=slices[:1] - 1))
+                for stored in messages_of(view, rows.some(firsts)):
+                    message = view.bags.decode(stored)
+                    if message is None:
+                        continue
+                    frame = view.extractor.frame(message).lstrip("/")
+                    pose = getattr(message, "pose", None)
+                    sigma = _sigma_ahead(getattr(pose, "covariance", None))
+                    if sigma is not None and frame == view.limits.map_frame:
+                        said.append((stored.time, sigma))
+        said.sort()
+        times = np.array([time for time, _ in said], np.int64)
+        return times, np.array([sigma for _, sigma in said], np.float64)
 
 
 def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:

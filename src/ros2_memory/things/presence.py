@@ -12,7 +12,6 @@ there (Viterbi, two states) gives the stays.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
 from itertools import groupby, pairwise, product
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -209,25 +208,18 @@ def _hashed(rows: Ints) -> Ints:
     return numbers
 
 
-class FieldOfView(NamedTuple):
-    """The distances (mm) and directions (degrees) at which a detector sees nearly all it sees."""
+def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topics: int) -> Floats:
+    """Returns how far (mm), and from and to which directions (degrees), detectors see.
 
-    most_mm: float
-    least_deg: float
-    most_deg: float
-
-    def contains(self, distance: Floats, bearing: Floats) -> Flags:
-        """Returns which distances (mm) and directions (degrees) lie in it."""
-        is_ahead = (bearing >= self.least_deg) & (bearing <= self.most_deg)
-        inside: Flags = is_ahead & (distance <= self.most_mm)
-        return inside
-
-
-def field_of_view(distance: Floats, bearing: Floats, n: Ints) -> FieldOfView:
-    """Returns the field of view in which nearly all detections lie: `n` at each (mm, degrees)."""
-    [far] = _weighted_quantiles(distance, n, 1 - _VIEW_SHARE)
-    low, high = _weighted_quantiles(bearing, n, _VIEW_SHARE, 1 - _VIEW_SHARE)
-    return FieldOfView(far, low, high)
+    That is for each of so many topics where nearly all its detections lie: `n` at each.
+    """
+    fields = np.full((topics, 3), -1.0)
+    for number in np.unique(topic).tolist():
+        rows = topic == number
+        [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
+        sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
+        fields[number] = far, *sides
+    return fields
 
 
 def in_ranges(starts: Ints, sizes: Ints) -> Ints:
@@ -306,7 +298,7 @@ class Stay(NamedTuple):
 
 def evidence_at(
     cells: Cells,
-    fields_of_view: dict[int, FieldOfView],
+    fields: Floats,
     places: Floats,
     rows: Ints,
     place: Ints,
@@ -315,8 +307,8 @@ def evidence_at(
 ) -> Evidence:
     """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
 
-    `fields_of_view` are by topic; `place` has the number of the place of each row; `unplaced` are
-    the rows of the label.
+    `fields` are as of `fields_of_view`, `place` has the number of the place of each row, and
+    `unplaced` the rows of the label.
     """
     has_look, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
     blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~has_look], n[~has_look])
@@ -334,21 +326,18 @@ def evidence_at(
     hits = np.zeros(len(looks), np.int64)
     hits[np.searchsorted(looks, hit_looks)] = hits_of
     fair = sees[cell]
-    fair[fair] = _are_in_view(cells, fields_of_view, places, looks[fair])
+    fair[fair] = _are_in_view(cells, fields, places, looks[fair])
     numbers = _number(looks)
     n = np.maximum(cells.n[numbers] - cells.totals_in(numbers, unplaced), hits)
     return Evidence(looks, cell, n, hits, blind, times, fair)
 
 
-def _are_in_view(
-    cells: Cells, fields_of_view: dict[int, FieldOfView], places: Floats, looks: Ints
-) -> Flags:
+def _are_in_view(cells: Cells, fields: Floats, places: Floats, looks: Ints) -> Flags:
     """Returns which looks have their place (mm) in the field of view of their topic."""
-    numbers, at = _number(looks), places[_place(looks)]
-    distance, bearing = cells.seen_at(numbers, at[:, 0], at[:, 1])
-    are_in_view = np.zeros(len(looks), bool)
-    for topic, field in fields_of_view.items():
-        are_in_view |= field.contains(distance, bearing) & (cells.topic[numbers] == topic)
+    numbers = _number(looks)
+    distance, bearing = cells.seen_at(numbers, *places[_place(looks)].T)
+    far, left, right = fields[cells.topic[numbers]].T
+    are_in_view: Flags = (distance <= far) & (bearing >= left) & (bearing <= right)
     return are_in_view
 
 
@@ -412,22 +401,6 @@ def _sees(cells: Cells, hit_cells: Ints, cell: Ints, n: Ints, hits: Ints) -> Fla
     return sees
 
 
-class _Series(NamedTuple):
-    """The evidence for the places of a label, by slices of places.
-
-    Attributes:
-        slices: the places and slices, as keys in order.
-        odds: the natural logarithm of the odds that it was there, by each alone.
-        hits: how often it was seen.
-        messages: of the looks that saw it.
-    """
-
-    slices: Ints
-    odds: Floats
-    hits: Ints | Floats
-    messages: Ints | Floats
-
-
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
     slices, odds, hits, messages = _by_slice(cells, evidence)
@@ -449,7 +422,12 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
         yield place, Stay(first_slice, last_slice, firm_first, firm_last, n, n_messages, left)
 
 
-def _by_slice(cells: Cells, evidence: Evidence) -> _Series:
+def _by_slice(cells: Cells, evidence: Evidence) -> tuple[Ints, Floats, Ints, Ints]:
+    """Returns the slices of places, as keys in order, with the evidence of each alone.
+
+    That is the natural logarithm of the odds that it was there, how often it was seen, and the
+    messages of the looks that saw it.
+    """
     looks = _keys(_place(evidence.looks), cells.slice[_number(evidence.looks)])
     slices = _distinct(np.concatenate((looks, evidence.blind)))
     slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
@@ -461,7 +439,7 @@ def _by_slice(cells: Cells, evidence: Evidence) -> _Series:
     by_look = _odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
     odds = np.bincount(slice_of, by_look, len(slices)).astype(np.float64)
     odds[blind] += _UNPLACED_HIT * evidence.times
-    return _Series(slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, messages)
+    return slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, messages
 
 
 def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
@@ -531,22 +509,23 @@ def _present(by_slice: Floats, place: Ints) -> Iterator[tuple[int, int, int, int
 
     As the place, [start, stop), and where the slices of this place end.
     """
-    ends = np.append(np.flatnonzero(place[1:] != place[:-1]) + 1, len(place)).tolist()
     if not len(place):
         return
     # Runs of one sign have one state: fewer steps than slices.
-    changes = np.flatnonzero(np.diff(by_slice >= 0)) + 1
-    starts = np.union1d([0, *ends[:-1]], changes)
-    sums, starts = np.add.reduceat(by_slice, starts).tolist(), starts.tolist()
-    begin = 0
-    for end in ends:
-        stop = bisect_left(starts, end)
-        runs = zip(_states(sums[begin:stop]), pairwise([*starts[begin:stop], end]), strict=True)
-        for is_there, same in groupby(runs, itemgetter(0)):
+    is_positive = by_slice >= 0
+    starts = np.flatnonzero(
+        np.diff(place, prepend=-1).astype(bool) | np.diff(is_positive, prepend=is_positive[:1])
+    )
+    spans = pairwise([*starts.tolist(), len(place)])
+    sums = np.add.reduceat(by_slice, starts).tolist()
+    of_places = groupby(zip(place[starts].tolist(), sums, spans, strict=True), itemgetter(0))
+    for number, runs in of_places:
+        _, sums_there, spans_there = zip(*runs, strict=True)
+        states = zip(_states(sums_there), spans_there, strict=True)
+        for is_there, same in groupby(states, itemgetter(0)):
             if is_there:
                 begins, stops = zip(*(span for _, span in same), strict=True)
-                yield int(place[end - 1]), begins[0], stops[-1], end
-        begin = stop
+                yield number, begins[0], stops[-1], spans_there[-1][1]
 
 
 def _states(sums: Sequence[float]) -> Sequence[bool]:

@@ -168,12 +168,8 @@ class Watching:
             if any(map(may_have_detections, timeline.types_of(topic)))
         ]
         limits = view.limits
-        self._needed = (
-            *self._topics,
-            view.pose_topic,
-            *limits.tf_topics,
-            *(topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic)),
-        )
+        localisers = (topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic))
+        self._needed = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
         self._may_be_kept = not view.stream.may_be_relatched(self._topics)
         self._digested: tuple[object, str] = None, ""
 
@@ -454,10 +450,8 @@ class _Parts(NamedTuple):
         if scanner.store.failures != failures:
             return None
         heads.sort(key=lambda head: head.first)
-        firsts, lasts, numbers = (
-            np.array([getattr(head, name) for head in heads], np.int64)
-            for name in ("first", "last", "number")
-        )
+        bounds = [(head.first, head.last, head.number) for head in heads]
+        firsts, lasts, numbers = np.array(bounds, np.int64).reshape(-1, 3).T
         counting = coverage.counts([head.bags for head in heads])
         all_count = counting == [head.bags.size for head in heads]
         return cls(merged, firsts, lasts, np.maximum.accumulate(lasts), numbers, all_count)

@@ -113,14 +113,6 @@ def test_a_thing_is_missed_only_where_the_robot_looked_again(tmp_path: Path) -> 
     assert labels(compared(tmp_path / "after", after)) == {"not_looked_at": ["mug"]}
 
 
-def test_a_thing_that_was_detected_without_a_place_is_not_missed(tmp_path: Path) -> None:
-    lost = ("mug", math.nan, math.nan)
-    reply = compared(tmp_path, [*looked(0, 20, HERE, MUG), *looked(60, 90, HERE, lost)])
-    assert labels(reply) == {"not_looked_at": ["mug"]}
-    [note] = reply["notes"]
-    assert "could not be placed: mug (30 times" in note
-
-
 def test_a_thing_that_was_brought_back_in_between_is_not_missed(tmp_path: Path) -> None:
     seen = [*looked(0, 30, HERE, MUG), *looked(30, 45, HERE)]
     back = [*seen, *looked(45, 60, HERE, MUG), *looked(60, 90, AWAY)]

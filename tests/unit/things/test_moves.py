@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.sights import Look, fixes_of
 from ros2_memory.columns.sights import joined, packed
-from ros2_memory.things.localisation import poorly_localised
-from ros2_memory.things.moves import Sightings, stays_in
+from ros2_memory.things.places import Sightings, poorly_localised, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
 from tests.support.examples import examples
 from tests.support.memories import asked, memory_of
@@ -109,16 +108,6 @@ def test_a_thing_that_was_moved_a_little_is_where_it_was_seen_last(
         was = each["was"]["x"], each["was"]["y"]
         assert math.dist(was, home.before[each["label"]]) < 0.05 + bias
     assert reply["things_unchanged"] == 0
-
-
-@pytest.mark.parametrize(
-    ("bias", "sides"), [(0.0, ""), (0.1, ""), (0.1, "000001"), (0.1, "000011"), (0.1, "010101")]
-)
-def test_a_world_without_moves_has_none(tmp_path: Path, bias: float, sides: str) -> None:
-    things = found(tmp_path, Home(4, bias=bias, sides=sides))
-    assert not any("moved" in thing for thing in things.values())
-    reply = compare(tmp_path)
-    assert (reply["things"], reply["things_unchanged"]) == ({}, len(LABELS))
 
 
 # -- sightings, in many worlds -------------------------------------------------------------------
