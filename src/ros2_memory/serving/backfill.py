@@ -94,36 +94,27 @@ class Backfill:
             return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
         return self.filling.progress(timeline)
 
-    def _to_fill(self) -> tuple[Filling, Timeline] | None:
-        """Returns what fills the store, and the bags; None without a store, or without its bags.
+    def _filled(self, work: Callable[[Filling, Timeline], T], otherwise: T) -> T:
+        """Returns what `work` does with the store and the bags, where there are both.
 
         A missing bag directory is more likely a missing disk than an empty one.
         """
         snapshot = self._memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
-            return None
-        return self.filling, snapshot.timeline
+            return otherwise
+        return work(self.filling, snapshot.timeline)
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags of which columns are to be stored, the newest first."""
-        if (to_fill := self._to_fill()) is None:
-            return []
-        filling, timeline = to_fill
-        return filling.waiting(timeline)
+        return self._filled(Filling.waiting, [])
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        if (to_fill := self._to_fill()) is None:
-            return []
-        filling, timeline = to_fill
-        return filling.batches(timeline)
+        return self._filled(Filling.batches, [])
 
     def store(self, batch: Batch) -> int:
         """Stores the columns of a batch of bags; returns how many bags, as `Filling.fill`."""
-        if (to_fill := self._to_fill()) is None:
-            return 0
-        filling, timeline = to_fill
-        return filling.fill(batch, timeline)
+        return self._filled(lambda filling, timeline: filling.fill(batch, timeline), 0)
 
     def follow(self) -> bool:
         """Makes what follows from whole parts, and keeps the store within what it may take.
@@ -134,9 +125,9 @@ class Backfill:
         Returns:
             Whether there is more of that.
         """
-        if (to_fill := self._to_fill()) is None:
-            return False
-        filling, timeline = to_fill
+        return self._filled(self._follow, otherwise=False)
+
+    def _follow(self, filling: Filling, timeline: Timeline) -> bool:
         columns = self._memory.columns
         coverage = columns.coverage(timeline)
         waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
@@ -156,9 +147,7 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        if (to_fill := self._to_fill()) is not None:
-            filling, _ = to_fill
-            filling.store.look_after(thorough=thorough)
+        self._filled(lambda filling, _: filling.store.look_after(thorough=thorough), None)
 
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
@@ -174,12 +163,13 @@ class Backfill:
 
         Does nothing where there are no bags, for the same reason.
         """
-        if (to_fill := self._to_fill()) is None:
-            return
-        filling, timeline = to_fill
-        if timeline.bags:
-            filling.prune(timeline)
-            self._memory.store_listings(self._memory.index.snapshot())
+
+        def of_deleted(filling: Filling, timeline: Timeline) -> None:
+            if timeline.bags:
+                filling.prune(timeline)
+                self._memory.store_listings(self._memory.index.snapshot())
+
+        self._filled(of_deleted, None)
 
 
 def make_fragments(

@@ -8,8 +8,8 @@ from datetime import date, timedelta
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.lake.files import Days, LakeFile
 from ros2_memory.lake.memory import newest
+from ros2_memory.lake.warehouse import Days, LakeFile
 
 FIRST = date(2024, 2, 27)
 SIZES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 50)), max_size=12)
