@@ -87,6 +87,12 @@ class Served:
                 await asyncio.sleep(0.001)
 
 
+async def answered(reader: asyncio.StreamReader) -> None:
+    """Reads a whole reply of the application."""
+    async with asyncio.timeout(BOUND_S):
+        assert b" 200 " in await reader.readuntil(b"ok")
+
+
 @asynccontextmanager
 async def serving() -> AsyncIterator[Served]:
     app = App()
@@ -180,15 +186,13 @@ async def test_a_connection_too_many_is_told_so_and_the_others_are_served(
         open_ones = [await served.connect() for _ in range(3)]
         for reader, writer in open_ones:
             writer.write(GET)
-            async with asyncio.timeout(BOUND_S):
-                await reader.readuntil(b"ok")
+            await answered(reader)
         shown = await served.reply()
         assert shown.startswith(b"HTTP/1.1 503 Service Unavailable\r\n")
         assert shown.endswith(b"Too many connections; close some.\n")
         for reader, writer in open_ones:
             writer.write(GET)
-            async with asyncio.timeout(BOUND_S):
-                assert b" 200 " in await reader.readuntil(b"ok")
+            await answered(reader)
             writer.close()
         await served.gone()
         assert b" 200 " in await served.reply(
@@ -221,8 +225,7 @@ async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
     async with serving() as served:
         known, to_known = await served.connect()
         to_known.write(GET)
-        async with asyncio.timeout(BOUND_S):
-            await known.readuntil(b"ok")
+        await answered(known)
         with ExitStack() as stack:
             strangers = []
             for _ in range(6):
@@ -239,8 +242,7 @@ async def test_the_oldest_stranger_makes_room_and_whoever_was_admitted_stays(
                 each.sendall(GET[1:])
                 assert b" 200 " in await asyncio.to_thread(each.recv, 1000)
         to_known.write(GET)
-        async with asyncio.timeout(BOUND_S):
-            assert b" 200 " in await known.readuntil(b"ok")
+        await answered(known)
         to_known.close()
 
 
@@ -257,8 +259,7 @@ async def test_a_flood_of_one_address_does_not_drop_who_speaks_late_from_another
                 each.connect(("127.0.0.1", served.port))
                 await asyncio.sleep(0.01)  # it is accepted meanwhile
             writer.write(GET)
-            async with asyncio.timeout(BOUND_S):
-                assert b" 200 " in await reader.readuntil(b"ok")
+            await answered(reader)
         writer.close()
 
 
@@ -282,8 +283,7 @@ async def test_a_body_in_chunks_that_are_few_or_large_enough_is_taken(size: int)
         reader, writer = await served.connect()
         for _ in range(2):
             writer.write(CHUNKED % b"/" + body)
-            async with asyncio.timeout(BOUND_S):
-                assert b" 200 " in await reader.readuntil(b"ok")
+            await answered(reader)
         writer.close()
 
 

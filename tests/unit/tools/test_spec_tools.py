@@ -108,24 +108,6 @@ def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
     assert len(listing.model_dump_json(by_alias=True, exclude_none=True).encode()) <= most
 
 
-@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
-def test_arguments_of_a_form_of_their_own_show_it(tool: Tool) -> None:
-    """`where` does so where it is in full, and elsewhere names that tool. Each says what it is."""
-    if tool.description.removeprefix("Blocking. ").startswith("As "):
-        return  # what the tool that it refers to says
-    assert all(each.get("description") for each in tool.arguments.values())
-    shown = {
-        "start": "2026-11-20T14:05",
-        "tolerance_s": "e.g. 2",
-        "while": '{"topic": "/is_docked", "condition_type"',
-        "where": "{x: [0, 5], y: [0, 9]}"
-        if tool.name == "trajectory_summary"
-        else "forms: trajectory_summary",
-    }
-    for name in shown.keys() & tool.arguments.keys():
-        assert shown[name] in str(tool.arguments[name]["description"])
-
-
 def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(10**18, 0.0, 0.0)])
     both = replied(memory_of(tmp_path), tmp_path, "recap", {"last_s": 5, "end": 1e9})
