@@ -274,9 +274,7 @@ class EpisodicServer(MCPServer[object]):
         typed = argument.value.casefold()
         values = sorted({str(row[key]) for row in rows if typed in str(row[key]).casefold()})
         return Completion(
-            values=values[:_MAX_COMPLETED],
-            total=len(values),
-            has_more=len(values) > _MAX_COMPLETED,
+            values=values[:_MAX_COMPLETED], total=len(values), has_more=len(values) > _MAX_COMPLETED
         )
 
     async def list_prompts(self) -> list[Prompt]:

@@ -135,9 +135,7 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path:
     assert stored(memory) == ["rec/rec_0.mcap"]
 
 
-async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(
-    tmp_path: Path,
-) -> None:
+async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     _, backfill = storing(tmp_path)
     begun: list[int] = []

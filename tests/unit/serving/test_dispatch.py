@@ -27,11 +27,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.serving.dispatch import (
-    BLOCKING_AT_ONCE,
-    QUICK_AT_ONCE,
-    Dispatcher,
-)
+from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
 from ros2_memory.serving.fair_queue import MOST_WAITING, FairQueue
 from ros2_memory.serving.mcp_server import EpisodicServer
 from ros2_memory.tools.declaration import Tool

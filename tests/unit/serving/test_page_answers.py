@@ -42,12 +42,7 @@ from ros2_memory.serving.page.routes import (
     warm_up,
     window_asked,
 )
-from ros2_memory.serving.page.span import (
-    MOST_POINTS,
-    driven_cells,
-    span_shown,
-    thinned,
-)
+from ros2_memory.serving.page.span import MOST_POINTS, driven_cells, span_shown, thinned
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies

@@ -17,11 +17,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import _listed
 from ros2_memory.tools import extra_tools, spec_tools
-from ros2_memory.tools.arguments import (
-    At,
-    LastMatchArguments,
-    MotionArguments,
-)
+from ros2_memory.tools.arguments import At, LastMatchArguments, MotionArguments
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions

@@ -68,11 +68,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     ]
     rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))
     shown: list[JsonValue] = [*rows[:MOST_LABELS]]
-    return {
-        "end": unix_from_ns(window.stop),
-        "labels": shown,
-        "labels_total": len(rows),
-    }
+    return {"end": unix_from_ns(window.stop), "labels": shown, "labels_total": len(rows)}
 
 
 def _label(
