@@ -33,9 +33,8 @@ if TYPE_CHECKING:
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.lake.engines.base import LakeEngine
-    from ros2_memory.lake.files import Lake
     from ros2_memory.lake.shipper import RobotBags
-    from ros2_memory.lake.warehouse import LakeLocation
+    from ros2_memory.lake.warehouse import Lake, LakeLocation
 
 
 # ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
@@ -101,7 +100,7 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     """
     location = lake_location(settings)
     engine = engine_of(node)
-    from ros2_memory.lake.files import Lake
+    from ros2_memory.lake.warehouse import Lake
 
     opened = ExitStack()
     atexit.register(opened.close)

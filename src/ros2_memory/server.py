@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.telemetry import Telemetry
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory
+    from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.health import FleetHealth, Health
     from ros2_memory.serving.mcp_server import EpisodicServer
     from ros2_memory.serving.web_app import Background
@@ -192,19 +193,20 @@ def _parts_of_one(
     from ros2_memory.serving.health import Health, keep_fresh
 
     backfill = build_backfill(settings, memory)
+    backfill.helper = _helper(overrides)
     server = build_server(settings, memory, telemetry, backfill.progress)
-    every_s, page, warm_page = settings.reader.index_refresh_s, None, None
+    every_s, page = settings.reader.index_refresh_s, None
     if settings.server.transport != "stdio" and settings.server.page:
         from ros2_memory.serving.page.routes import page_routes, warm_up
 
         page = page_routes(server.dispatcher, backfill.progress)
-        warm_page = partial(warm_up, server.dispatcher)
+        backfill.warm_up = partial(warm_up, server.dispatcher)
 
     async def background() -> None:
         """Keeps the index fresh and the store of columns full, until it is cancelled."""
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(keep_fresh, memory, every_s)
-            tasks.start_soon(keep_backfilled, backfill, _helper(overrides), every_s, warm_page)
+            tasks.start_soon(keep_backfilled, backfill, every_s)
 
     return _Parts(server, Health(memory, package_version(), backfill), background, page)
 
@@ -221,33 +223,32 @@ def _parts_of_fleet(
 
     from ros2_memory.bootstrap import build_backfill, build_server
     from ros2_memory.bootstrap_fleet import robot_settings
-    from ros2_memory.serving.backfill import Filler, keep_all_backfilled
+    from ros2_memory.serving.backfill import keep_all_backfilled
     from ros2_memory.serving.health import FleetHealth, Health
 
     reports: dict[str, Health] = {}
-    fillers: dict[str, tuple[Memory, Filler]] = {}
+    backfills: dict[str, Backfill] = {}
     for name in settings.fleet.robots:  # of others there is no bag here
         robot = fleet.robots[name]
         robot_memory = robot.memory
         backfill = build_backfill(robot_settings(settings, name), robot_memory)
         reports[name] = Health(robot_memory, package_version(), backfill)
-        helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
-        fillers[name] = robot_memory, Filler(backfill, helper)
-    shipped: dict[str, tuple[Memory, Filler]] = {}
+        backfill.helper = _helper(overrides, "--bag-dir", str(robot.bag_dir.absolute()))
+        backfills[name] = backfill
+    shipped: dict[str, Backfill] = {}
 
-    def all_fillers() -> list[tuple[Memory, Filler]]:
+    def all_backfills() -> list[Backfill]:
         for robot in [*fleet.robots.values()]:  # more robots may have joined
             if robot.lake is not None and robot.name not in shipped:
-                backfill = build_backfill(settings, robot.lake, are_files=False)
-                shipped[robot.name] = robot.lake, Filler(backfill)
-        return [*fillers.values(), *shipped.values()]
+                shipped[robot.name] = build_backfill(settings, robot.lake, are_files=False)
+        return [*backfills.values(), *shipped.values()]
 
     async def background() -> None:
         """Keeps the indexes fresh and the stores of columns full, until it is cancelled."""
         every_s = settings.reader.index_refresh_s
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(keep_fleet_fresh, fleet, every_s)
-            tasks.start_soon(keep_all_backfilled, all_fillers, every_s)
+            tasks.start_soon(keep_all_backfilled, all_backfills, every_s)
 
     server = build_server(settings, memory, telemetry, fleet=fleet)
     return _Parts(server, FleetHealth(reports, package_version()), background, None)

@@ -239,7 +239,8 @@ async def test_bags_that_cannot_be_stored_have_the_helper_started_no_second_time
     started = tmp_path / "started"
     helper = ["sh", "-c", f"echo once >> {started}"]
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(keep_backfilled, filler, helper, 0.001)
+        filler.helper = helper
+        tasks.start_soon(keep_backfilled, filler, 0.001)
         with anyio.fail_after(PATIENCE_S):
             while filler.progress().waiting:
                 await anyio.lowlevel.checkpoint()

@@ -256,16 +256,6 @@ def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
     )
 
 
-def test_an_address_of_another_machine_is_told_in_one_line(bag_dir: Path) -> None:
-    env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_HOST="192.0.2.1", MEMORY_API_TOKEN="x" * 32)
-    ended = subprocess.run(
-        command("logging.level=error"), env=env, capture_output=True, text=True, check=False
-    )
-    assert ended.returncode == 1
-    assert "give an address of this machine with MCP_HOST" in ended.stderr
-    assert len(ended.stderr.splitlines()) == 1
-
-
 def test_a_refused_configuration_is_told_on_stderr(bag_dir: Path) -> None:
     ended = subprocess.run(
         command("server.prot=1"),

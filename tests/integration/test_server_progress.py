@@ -11,10 +11,9 @@ import httpx2
 import pytest
 from mcp import Client
 from mcp.client.sse import sse_client
-from mcp.client.stdio import StdioServerParameters, stdio_client
 from mcp.types import TextContent
 
-from tests.integration.test_server_process import Served, environment, serving
+from tests.integration.test_server_process import Served, serving
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import write_run
 
@@ -85,14 +84,6 @@ async def asked_for_progress(client: Client) -> None:
     assert isinstance(block, TextContent)
     assert "frames" in json.loads(block.text)
     assert reports[:REPORTS] == [1, 2]
-
-
-async def test_over_stdio(bag_dir: Path, tmp_path: Path) -> None:
-    program, *arguments = command()
-    server = StdioServerParameters(command=program, args=arguments, env=environment(bag_dir))
-    with (tmp_path / "log").open("w", encoding="utf-8") as log:
-        async with Client(stdio_client(server, errlog=log)) as client:
-            await asked_for_progress(client)
 
 
 def posted(served: Served, name: str, accept: str, **meta: object) -> Any:

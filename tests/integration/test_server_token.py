@@ -92,17 +92,3 @@ def _leave_traces(served: Served) -> None:
             status(served, "POST", path, headers)
     status(served, "POST", f"/messages/?session_id={GOOD}", SHOWN)
     status(served, "POST", f"/messages/{GOOD}?session_id=in-a-query", SHOWN)
-
-
-async def test_a_token_is_demanded_on_the_loopback_address_too(
-    bag_dir: Path, tmp_path: Path
-) -> None:
-    file = tmp_path / "token"
-    file.write_text(GOOD)
-    with serving(bag_dir, tmp_path / "log", MEMORY_API_TOKEN_FILE=str(file)) as served:
-        assert status(served, "GET", "/sse", {})[0] == 401
-        async with Client(
-            sse_client(served.url("/sse"), headers=SHOWN, timeout=PATIENCE_S)
-        ) as client:
-            output, _ = await ask(client, "data_time_range", {})
-            assert output["bags"] == 1

@@ -16,11 +16,8 @@ from ros2_memory.core.errors import EpisodicError, NoDataReason
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.mcp_server import (
     MOMENT,
-    MOMENTS,
+    RESOURCES,
     SCHEMA,
-    STATUS,
-    TOOLS_OF_RESOURCES,
-    TOPICS,
 )
 from ros2_memory.tools.build import build_tools
 from tests.project import reference_tables as reference
@@ -156,11 +153,10 @@ def test_every_resource_stands_there_with_the_tool_behind_it() -> None:
         re.findall(r"^\| `(episodic://\S+)` \| (.+) \|$", page("tools"), re.MULTILINE)
     )
     templates = {MOMENT.uri_template, SCHEMA.uri_template}
-    assert set(documented) == {TOPICS.uri, STATUS.uri, MOMENTS.uri} | templates
-    assert set(TOOLS_OF_RESOURCES) == {TOPICS.uri, STATUS.uri, MOMENTS.uri}
-    for uri, tool in TOOLS_OF_RESOURCES.items():
-        if uri != MOMENTS.uri:
-            assert documented[uri] == f"`{tool}`"
+    assert set(documented) == {resource.uri for resource in RESOURCES.values()} | templates
+    for tool, resource in RESOURCES.items():
+        if tool != "list_moments":
+            assert documented[resource.uri] == f"`{tool}`"
 
 
 def test_every_command_and_every_column_of_a_lake_stands_there() -> None:

@@ -22,11 +22,10 @@ from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
-from ros2_memory.lake.files import Lake
 from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, LakeReader
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.upkeep import Tombstone
-from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation, location_of
+from ros2_memory.lake.warehouse import CATALOGUE_FILE, Lake, LakeLocation, location_of
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap

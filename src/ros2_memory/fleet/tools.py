@@ -45,7 +45,7 @@ from ros2_memory.fleet.robots import (
     there_are,
 )
 from ros2_memory.results import Match, OfFleet, OfRobot, OneAnswer, Sightings
-from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
+from ros2_memory.tools.replies import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
@@ -91,6 +91,7 @@ AT_LEAST: Final = "at_least"
 """How many there are in a reply that did not count all, in place of the total."""
 MATCHES: Final = "matches"
 TOPICS: Final = "topics"
+_ROBOT_NAMES: Final = f"{ROBOT_NAME}s"
 MERGED_ROWS: Final[Mapping[str, Sequence[Key]]] = {
     "find_last_match": (PLAIN(MATCHES).along("timestamp"),),
     "list_recorded_topics": (PLAIN(TOPICS).along("last_ts"),),
@@ -166,7 +167,7 @@ def _described(tool: Tool) -> tuple[str, JsonObject]:
         shape = f"{{robots: [{{{ROBOT_NAME}, ...}}]}}"
         if tool.name in MERGED_ROWS:
             key = next(key.name for key in MERGED_ROWS[tool.name] if key.row_time)
-            name = f"{ROBOT_NAME}s" if key == TOPICS else ROBOT_NAME
+            name = _ROBOT_NAMES if key == TOPICS else ROBOT_NAME
             also = ", never: robots that never did" if key == MATCHES else ""
             shape = f"{{{key}: [{{{name}, ...}}]{also}}}"
         text = f"{text} Of all robots: {shape}."
@@ -200,7 +201,12 @@ class _FleetQuestion:
         is_of_all = (tool in ANSWER_FOR_ALL or is_table) and given.get("between") is None
         if is_of_all and (named is None or len(names) > 1):
             return self._of_all(robots, call)
-        return self._of_one(_only_one(tool, robots), call)
+        if len(robots) == 1:
+            return self._of_one(robots[0], call)
+        example = f", e.g. robot={robots[0].name}" if robots else ""
+        raise InvalidArgumentsError(
+            f"which robot? {tool} answers for one: pass robot{example}; {there_are(robots)}"
+        )
 
     def _of_one(self, robot: Robot, call: Call) -> OfRobot:
         """Returns a robot's answer; one whose disk hangs blocks one thread, however often asked.
@@ -231,8 +237,9 @@ class _FleetQuestion:
             )
         robots.sort(key=Robot.latest_known, reverse=True)
         now = StoppedClock(self.fleet.clock.now())
-        default = self.tool.arguments.get("limit", {}).get("default")
-        wanted = default if given.get("limit") is None else given["limit"]
+        wanted = given.get("limit")
+        if wanted is None:
+            wanted = self.tool.arguments.get("limit", {}).get("default")
         limit = int(wanted) if isinstance(wanted, int | float) else None
         page = Page(limit, oldest_first=given.get("oldest_first") is True)
         answers = self.fan_out.ask(robots, partial(self._reply, now, page), call)
@@ -339,20 +346,6 @@ def _coordinates_in(given: Mapping[str, object]) -> str | None:
     return next((name for name in (*near, "x", "y") if given.get(name) is not None), None)
 
 
-def _only_one(tool: str, robots: Sequence[Robot]) -> Robot:
-    """Returns the only one of some robots.
-
-    Raises:
-        InvalidArgumentsError: there are several, or none; the sentence names them.
-    """
-    if len(robots) == 1:
-        return robots[0]
-    example = f", e.g. robot={robots[0].name}" if robots else ""
-    raise InvalidArgumentsError(
-        f"which robot? {tool} answers for one: pass robot{example}; {there_are(robots)}"
-    )
-
-
 def _shared_error(failed: Mapping[str, EpisodicError]) -> EpisodicError:
     """Returns the error where no robot has an answer."""
     reasons = by_reason((name, reason_of(error)) for name, error in failed.items())
@@ -404,17 +397,14 @@ def merged(
         short = [{key: row[key] for key in keys if key in row} for row in whole]
         do = "each robot shortly; pass robot for all of it"
         return with_notes({"robots": [*short], **failed}, [do, *notes])
-    notes_of_robots = by_reason(
+    of_robots = _sentences(
         (reply.name, note)
         for reply in order
         # `str(note)` would lose that it is quoted.
         for note in _items(reply.body, "notes")
         if isinstance(note, str)
     )
-    return with_notes(
-        {**reply_body, **failed},
-        [*map(_of_robots, notes_of_robots.values(), notes_of_robots), *notes],
-    )
+    return with_notes({**reply_body, **failed}, [*of_robots, *notes])
 
 
 def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) -> JsonObject:
@@ -436,18 +426,15 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
             named = {ROBOT_NAME: reply.name, **same, **row}
             order.append((reply.is_ahead, at if page.oldest_first else -at, named))
     order.sort(key=itemgetter(0, 1))
-    ordered: list[JsonValue] = [row for *_, row in order]
-    rows: JsonObject = {key: ordered[: page.limit]}
+    rows: JsonObject = {key: [row for *_, row in order[: page.limit]]}
     if key == MATCHES:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
     rest = {name: _without(value, {key, *names}) for name, value in values.items()}
-    is_cut = ordered[: page.limit] != ordered or any(value.get("more") for value in values.values())
+    is_cut = order[: page.limit] != order or any(value.get("more") for value in values.values())
+    more: JsonObject = {"more": True}
     marks_more = is_cut and any(key.name == "more" for key in declared)
-    reply_body = {**rows, **_combined(merging, replies, rest)}
-    if marks_more:
-        reply_body["more"] = True
-    return reply_body
+    return {**rows, **_combined(merging, replies, rest), **(more if marks_more else {})}
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -503,7 +490,6 @@ def _combined(
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
     """Returns a row for each topic of a type, with the names of the robots that record it."""
     topics: dict[tuple[str, str], JsonObject] = {}
-    robots: dict[tuple[str, str], list[JsonValue]] = {}
     for reply in replies:  # those whose clock ran ahead come last
         for row in _list(reply.value):
             key = str(row["topic"]), str(row["type"])
@@ -512,8 +498,7 @@ def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
                 if not reply.is_ahead:
                     total[time] = best(_number(total[time]), _number(row[time]))
             total["count"] = int(_number(total["count"]) + _number(row["count"]))
-            total[f"{ROBOT_NAME}s"] = robots.setdefault(key, [])
-            robots[key].append(reply.name)
+            total[_ROBOT_NAMES] = [*_items(total, _ROBOT_NAMES), reply.name]
     return [*sorted(topics.values(), key=lambda row: (-_number(row["last_ts"]), str(row["topic"])))]
 
 
@@ -557,20 +542,20 @@ def reason_of(error: EpisodicError) -> str:
             return str(error)
 
 
-def _of_robots(names: Sequence[str], note: str) -> str:
-    return still_quoted(f"{listed(names, at_most=_MOST_NAMED)}: {note}", note)
+def _sentences(reasons: Iterable[tuple[str, str]], begin: str = "") -> list[str]:
+    """Returns a note for each reason, with the names of its robots."""
+    return [
+        still_quoted(f"{begin}{listed(names, at_most=_MOST_NAMED)}: {reason}", reason)
+        for reason, names in by_reason(reasons).items()
+    ]
 
 
 def _notes_on(replies: Sequence[RobotReply], failures: Mapping[str, EpisodicError]) -> list[str]:
     """Returns what is to be known of robots: who did not answer and why, whose clock is ahead."""
-    failed = by_reason((name, reason_of(error)) for name, error in failures.items())
-    notes = [
-        still_quoted(f"no answer of {_of_robots(names, reason)}", reason)
-        for reason, names in failed.items()
-    ]
+    failed = ((name, reason_of(error)) for name, error in failures.items())
     of_lake = {reply.name: reply.lake for reply in replies if reply.lake is not None}
-    unseen = by_reason((name, note) for name, lake in of_lake.items() for note in lake.notes)
-    notes += map(_of_robots, unseen.values(), unseen)
+    notes = _sentences(failed, "no answer of ")
+    notes += _sentences((name, note) for name, lake in of_lake.items() for note in lake.notes)
     notes += shipped_to({name: lake.latest for name, lake in of_lake.items()})
     if ahead := [reply.name for reply in replies if reply.is_ahead]:
         notes.append(

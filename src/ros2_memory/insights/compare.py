@@ -275,7 +275,7 @@ class _ThingsBetween:
             looks, crossed = estimate.missing(instance, last_there)
             if crossed is None or crossed >= self.later.stop:
                 return "not_looked_at", thing
-            return "missed", replace(thing, missed=crossed, looks=looks)
+            return "not_seen_where_expected", replace(thing, missed=crossed, looks=looks)
         if before is None or after is None or before.is_elsewhere(after):
             return "moved", thing
         if before.at_once == after.at_once:

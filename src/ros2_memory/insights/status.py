@@ -256,7 +256,7 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         is_long = latest - last > max(SILENT_AFTER_NS, longest)
         since = TimeWindow(last + 1, latest + 1)
         if is_long and not cut_spans(memory.index.bag_dir, topic, since):
-            yield SilentTopic(topic, last, usual)
+            yield SilentTopic(topic, last)
 
 
 def budget_of(memory: Memory, snapshot: Snapshot, heartbeat: Heartbeat | None, wall: Ns) -> Budget:

@@ -39,7 +39,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.poses import poses_of_bag
 from ros2_memory.history.view import View
 from ros2_memory.insights.topic_events import events_of_bag, toggled
-from ros2_memory.lake.tables import ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
+from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import RobotTracks
@@ -119,7 +119,7 @@ def rows_of(
     Raises:
         BagError: the bag, or a part of it, cannot be read.
     """
-    keys = {"robot": shipped.robot, "bag_id": shipped.bag_id, "day": shipped.day}
+    keys = {name: getattr(shipped, name) for name in KEYS}
     rows_by_table = _BagRows(memory, bag, messages).rows(shipped)
     return {name: [{**keys, **row} for row in rows] for name, rows in rows_by_table.items()}
 
@@ -158,12 +158,13 @@ class _BagRows:
             events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
             self._rows["events"] += self._events_of(topic, events)
             # What the events of a topic rule out is not decoded.
-            may_have_some = any(map(may_have_detections, self._types[topic]))
-            if may_have_some and (events.visible.size or events.left_out):
+            if (events.visible.size or events.left_out) and any(
+                map(may_have_detections, self._types[topic])
+            ):
                 seen.add(topic)
         driven = self._driven()
-        first = tracks[0] if tracks else (None, empty_track())
-        self._add_messages(seen, *first)
+        map_frame, track = tracks[0] if tracks else (None, empty_track())
+        self._add_messages(seen, map_frame, track)
         self._rows["channels"] += self._channels()
         self._rows["bags"].append(
             {
@@ -173,7 +174,7 @@ class _BagRows:
                 "undecodable": self._undecodable,
                 "detections": len(self._rows["sightings"]),
                 "pose_topic": self._pose_topic,
-                "map_frame": first[0],
+                "map_frame": map_frame,
                 **driven,
                 "summary": self._bag.summary.schema.to_json(),
                 "counts": self._bag.summary.packed,
@@ -246,8 +247,8 @@ class _BagRows:
         """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
         # By identity, since hashing a channel hashes its definition.
         by_channel: dict[int, _Messages] = {}
-        topics, window = tuple(self._types), TimeWindow.everything()
-        for batch in self._memory.reader.batches(self._bag.path, topics, window):
+        everything = TimeWindow.everything()
+        for batch in self._memory.reader.batches(self._bag.path, self._types, everything):
             channel = batch.channel
             if id(channel) not in by_channel:
                 is_whole = channel.topic in self._whole
@@ -269,10 +270,9 @@ class _BagRows:
         topics, window = {*self._whole, *seen}, TimeWindow.everything()
         reader, extractor = self._memory.reader, self._memory.extractor
         for record in reader.records(self._bag.path, topics, window):
-            topic, kind = record.channel.topic, record.channel.type
+            topic, kind, time = record.channel.topic, record.channel.type, record.log_time
             detections: Sequence[Detection] = ()
-            row = {"topic": topic, "type": kind, "time_ns": record.log_time}
-            row["message"] = numbers[topic]
+            row = {"topic": topic, "type": kind, "time_ns": time, "message": numbers[topic]}
             numbers[topic] += 1
             try:
                 message = reader.decode(record)
@@ -284,9 +284,8 @@ class _BagRows:
                 value = taken_apart(shown) if topic in self._whole else {}
                 detections = detections_of(shown, extractor.frame(message)) if topic in seen else ()
             if topic in self._whole:
-                published = {"publish_ns": record.publish_time}
-                self._rows["messages"].append({**row, **published, **value})
-            at = place_at(track, record.log_time) if detections else None
+                self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
+            at = place_at(track, time) if detections else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
             for detection in detections:

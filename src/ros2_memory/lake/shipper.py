@@ -292,7 +292,10 @@ class RobotBags:
                     continue
                 ids.add(bag_id)
                 shipped = self._row_of(bag, bag_id, before, shipper.messages)
-                if before is not None and _is_same(before, shipped):
+                # The rows of a copy are the same, which has another path and mtime.
+                if before and before == shipped._replace(
+                    mtime_ns=before.mtime_ns, file=before.file
+                ):
                     confirmed.append(shipped)
                     continue
                 same_file = by_file.get(shipped.file)
@@ -306,7 +309,9 @@ class RobotBags:
                 continue
             replaced = {before} if before is not None else set()
             # As where its first messages were deleted by request: what is left lies within it.
-            if same_file is not None and _covers(same_file, shipped):
+            if same_file is not None and (
+                same_file.start_ns <= shipped.start_ns and shipped.end_ns <= same_file.end_ns
+            ):
                 replaced.add(same_file)
             yield _PreparedBag(self, shipped, rows, [*replaced])
         self.confirm(confirmed, shipper, done)
@@ -415,13 +420,3 @@ def _list_one(folder: Path) -> None:
     """Lists one entry of a folder, which takes as long as its disk does; errors are no matter."""
     with suppress(OSError), os.scandir(folder) as entries:
         next(entries, None)
-
-
-def _covers(before: ShippedBag, now: ShippedBag) -> bool:
-    """Returns whether all of a bag lies within the time of an earlier one."""
-    return before.start_ns <= now.start_ns and now.end_ns <= before.end_ns
-
-
-def _is_same(before: ShippedBag, now: ShippedBag) -> bool:
-    """Returns whether the rows of a bag would be the same; a copy has another path and mtime."""
-    return before == now._replace(mtime_ns=before.mtime_ns, file=before.file)

@@ -18,6 +18,8 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import astuple, dataclass, field, replace
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
@@ -25,10 +27,9 @@ from ros2_memory.core.errors import LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.lake.files import Partitions
 from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
-from ros2_memory.lake.warehouse import WRITTEN, LakeTables
+from ros2_memory.lake.warehouse import WRITTEN, LakeTables, Partitions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -80,23 +81,21 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
 def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[str]]]:
     """Yields what to put together of the days before `closed`: a day, and some of its robots."""
     sizes = sorted(
-        (day, robot, sum(file.size for file in files))
+        (day, robot, size)
         for robot, days in Partitions().look(table).items()
         for day, files in days.items()
         if day < closed and len(files) > FEW_FILES
+        if (size := sum(file.size for file in files)) <= _MOST_BYTES
     )
-    robots: list[str] = []
-    of_day, total = closed, 0
-    for day, robot, size in sizes:
-        is_full = total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS
-        if robots and (day != of_day or is_full):
-            yield of_day, robots
-            robots, total = [], 0
-        if size <= _MOST_BYTES:
+    for day, of_day in groupby(sizes, itemgetter(0)):
+        robots, total = list[str](), 0
+        for _, robot, size in of_day:
+            if total + size > _MOST_BYTES or len(robots) == _MOST_ROBOTS:
+                yield day, robots
+                robots, total = [], 0
             robots.append(robot)
-            of_day, total = day, total + size
-    if robots:
-        yield of_day, robots
+            total += size
+        yield day, robots
 
 
 def expire(lake: LakeTables, until: Ns) -> int:
@@ -140,24 +139,19 @@ def _drop_versions(table: IcebergTable, until: Ns) -> None:
 
 
 def _unreferenced(table: IcebergTable, files: Sequence[str]) -> Sequence[str]:
-    """Returns those of some files that lie below a table's location, and that it does not need."""
+    """Returns those of some files below a table's location that none of its versions refers to."""
     location = f"{table.location().rstrip('/')}/"
     below = {file for file in files if file.startswith(location) and ".." not in file}
-    return sorted(below - _referenced(table)) if below else ()
-
-
-def _referenced(table: IcebergTable) -> set[str]:
-    """Returns the files that some version, branch or tag of a table refers to."""
-    metadata, io = table.metadata, table.io
-    referenced = {
-        table.metadata_location,
-        *(statistics.statistics_path for statistics in metadata.statistics),
-    }
-    manifests = [manifest for version in metadata.snapshots for manifest in version.manifests(io)]
-    for manifest in {manifest.manifest_path: manifest for manifest in manifests}.values():
+    if not below:
+        return ()
+    metadata, io, versions = table.metadata, table.io, table.metadata.snapshots
+    below -= {table.metadata_location, *(version.manifest_list for version in versions)}
+    below -= {statistics.statistics_path for statistics in metadata.statistics}
+    manifests = [manifest for version in versions for manifest in version.manifests(io)]
+    for path, manifest in {manifest.manifest_path: manifest for manifest in manifests}.items():
         entries = manifest.fetch_manifest_entry(io, discard_deleted=True)
-        referenced |= {manifest.manifest_path, *(entry.data_file.file_path for entry in entries)}
-    return referenced | {version.manifest_list for version in metadata.snapshots}
+        below -= {path, *(entry.data_file.file_path for entry in entries)}
+    return sorted(below)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +180,12 @@ class Tombstone:
         ids = [bag_id_of(robot, *astuple(bag)) for bag in forgetting.bags]
         return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
 
+    def rows(self, first: str, last: str) -> BooleanExpression:
+        """Returns the condition on rows of what is forgotten; two columns have their span."""
+        if self.bags:
+            return of_ids(self.robot, self.bags)
+        return overlapping(self.robot, (first, last), self.window, self.topics)
+
     def forbids(self, reader: BagReader, bag: BagFile, bag_id: str) -> bool:
         """Returns whether a bag of the robot has a message that was forgotten.
 
@@ -197,8 +197,8 @@ class Tombstone:
         if not self.window.overlaps(bag.start, bag.end):
             return False
         topics = {topic.topic for topic in bag.summary.topics}
-        wanted = topics.intersection(self.topics) if self.topics else topics
-        return any(True for _ in reader.records(bag.path, tuple(wanted), self.window))
+        wanted = topics.intersection(self.topics or topics)
+        return any(True for _ in reader.records(bag.path, wanted, self.window))
 
 
 TOMBSTONES: Final = JsonLog(TOMBSTONES_FILE, Tombstone)
@@ -248,11 +248,10 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
     """
     # `channels` has a row of each bag of which anything is in the lake: it is the first to be
     # committed, and the last from which is deleted.
-    bags = _bags_where(lake, "channels", _rows_of_tombstone(tombstone, "first_ns", "last_ns"))
+    bags = _bags_where(lake, "channels", tombstone.rows("first_ns", "last_ns"))
     # In `bags` alone: of which no message counts, and what a killed process was about to replace.
-    listed = _bags_where(
-        lake, "bags", _rows_of_tombstone(replace(tombstone, topics=()), "start_ns", "end_ns")
-    )
+    of_any_topic = replace(tombstone, topics=())
+    listed = _bags_where(lake, "bags", of_any_topic.rows("start_ns", "end_ns"))
     if tombstone.topics and listed:
         ids = of_ids(tombstone.robot, {bag_id for *_, bag_id in listed})
         listed -= _bags_where(lake, "channels", ids)
@@ -261,19 +260,16 @@ def forget_in_lake(lake: LakeTables, tombstone: Tombstone) -> Forgotten:
         lake.delete(name, of_bags(bags))
     # The versions before have what was deleted, so they go whatever their age, and the clock says.
     files = expire(lake, MAX_NS)
-    kept_by = (*_refs_to_old_versions(lake),)
+    metadata = {name: lake.current(name).metadata for name in TABLES}
+    kept_by = tuple(
+        f"{name}: {ref}"
+        for name, of_table in metadata.items()
+        for ref, version in of_table.refs.items()
+        if version.snapshot_id != of_table.current_snapshot_id
+    )
     append_tombstone(lake.location.state_dir, tombstone, done=True)
     log.info("forgotten_in_lake", robot=tombstone.robot, bags=len(bags), files=files)
     return Forgotten(len(bags), files, kept_by)
-
-
-def _refs_to_old_versions(lake: LakeTables) -> Iterator[str]:
-    """Yields the branches and tags that name another version than the newest: `bags: NAME`."""
-    for name in TABLES:
-        metadata = lake.current(name).metadata
-        for ref, version in metadata.refs.items():
-            if version.snapshot_id != metadata.current_snapshot_id:
-                yield f"{name}: {ref}"
 
 
 def _bags_where(
@@ -282,10 +278,3 @@ def _bags_where(
     """Returns robot, day and id of the bags that have some rows."""
     rows = lake.rows(name, condition, ("robot", "day", "bag_id")).to_pylist()
     return {(row["robot"], row["day"], row["bag_id"]) for row in rows}
-
-
-def _rows_of_tombstone(tombstone: Tombstone, first: str, last: str) -> BooleanExpression:
-    """Returns the condition on rows of what is forgotten; the columns have their span."""
-    if tombstone.bags:
-        return of_ids(tombstone.robot, tombstone.bags)
-    return overlapping(tombstone.robot, (first, last), tombstone.window, tombstone.topics)

@@ -136,11 +136,10 @@ class DataTimeRange(AnswerWithNotes):
 
 @result("topic", TIME("last_ts", "last"), AGO("ago_s", "last"), LOCAL("local", "last", "last"))
 class SilentTopic:
-    """A topic without recent messages: its last one, and the usual time between two."""
+    """A topic without recent messages, and its last one."""
 
     topic: str
     last: Ns
-    usual: Ns
 
 
 @result(

@@ -45,6 +45,16 @@ _XY: Final = vector("xy", 2)
 _LONGEST_NAME: Final = 100
 """Characters of the text of an error."""
 _MISSED: Final = "not_seen_where_expected"
+_DIFFERENCES: Final = (
+    "moved",
+    "appeared",
+    _MISSED,
+    "not_looked_at",
+    "not_comparable",
+    "more_or_fewer",
+    "movers",
+)
+"""What may differ of things between two windows, in the order of the reply."""
 _LABEL: Final = unit(lambda label: shortened(named(label), 40))
 
 
@@ -340,20 +350,8 @@ class ComparedMover:
 
 def _differences(most: int) -> Keys:
     """Returns the keys of compared things, with so many of each kind, twice as many that moved."""
-    return keys(
-        *(
-            OBJECTS(name, source).first(shown, "total").if_any
-            for name, source, shown in (
-                ("moved", "moved", 2 * most),
-                ("appeared", "appeared", most),
-                ("not_seen_where_expected", "missed", most),
-                ("not_looked_at", "not_looked_at", most),
-                ("not_comparable", "not_comparable", most),
-                ("more_or_fewer", "more_or_fewer", most),
-                ("movers", "movers", most),
-            )
-        )
-    )
+    others = (OBJECTS(name).first(most, "total").if_any for name in _DIFFERENCES[1:])
+    return keys(OBJECTS("moved").first(2 * most, "total").if_any, *others)
 
 
 @result()
@@ -366,7 +364,7 @@ class ComparedThings:
 
     moved: tuple[ComparedThing, ...] = ()
     appeared: tuple[ComparedThing, ...] = ()
-    missed: tuple[ComparedThing, ...] = ()
+    not_seen_where_expected: tuple[ComparedThing, ...] = ()
     not_looked_at: tuple[ComparedThing, ...] = ()
     same: int = 0
     movers: tuple[ComparedMover, ...] = ()
@@ -376,15 +374,7 @@ class ComparedThings:
     @property
     def is_any(self) -> bool:
         """Whether anything differs."""
-        differences = (
-            self.moved,
-            self.appeared,
-            self.missed,
-            self.not_looked_at,
-            self.not_comparable,
-            self.more_or_fewer,
-        )
-        return any((*differences, self.movers))
+        return any(getattr(self, name) for name in _DIFFERENCES)
 
 
 class StandstillPlace(NamedTuple):

@@ -42,7 +42,7 @@ from ros2_memory.results.base import AnswerWithNotes
 from ros2_memory.results.recap import SAID, Episode, Spell
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Collection, Iterator
 
     from ros2_memory.core.model import JsonValue, Pose, Sample, Vector3
 
@@ -143,22 +143,20 @@ class TopicRange(AnswerWithNotes):
     @property
     def columns(self) -> tuple[str, ...]:
         """The columns of the table: a field that holds an object has one for each of its parts."""
-        names = dict.fromkeys(name for row in self._cells() for name in row)
-        return ("timestamp", *map(named, names), *(["local"] if any(self._locals()) else ()))
+        local = ["local"] * any(self._locals())
+        return ("timestamp", *map(named, self._names()), *local)
 
     @property
     def rows(self) -> list[JsonValue]:
         """A row for each sample: its time and cells; null where a sample has no such part."""
-        names = dict.fromkeys(name for row in self._cells() for name in row)
+        names, table = self._names(), zip(self.samples, self._cells(), self._locals(), strict=True)
         return [
             [
                 moment(sample.time),
                 *(quote(cells.get(name), name) for name in names),
                 *([] if local is None else [local]),
             ]
-            for sample, cells, local in zip(
-                self.samples, self._cells(), self._locals(), strict=True
-            )
+            for sample, cells, local in table
         ]
 
     @property
@@ -170,6 +168,9 @@ class TopicRange(AnswerWithNotes):
         """Returns the local time of each sample, where they span so much that it is shown."""
         times = LocalTimes(_first_time(self), _last_time(self))
         return [times.text(sample.time) for sample in self.samples]
+
+    def _names(self) -> Collection[str]:
+        return dict.fromkeys(name for row in self._cells() for name in row).keys()
 
     def _cells(self) -> list[dict[str, JsonValue]]:
         return [

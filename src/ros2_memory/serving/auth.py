@@ -115,12 +115,10 @@ class TokenGate:
         limited: Mapping[str, frozenset[str]] | None = None,
     ) -> None:
         self._app = app
-        self._digests: list[tuple[bytes, frozenset[str] | None]] = [
-            (_digest(limited_token.encode("ascii")), robots)
-            for limited_token, robots in (limited or {}).items()
-        ]
+        tokens: dict[str, frozenset[str] | None] = {**(limited or {})}
         if token is not None:
-            self._digests.append((_digest(token.encode("ascii")), None))
+            tokens[token] = None
+        self._digests = [(_digest(own.encode("ascii")), robots) for own, robots in tokens.items()]
         self._refusals = LogThrottle(monotonic, LOG_INTERVAL_S)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:

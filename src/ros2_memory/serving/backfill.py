@@ -63,66 +63,99 @@ _LATELY: Final = 4
 class Backfill:
     """Stores the bags of one memory. Only `progress` may be called from several threads.
 
-    Args:
+    Attributes:
         memory: has the bags.
         filling: fills the store of columns; None where there is none.
-
-    Attributes:
-        filling: see there.
+        helper: the command line of the program that stores a backlog (`ros2-memory index`);
+            without it that is stored here.
+        warm_up: called once the store is full, until it returns that it is done.
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
     """
 
-    _memory: Memory
+    memory: Memory
     filling: Filling | None
+    helper: Sequence[str] = ()
+    warm_up: Callable[[], bool] | None = None
     undecodable: dict[str, str] = field(default_factory=dict)
     _of_others: list[Ns] | None = None
+    _pruned_s: float = -math.inf
+    _is_precomputed: bool = False
 
-    async def in_thread(self, work: Callable[[], T]) -> T:
+    async def fill(self) -> None:
+        """Stores the closed bags that there are. Raises nothing but cancellation."""
+        try:
+            await self._fill_round()
+        except Exception:
+            log.exception("filling_failed")
+
+    async def _fill_round(self) -> None:
+        due, in_thread = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S, self._in_thread
+        await in_thread(partial(self.look_after, thorough=due))
+        waiting = await in_thread(self.waiting)
+        store = None if self.filling is None else self.filling.store
+        # A store that is in memory cannot be filled by another process.
+        has_file = store is not None and store.path is not None
+        is_helped = self.helper and len(waiting) > BACKLOG and has_file
+        if is_helped and await _run_helper(self.helper):
+            # Bags that the helper could not store are tried here, and refused if they fail.
+            waiting = await in_thread(self.waiting)
+        if not waiting and store is not None:
+            await in_thread(store.write_again)  # whether the disk works again
+        done = tried = 0
+        for batch in await in_thread(self.batches):
+            if tried >= (BACKLOG if self.helper else _BACKLOG_ALONE):
+                break
+            tried += len(batch.bags)
+            done += await in_thread(partial(self.store, batch))
+            if store is not None and store.is_failing:
+                break
+        await in_thread(self.follow)
+        if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
+            await in_thread(self.precompute)
+            self._is_precomputed = True
+        if self.warm_up and len(waiting) <= BACKLOG and await in_thread(self.warm_up):
+            self.warm_up = None
+        if due:
+            await in_thread(self.prune)
+            self._pruned_s = time.monotonic()
+
+    async def _in_thread(self, work: Callable[[], T]) -> T:
         """Returns what `work` returns, in a thread that waits while others hold much of a bag."""
 
         def work_in_turn() -> T:
-            with self._memory.large.during():
+            with self.memory.large.during():
                 return work()
 
         return await anyio.to_thread.run_sync(work_in_turn, abandon_on_cancel=True)
 
     def progress(self) -> Progress:
         """Returns how much is stored."""
-        timeline = self._memory.index.snapshot().timeline
+        timeline = self.memory.index.snapshot().timeline
         if self.filling is None:
             return Progress(sum(bag.state is BagState.CLOSED for bag in timeline.bags))
         return self.filling.progress(timeline)
 
-    def _to_fill(self) -> tuple[Filling, Timeline] | None:
-        """Returns what fills the store, and the bags; None without a store, or without its bags.
+    def _filled(self, work: Callable[[Filling, Timeline], T], otherwise: T) -> T:
+        """Returns what `work` does with the store and the bags, where there are both.
 
         A missing bag directory is more likely a missing disk than an empty one.
         """
-        snapshot = self._memory.index.snapshot()
+        snapshot = self.memory.index.snapshot()
         if self.filling is None or snapshot.problem is not None:
-            return None
-        return self.filling, snapshot.timeline
+            return otherwise
+        return work(self.filling, snapshot.timeline)
 
     def waiting(self) -> list[BagFile]:
         """Returns the bags of which columns are to be stored, the newest first."""
-        if (to_fill := self._to_fill()) is None:
-            return []
-        filling, timeline = to_fill
-        return filling.waiting(timeline)
+        return self._filled(Filling.waiting, [])
 
     def batches(self) -> list[Batch]:
         """Returns the bags to be stored, as `Filling.batches`."""
-        if (to_fill := self._to_fill()) is None:
-            return []
-        filling, timeline = to_fill
-        return filling.batches(timeline)
+        return self._filled(Filling.batches, [])
 
     def store(self, batch: Batch) -> int:
         """Stores the columns of a batch of bags; returns how many bags, as `Filling.fill`."""
-        if (to_fill := self._to_fill()) is None:
-            return 0
-        filling, timeline = to_fill
-        return filling.fill(batch, timeline)
+        return self._filled(lambda filling, timeline: filling.fill(batch, timeline), 0)
 
     def follow(self) -> bool:
         """Makes what follows from whole parts, and keeps the store within what it may take.
@@ -133,20 +166,20 @@ class Backfill:
         Returns:
             Whether there is more of that.
         """
-        if (to_fill := self._to_fill()) is None:
-            return False
-        filling, timeline = to_fill
-        columns = self._memory.columns
+        return self._filled(self._follow, otherwise=False)
+
+    def _follow(self, filling: Filling, timeline: Timeline) -> bool:
+        columns = self.memory.columns
         coverage = columns.coverage(timeline)
         waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
-        make_fragments(self._memory, filling.whole_since(), waiting)
+        make_fragments(self.memory, filling.whole_since(), waiting)
         filling.thin()
         filling.trim()
         if self._of_others is None:
             self._of_others = columns.fragments_of_others()
         now, self._of_others = self._of_others[:_AGAIN], self._of_others[_AGAIN:]
         windows = [TimeWindow(start, start + PART_NS) for start in now]
-        make_fragments(self._memory, windows, [*waiting, *self._of_others])
+        make_fragments(self.memory, windows, [*waiting, *self._of_others])
         return bool(self._of_others)
 
     def look_after(self, *, thorough: bool = False) -> None:
@@ -155,9 +188,7 @@ class Backfill:
         Args:
             thorough: whether the whole file is read to check its integrity.
         """
-        if (to_fill := self._to_fill()) is not None:
-            filling, _ = to_fill
-            filling.store.look_after(thorough=thorough)
+        self._filled(lambda filling, _: filling.store.look_after(thorough=thorough), None)
 
     def precompute(self) -> None:
         """Finds out what cannot be decoded, and counts what overlapping recordings hold together.
@@ -165,7 +196,7 @@ class Backfill:
         Before a client asks.
         """
         with suppress(EpisodicError):
-            rows = list_recorded_topics(self._memory, Call())
+            rows = list_recorded_topics(self.memory, Call())
             self.undecodable = {row.topic: row.undecodable for row in rows if row.undecodable}
 
     def prune(self) -> None:
@@ -173,12 +204,13 @@ class Backfill:
 
         Does nothing where there are no bags, for the same reason.
         """
-        if (to_fill := self._to_fill()) is None:
-            return
-        filling, timeline = to_fill
-        if timeline.bags:
-            filling.prune(timeline)
-            self._memory.store_listings(self._memory.index.snapshot())
+
+        def of_deleted(filling: Filling, timeline: Timeline) -> None:
+            if timeline.bags:
+                filling.prune(timeline)
+                self.memory.store_listings(self.memory.index.snapshot())
+
+        self._filled(of_deleted, None)
 
 
 def make_fragments(
@@ -247,94 +279,29 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
         memory.columns.make_outlines(view.timeline, window)
 
 
-async def keep_backfilled(
-    backfill: Backfill,
-    helper: Sequence[str],
-    every_s: float,
-    warm_up: Callable[[], bool] | None = None,
-) -> None:
-    """Stores closed bags every `every_s` seconds, until it is cancelled.
-
-    `helper` is the command line of the program that stores a backlog (`ros2-memory index`).
-    `warm_up` is called once the store is full, until it returns that it is done.
-    """
-    filler = Filler(backfill, helper, warm_up)
+async def keep_backfilled(backfill: Backfill, every_s: float) -> None:
+    """Stores closed bags every `every_s` seconds, until it is cancelled."""
     while True:
-        await filler.fill()
+        await backfill.fill()
         await anyio.sleep(every_s)
 
 
-async def keep_all_backfilled(
-    fillers: Callable[[], Sequence[tuple[Memory, Filler]]], every_s: float
-) -> None:
+async def keep_all_backfilled(backfills: Callable[[], Sequence[Backfill]], every_s: float) -> None:
     """Fills several stores, one after the other, until it is cancelled.
 
     A memory whose bags were not scanned lately is passed over: its disk may hang.
     """
     while True:
-        for memory, filler in fillers():
+        for backfill in backfills():
+            memory = backfill.memory
             published = memory.index.published
             if published is None or published.problem is not None:
                 continue
             if memory.clock.now() - published.scanned_at > ns_from_unix(_LATELY * every_s):
                 continue
             with anyio.move_on_after(LONGEST_TURN_S):
-                await filler.fill()
+                await backfill.fill()
         await anyio.sleep(every_s)
-
-
-@dataclass
-class Filler:
-    """Fills one store, a round at a time; see `keep_backfilled`.
-
-    Without a `helper` it stores a backlog itself.
-    """
-
-    _backfill: Backfill
-    _helper: Sequence[str] = ()
-    _warm_up: Callable[[], bool] | None = None
-    _pruned_s: float = -math.inf
-    _is_precomputed: bool = False
-
-    async def fill(self) -> None:
-        """Stores the closed bags that there are. Raises nothing but cancellation."""
-        try:
-            await self._fill_round()
-        except Exception:
-            log.exception("filling_failed")
-
-    async def _fill_round(self) -> None:
-        backfill = self._backfill
-        due = time.monotonic() - self._pruned_s > PRUNE_INTERVAL_S
-        in_thread = backfill.in_thread
-        await in_thread(partial(backfill.look_after, thorough=due))
-        waiting = await in_thread(backfill.waiting)
-        store = None if backfill.filling is None else backfill.filling.store
-        # A store that is in memory cannot be filled by another process.
-        has_file = store is not None and store.path is not None
-        is_helped = self._helper and len(waiting) > BACKLOG and has_file
-        if is_helped and await _run_helper(self._helper):
-            # Bags that the helper could not store are tried here, and refused if they fail.
-            waiting = await in_thread(backfill.waiting)
-        if not waiting and store is not None:
-            await in_thread(store.write_again)  # whether the disk works again
-        done = tried = 0
-        for batch in await in_thread(backfill.batches):
-            if tried >= (BACKLOG if self._helper else _BACKLOG_ALONE):
-                break
-            tried += len(batch.bags)
-            done += await in_thread(partial(backfill.store, batch))
-            if store is not None and store.is_failing:
-                break
-        await in_thread(backfill.follow)
-        if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
-            await in_thread(backfill.precompute)
-            self._is_precomputed = True
-        if self._warm_up and len(waiting) <= BACKLOG and await in_thread(self._warm_up):
-            self._warm_up = None
-        if due:
-            await in_thread(backfill.prune)
-            self._pruned_s = time.monotonic()
 
 
 async def _run_helper(helper: Sequence[str]) -> bool:

@@ -325,12 +325,7 @@ class Dispatcher:
             return error.code, self._replies.error(error)
 
     async def _in_turn(
-        self,
-        name: str,
-        queue: FairQueue,
-        client: Hashable,
-        call: Call,
-        answer: Callable[[], Reply],
+        self, name: str, queue: FairQueue, client: Hashable, call: Call, answer: Callable[[], Reply]
     ) -> tuple[str, Reply]:
         """Returns the outcome and the reply, once it is the client's turn.
 

@@ -32,16 +32,15 @@ MOST_WAITING: Final = 256
 
 
 class FairQueue:
-    """Runs at most `threads` queries at once, each in a thread. At most `most_waiting` wait.
+    """Runs at most `threads` queries at once, each in a thread. At most `MOST_WAITING` wait.
 
     All methods must be called on the event loop's thread. A query counts as running until its
     thread is done, also where nobody waits for the answer any more: a thread cannot be stopped.
     """
 
-    def __init__(self, name: str, threads: int, most_waiting: int = MOST_WAITING) -> None:
+    def __init__(self, name: str, threads: int) -> None:
         self._threads = ThreadPoolExecutor(threads, thread_name_prefix=name)
         self._at_once = threads
-        self._most_waiting = most_waiting
         self._stopped = False
         self._waiting: dict[Hashable, deque[_Turn]] = {}
         self._running: Counter[Hashable] = Counter()
@@ -85,7 +84,7 @@ class FairQueue:
         if self.running < self._at_once and not self._waiting:
             self._running[client] += 1
             return
-        if self.waiting >= self._most_waiting:
+        if self.waiting >= MOST_WAITING:
             self._make_room(client)
         turn = asyncio.get_running_loop().create_future()
         self._waiting.setdefault(client, deque()).append(turn)
@@ -107,7 +106,7 @@ class FairQueue:
         """
         most = max(self._waiting, key=lambda waiting: len(self._waiting[waiting]))
         refusal = BusyError(
-            f"{self._most_waiting} questions wait already; ask again when some are answered, and "
+            f"{MOST_WAITING} questions wait already; ask again when some are answered, and "
             "fewer at once"
         )
         if len(self._waiting[most]) <= len(self._waiting.get(client, ())) + 1:

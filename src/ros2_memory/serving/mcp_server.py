@@ -87,30 +87,22 @@ _PROMPT_TITLE: Final = "How to use the robot's memory"
 _PROMPT_DESCRIPTION: Final = "Explains to a planner which tool answers which question."
 
 
-TOPICS: Final = Resource(
-    uri="episodic://topics",
-    name="topics",
-    description="Every recorded topic with its type, times and count.",
-    mime_type=_JSON,
-)
-STATUS: Final = Resource(
-    uri="episodic://status",
-    name="status",
-    description="Recorder state, age of the newest data, damaged files and silent topics.",
-    mime_type=_JSON,
-)
-MOMENTS: Final = Resource(
-    uri="episodic://moments",
-    name="moments",
-    description="Moments saved by remember_moment or a rule, newest first.",
-    mime_type=_JSON,
-)
-TOOLS_OF_RESOURCES: Final = {
-    TOPICS.uri: "list_recorded_topics",
-    STATUS.uri: "memory_status",
-    MOMENTS.uri: "list_moments",
+def _resource(name: str, description: str) -> Resource:
+    return Resource(uri=f"episodic://{name}", name=name, description=description, mime_type=_JSON)
+
+
+RESOURCES: Final = {
+    "list_recorded_topics": _resource(
+        "topics", "Every recorded topic with its type, times and count."
+    ),
+    "memory_status": _resource(
+        "status", "Recorder state, age of the newest data, damaged files and silent topics."
+    ),
+    "list_moments": _resource(
+        "moments", "Moments saved by remember_moment or a rule, newest first."
+    ),
 }
-"""The tools whose replies are the text of the resources."""
+"""The resources by the tools whose replies are their text."""
 _Report: TypeAlias = "Callable[[float, float | None, str | None], Awaitable[None]]"
 
 LISTS_CACHED: Final = CacheHint(ttl_ms=3_600_000, scope="public")
@@ -180,17 +172,12 @@ class EpisodicServer(MCPServer[object]):
         self._progress = progress
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
-        has_status = any(tool.name == TOOLS_OF_RESOURCES[STATUS.uri] for tool in dispatcher.tools)
-        offered = [TOPICS, STATUS, MOMENTS] if has_status else [TOPICS]
-        readable = dispatcher.readable
-        self._resources = [
-            resource for resource in offered if TOOLS_OF_RESOURCES[resource.uri] in readable
-        ]
-        self._templates = [
-            template
-            for template, tool, *_ in _TEMPLATES.values()
-            if has_status and tool in readable
-        ]
+        has_status = any(tool.name == "memory_status" for tool in dispatcher.tools)
+        offered = (
+            dispatcher.readable if has_status else dispatcher.readable & {"list_recorded_topics"}
+        )
+        self._resources = {tool: row for tool, row in RESOURCES.items() if tool in offered}
+        self._templates = {prefix: row for prefix, row in _TEMPLATES.items() if row[1] in offered}
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
 
     async def list_tools(self) -> list[ListedTool]:
@@ -232,11 +219,11 @@ class EpisodicServer(MCPServer[object]):
 
     async def list_resources(self) -> list[Resource]:
         """Returns the resources that have no parameter."""
-        return self._resources
+        return [*self._resources.values()]
 
     async def list_resource_templates(self) -> list[ResourceTemplate]:
         """Returns the templates of the resources of message types and of saved moments."""
-        return self._templates
+        return [template for template, *_ in self._templates.values()]
 
     async def read_resource(
         self, uri: object, context: object | None = None
@@ -257,14 +244,14 @@ class EpisodicServer(MCPServer[object]):
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
         """Returns the tool of a resource, and its arguments."""
-        for prefix, (template, tool, argument, _) in _TEMPLATES.items():
-            if template in self._templates and uri.startswith(prefix) and uri != prefix:
+        for prefix, (_, tool, argument, _) in self._templates.items():
+            if uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
-        offered = [resource.uri for resource in self._resources]
-        if uri in offered:
-            return TOOLS_OF_RESOURCES[uri], {}
+        tools = {resource.uri: tool for tool, resource in self._resources.items()}
+        if uri in tools:
+            return tools[uri], {}
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
-        uris = ", ".join([*offered, *(template.uri_template for template in self._templates)])
+        uris = ", ".join([*tools, *(row[0].uri_template for row in self._templates.values())])
         raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {uris}")
 
     async def _complete(
@@ -275,25 +262,19 @@ class EpisodicServer(MCPServer[object]):
     ) -> Completion | None:
         """Returns what a template's parameter can be, as far as it has been typed."""
         uri = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        completed = next(
-            (
-                (key, tool)
-                for template, _, key, tool in _TEMPLATES.values()
-                if template in self._templates and template.uri_template == uri
-            ),
-            None,
-        )
-        if completed is None:
+        sources = {
+            template.uri_template: (key, tool)
+            for template, _, key, tool in self._templates.values()
+        }
+        if uri not in sources:
             return None
-        key, tool = completed
+        key, tool = sources[uri]
         reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
         rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
         typed = argument.value.casefold()
         values = sorted({str(row[key]) for row in rows if typed in str(row[key]).casefold()})
         return Completion(
-            values=values[:_MAX_COMPLETED],
-            total=len(values),
-            has_more=len(values) > _MAX_COMPLETED,
+            values=values[:_MAX_COMPLETED], total=len(values), has_more=len(values) > _MAX_COMPLETED
         )
 
     async def list_prompts(self) -> list[Prompt]:

@@ -273,24 +273,15 @@ _Times: TypeAlias = Annotated[tuple[_Moment, ...], BeforeValidator(_as_times)]
 _Topic: TypeAlias = Annotated[_Name, Field(description="E.g. /odom.", examples=["/odom"])]
 _PoseTopic: TypeAlias = Annotated[_Name, Field(description="Pose topic.")]
 _SearchTopic: TypeAlias = Annotated[
-    _Name,
-    Field(description="Topic or glob.", examples=["/vision/*/scene_objects"]),
+    _Name, Field(description="Topic or glob.", examples=["/vision/*/scene_objects"])
 ]
 _Fields: TypeAlias = Annotated[
-    tuple[_Name, ...],
-    BeforeValidator(_as_names),
-    Field(description='Only these: ["position.x"].'),
+    tuple[_Name, ...], BeforeValidator(_as_names), Field(description='Only these: ["position.x"].')
 ]
 _Labels: TypeAlias = Annotated[
     tuple[_Name, ...],
     BeforeValidator(_as_names),
-    WithJsonSchema(
-        {
-            "type": ["string", "array"],
-            "items": {"type": "string"},
-            "examples": ["mug"],
-        }
-    ),
+    WithJsonSchema({"type": ["string", "array"], "items": {"type": "string"}, "examples": ["mug"]}),
 ]
 _Coordinate: TypeAlias = Annotated[
     float, Field(strict=True, allow_inf_nan=False), Field(examples=[1.5], description="m.")

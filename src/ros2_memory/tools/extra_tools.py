@@ -107,10 +107,7 @@ MOMENTS = ToolDeclaration(
     list_moments,
 )
 MOMENT = ToolDeclaration(
-    (ToolName("show_moment", "A saved moment"),),
-    "One saved moment.",
-    MomentArguments,
-    show_moment,
+    (ToolName("show_moment", "A saved moment"),), "One saved moment.", MomentArguments, show_moment
 )
 _SAVE_MOMENT = ToolDeclaration(
     (ToolName("remember_moment", "Save a moment"),),

@@ -1,8 +1,13 @@
-"""Answers and errors as the JSON text that is sent: with their kind, and never too long."""
+"""Answers and errors as the JSON text that is sent: with their kind, and never too long.
+
+Nearly every answer is rendered by its declaration alone (`core/reply.py`, `results/`). Here is what
+looks at the reply as a whole: rows that repeat each other, lists that are shortened until it fits.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections import Counter
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final
 
@@ -15,19 +20,59 @@ from ros2_memory.core.errors import (
     QueryTimeoutError,
     UndecodableError,
 )
-from ros2_memory.core.reply import JsonObject, Scope, file_name, shown, with_notes
+from ros2_memory.core.reply import (
+    JsonObject,
+    Keys,
+    LocalTimes,
+    Scope,
+    file_name,
+    render,
+    shown,
+    with_notes,
+)
 from ros2_memory.core.text import quoted_keys
-from ros2_memory.core.timebase import Ns, unix_rounded_up
-from ros2_memory.tools.reply_json import ROBOT_NAME, as_json
-from ros2_memory.tools.reply_size import QUOTED, fit_reply, to_json_text
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_rounded_up
+from ros2_memory.history.driven_path import length_notes
+from ros2_memory.results.things import SHORT_THING, compared, listed_things, thing
+from ros2_memory.tools.reply_size import HEADERS, QUOTED, fit_reply, largest, to_json_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.motion.trajectory import Trajectory
     from ros2_memory.core.model import JsonValue
 
 _LONGEST_LAST_ROW_CHARS: Final = 200
 """Characters of the row that sums up those left out, whatever its numbers."""
+ROBOT_NAME: Final = "robot_name"
+"""The key of the robot that an answer or a row is of, in a fleet; `robot` is where one was."""
+FINE_PATH_M: Final = 0.05 + 1e-9
+"""The deviation that a simplified path is expected to have; a larger one is noted."""
+_OF_ALL: Final = ("topic", "type", "frame_id", "parent", "child", "clock")
+"""Keys that a reply about several moments has once, where they have the same value at each."""
+_OF_WINDOW: Final = ("start", "end", "local", "at", "now")
+"""Keys of a reply that the row of its window has, or has not."""
+_SUMMED: Final = (
+    "total",
+    "at_least",
+    "entries",
+    "exits",
+    "minutes",
+    "visits",
+    "distance_m",
+    "duration_s",
+    "stood_s",
+    "inside_s",
+    "unknown_s",
+)
+"""Numbers of the replies for several windows that are added up."""
+_COMPARISONS: Final = tuple(compared(most) for most in range(5, 0, -1))
+_THINGS: Final = tuple(listed_things(thing(most_stays)) for most_stays in (8, 5, 3, 2))
+_SHORT_THINGS: Final = listed_things(SHORT_THING)
+_HOW: Final = "in short form; ask with one to four labels for their scores, states and moves"
+_LONGEST: Final = 6_000
+"""Characters of a reply about things; its lists are cut until it is no longer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +81,6 @@ class Reply:
 
     text: str
     is_error: bool = False
-
-
-def named(robot_name: str, value: JsonValue) -> JsonObject:
-    """Returns the JSON value of an answer with the name of its robot.
-
-    That is first in an object; "never", which is null, becomes an object whose values are null.
-    """
-    whole = value if isinstance(value, dict) else {"timestamp": None, "value": None}
-    return {ROBOT_NAME: robot_name, **whole}
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +116,9 @@ class Replies:
             return Reply(self._topics(answer, {} if name is None else {ROBOT_NAME: name}))
         value = answer.value if isinstance(answer, results.OfFleet) else as_json(answer, bag_dir)
         if name is not None:
-            value = named(name, value)
+            # "Never", which is null, becomes an object whose values are null.
+            whole = value if isinstance(value, dict) else {"timestamp": None, "value": None}
+            value = {ROBOT_NAME: name, **whole}
         if not isinstance(value, dict):
             return Reply(to_json_text(value))
         if notes:
@@ -159,3 +197,178 @@ class Replies:
     def _failure(self, code: str, detail: str, **more: JsonValue) -> Reply:
         reply: JsonObject = {"error": code, **more, "detail": detail}
         return self._fitted(reply, is_error=True)
+
+
+def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
+    """Returns an answer as a JSON value of any size; files are named relative to `bag_dir`."""
+    reply: JsonValue = None
+    match answer:
+        case tuple():
+            reply = [shown(row, Scope()) for row in answer]
+        case results.Match(found=None, notes=()) | results.ValueWhen(matched=None, notes=()):
+            pass
+        case results.ValueWhen(matched=None):
+            reply = render(results.Match(None, notes=answer.notes), bag_dir)
+        case results.AtEach():
+            reply = _at_each(answer, bag_dir)
+        case results.InEach():
+            reply = _in_each(answer, bag_dir)
+        case results.Comparison():
+            reply = _shortest(answer, bag_dir, _COMPARISONS)
+        case results.Things():
+            reply = _things(answer, bag_dir)
+        case _:
+            reply = render(_with_all_notes(answer), bag_dir)
+    return reply
+
+
+def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
+    """Returns an answer with the notes of what it consists of, each once."""
+    match answer:
+        case results.Match(found=found) if found is not None:
+            return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
+        case results.ValueWhen(matched=matched, value=value) if matched is not None:
+            value_notes = () if value is None else value.notes
+            return replace(
+                answer, notes=tuple(dict.fromkeys((*matched.notes, *value_notes, *answer.notes)))
+            )
+        case results.TrajectorySummary():
+            return replace(answer, notes=(*answer.notes, *_path_notes(answer.trajectory)))
+        case _:
+            return answer
+
+
+def _at_each(answer: results.AtEach, bag_dir: Path) -> JsonObject:
+    """Returns one row for each moment; what all rows share is above them, and is not repeated."""
+    rendered = [render(at_moment, bag_dir) for at_moment in answer.answers]
+    shared, rows, common = _joined(rendered, lambda key, _: key in _OF_ALL)
+    explained: set[JsonValue] = set()
+    for row in rows:
+        if "error" in row:
+            if row["reason"] in explained:
+                del row["detail"]
+            explained.add(row["reason"])
+    return with_notes({**shared, "results": [*rows]}, common)
+
+
+def _in_each(answer: results.InEach, bag_dir: Path) -> JsonObject:
+    """Returns one row for each window, and what all have together."""
+    replies = [as_json(window.answer, bag_dir) for window in answer.windows]
+    bodies = [reply for reply in replies if isinstance(reply, dict)]
+    shared, parts, common = _joined(
+        bodies, lambda key, value: isinstance(value, str) or key in HEADERS
+    )
+    rows: list[JsonValue] = []
+    for window, part in zip(answer.windows, parts, strict=True):
+        row: JsonObject = {
+            "local": LocalTimes(MIN_NS, MAX_NS).text(window.start, window.stop),
+            "start": unix_rounded_up(window.start),
+            "end": unix_rounded_up(window.stop),
+        }
+        rows.append(row | {key: item for key, item in part.items() if key not in _OF_WINDOW})
+    whole = _added_up([body for body in bodies if "error" not in body], is_all=answer.is_all)
+    total: JsonObject = {"all": whole} if whole else {}
+    return with_notes({**total, **shared, "windows": rows}, [*answer.notes, *common])
+
+
+def _joined(
+    replies: Sequence[JsonObject], may_be_shared: Callable[[str, JsonValue], bool]
+) -> tuple[JsonObject, list[JsonObject], list[str]]:
+    """Returns what all replies with an answer share, the rest of each, and the notes of several."""
+    answered = [reply for reply in replies if "error" not in reply]
+    shared: JsonObject = {
+        key: value
+        for key, value in (answered[0] if answered else {}).items()
+        if may_be_shared(key, value) and all(reply.get(key) == value for reply in answered)
+    }
+    occurrences = Counter(note for reply in replies for note in dict.fromkeys(_notes_in(reply)))
+    common = [note for note, times in occurrences.items() if times > 1]
+    rows = [
+        with_notes(
+            {key: value for key, value in reply.items() if key not in shared and key != "notes"},
+            [note for note in _notes_in(reply) if note not in common],
+        )
+        for reply in replies
+    ]
+    return shared, rows, common
+
+
+def _added_up(replies: Sequence[JsonObject], *, is_all: bool) -> JsonObject:
+    """Returns the sums over replies; `at_least` so many where one of them has no total.
+
+    And where they are not all that was asked for.
+    """
+    if not is_all or any("at_least" in reply for reply in replies):
+        replies = [{"at_least": reply.get("total"), **reply, "total": None} for reply in replies]
+    sums: JsonObject = {}
+    for key in _SUMMED:
+        values = [reply.get(key) for reply in replies]
+        numbers = [value for value in values if isinstance(value, int | float)]
+        if numbers:
+            sums[key] = round(sum(numbers), 3)
+    return sums
+
+
+def _notes_in(reply: JsonObject) -> list[str]:
+    notes = reply.get("notes")
+    return [note for note in notes if isinstance(note, str)] if isinstance(notes, list) else []
+
+
+def _shortest(
+    answer: results.Comparison | results.Things, bag_dir: Path, forms: tuple[Keys, ...]
+) -> JsonObject:
+    """Returns an answer by the first keys that leave it short, else by the last."""
+    reply: JsonObject = {}
+    for form in forms:
+        reply = render(answer, bag_dir, form)
+        if _is_short(reply):
+            break
+    return reply
+
+
+def _is_short(reply: JsonObject) -> bool:
+    return len(to_json_text(reply)) <= _LONGEST
+
+
+def _things(answer: results.Things, bag_dir: Path) -> JsonObject:
+    """Returns the things, each with as many of its newest places as leave the reply short.
+
+    Where that is not enough, what each is and where it was last, and only the things seen last.
+    """
+    reply = _shortest(answer, bag_dir, _THINGS)
+    if not answer.things or _is_short(reply):
+        return reply
+
+    def first(count: int) -> JsonObject:
+        things = answer.things[:count]
+        # A row of several at once is so many things.
+        listed = sum(thing.at_once or 1 for thing in things)
+        how_many = "all" if listed == answer.total else f"{listed} of {answer.total}"
+        note = f"{how_many} things are listed, {_HOW}"
+        few = replace(answer, things=things, notes=(note, *answer.notes))
+        return render(few, bag_dir, _SHORT_THINGS)
+
+    return first(largest(1, len(answer.things), lambda count: _is_short(first(count))) or 1)
+
+
+def _path_notes(path: Trajectory) -> Iterator[str]:
+    yield from length_notes(path)
+    if path.totals.jumps:
+        drawn = sum(point.jump for point in path.waypoints)
+        if drawn:
+            longest = "the longest lead" if drawn < path.totals.jumps else "each leads"
+            yield (
+                f"of the jumps {longest} to a waypoint with jump: true; "
+                "that distance was not driven"
+            )
+    mean, fastest = path.avg_speed, path.max_speed
+    if path.poses and fastest is not None and path.max_speed_from == "positions":
+        yield "max_speed is measured from positions: the messages have no speed"
+    # By more than the rounding of both.
+    if mean is not None and fastest is not None and mean > fastest + 0.01:
+        yield (
+            "avg_speed, by the positions, is above max_speed of the messages: "
+            "one of the two is wrong"
+        )
+    if path.waypoint_error_m > FINE_PATH_M:
+        yield f"the path is within {path.waypoint_error_m:.2f} m of the waypoints' line"

@@ -17,7 +17,7 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.coverage import seconds
 from ros2_memory.history.view import AtTime, TimeRange
 from ros2_memory.results import TransformAt
-from ros2_memory.tools.reply_json import as_json
+from ros2_memory.tools.replies import as_json
 from tests.support.bags import boolean, detections, log_entry, odom, text, tf, transform, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.memories import asked, memory_of, with_store

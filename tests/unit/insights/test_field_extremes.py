@@ -10,8 +10,7 @@ from ros2_memory import queries
 from ros2_memory.history.context import Call
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights import fields
-from ros2_memory.tools.replies import Replies
-from ros2_memory.tools.reply_json import as_json
+from ros2_memory.tools.replies import Replies, as_json
 from tests.support.bags import Msg, boolean, detections, odom, text, write_mcap
 from tests.support.memories import memory_of
 

@@ -17,7 +17,7 @@ from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.at_each import hours_of_days, in_each
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.tools.arguments import _as_hours
-from ros2_memory.tools.reply_json import as_json
+from ros2_memory.tools.replies import as_json
 from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import asked, memory_of
 from tests.support.rooms import S, asked_of, draw, write

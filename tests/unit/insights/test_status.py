@@ -291,7 +291,7 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
         tf(BEGIN, transform(BEGIN, "a", "b", (0, 0, 0)), topic="/tf_static"),
     ]
     answer = memory_status(remembering(tmp_path, messages), Call())
-    assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S, S),)
+    assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S),)
 
 
 @pytest.mark.parametrize(("docked_s", "fell"), [(190, []), (260, ["/odom"])])

@@ -34,14 +34,7 @@ from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
 from tests.support.fleets import START_S
 from tests.support.housekeepers import own_all
-from tests.support.lakes import (
-    lake_column,
-    location,
-    robot_bags,
-    ship,
-    ship_from,
-    write_bag,
-)
+from tests.support.lakes import lake_column, location, robot_bags, ship, ship_from, write_bag
 from tests.support.log_lines import with_checks
 
 MARKER = "zyxwv-9876"

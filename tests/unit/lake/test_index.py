@@ -1,22 +1,33 @@
-"""What is read again of a lake, and what stays, when more is shipped while a server runs."""
+"""What is read again of a lake, and what stays, when more is shipped; how far back searches go."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import date
+from datetime import date, timedelta
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.history.context import Memory
+from ros2_memory.core.timebase import NS_PER_S, Deadline
+from ros2_memory.fleet.robots import Fleet, Robot
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+from ros2_memory.lake.memory import newest
 from ros2_memory.lake.tables import day_of
-from tests.support.bags import detections, text, write_mcap
-from tests.support.fleets import SEEN, START_S
+from ros2_memory.lake.warehouse import Days, LakeFile
+from ros2_memory.queries import find_last_match
+from ros2_memory.results import Match
+from tests.support.bags import Msg, detections, text, write_mcap
+from tests.support.clocks import FixedClock
+from tests.support.fleets import NOW, SEEN, START_S, reply
 from tests.support.lakes import lake_robot, robot_bags, ship
 
 DAY_S = 86_400
@@ -109,9 +120,9 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     older = START_S - DAY_S
     robot = shipping.robot(days=1, most_bags=1)
     index = robot.index
-    for newest in (older, START_S):
-        shipping.ship([newest])
-        assert starts(robot) == [newest]
+    for last in (older, START_S):
+        shipping.ship([last])
+        assert starts(robot) == [last]
     bag, *_ = index.snapshot(older * NS_PER_S).bags
     shipping.ship([older + 60], label="fork")
     index.refresh()
@@ -169,3 +180,115 @@ def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
     for bag in bags:
         [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
         assert record.log_time == bag.start
+
+
+FIRST = date(2024, 2, 27)
+SIZES = st.lists(st.tuples(st.integers(0, 40), st.integers(1, 50)), max_size=12)
+
+
+def days_of(sizes: Sequence[tuple[int, int]]) -> Days:
+    """Days with gaps between them and files of so many rows."""
+    found, day = {}, FIRST
+    for gap, size in sizes:
+        day += timedelta(days=gap + 1)
+        found[day] = (LakeFile(f"file:///{day}", size),)
+    return found
+
+
+@given(SIZES, st.integers(1, 60), st.integers(1, 40), st.integers(0, 500))
+def test_the_newest_days_are_as_many_as_fit_and_at_least_those_asked_for(
+    sizes: list[tuple[int, int]], most: int, fewest: int, after: int
+) -> None:
+    days, until = days_of(sizes), FIRST + timedelta(days=after)
+    known = [day for day in days if day <= until]
+    found, before = newest(days, until, most, fewest)
+    assert [*found] == [day for day in known if before is None or day > before]
+    if not found:
+        assert not known
+        return
+    assert max(found) == known[-1]
+    always = known[-1] - timedelta(days=fewest)
+    rows = sum(file.rows for files in found.values() for file in files)
+    assert rows <= most or min(found) > always
+    if before is not None:
+        assert rows + days[before][0].rows > most
+        assert before <= always
+
+
+DAYS = 7
+"""Days ago that the first bag is of; from then on there are two of a day, and none of the third."""
+
+
+@pytest.fixture(scope="module")
+def memory(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+    """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
+
+    Its track is of another topic since.
+    """
+    folder = tmp_path_factory.mktemp("old")
+    labels = {DAYS: "mug", DAYS - 1: "fork"}
+    for ago in (7, 6, 4, 3, 1, 0):
+        at = (START_S - ago * DAY_S) * NS_PER_S
+        seen = labels.get(ago, "cup")
+        messages: list[Msg] = [detections(at, [seen]), text(at + NS_PER_S, seen)]
+        if ago == DAYS:
+            messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
+        write_mcap(folder / "bags" / "rec" / f"rec_{DAYS - ago}.mcap", messages)
+    ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
+    return lake_robot(folder / "lake", engine, days=1, most_bags=1)
+
+
+@pytest.fixture
+def robot(memory: Memory) -> Robot:
+    return Robot("hall", Path("/hall"), memory, lake=memory)
+
+
+def asked(of: Robot, tool: str, label: str, topic: str = SEEN, **more: object) -> Any:
+    given = {"topic": topic, "condition_type": "contains", "value": label, **more}
+    return reply(Fleet([of], FixedClock(NOW)), tool, given)
+
+
+def test_what_was_seen_before_the_newest_days_is_found_and_never_is_of_all(robot: Robot) -> None:
+    for label, ago in (("cup", 0), ("fork", 6), ("mug", 7), ("elephant", None)):
+        found = asked(robot, "find_last_match", label)
+        times = [row["timestamp"] for row in found["matches"]]
+        assert times == ([] if ago is None else [START_S - ago * DAY_S])
+        assert ("never" in found) is (ago is None)
+        assert "not looked at" not in str(found)
+    before = START_S - 2 * DAY_S
+    assert "never" not in asked(robot, "find_last_match", "mug", before=before)
+    # A topic of old days alone.
+    assert len(asked(robot, "find_last_match", "spoon", "/vision/old")["matches"]) == 1
+    assert asked(robot, "find_last_match", "cup", "/vision/old")["never"] == ["hall"]
+
+
+def test_days_before_are_named_only_where_the_answer_is_of_them(robot: Robot) -> None:
+    spans: tuple[tuple[dict[str, Any], bool], ...] = (
+        ({}, True),
+        ({"start": START_S - DAY_S}, True),
+        ({"start": START_S}, False),
+        ({"last_s": 60}, False),
+        ({"end": START_S - 2 * DAY_S}, True),
+    )
+    for span, is_noted in spans:
+        for name in ({}, {"robot": "hall"}):
+            found = asked(robot, "find_matches", "cup", **span, **name)
+            assert ("not looked at" in str(found)) is is_noted, span
+
+
+def test_where_the_time_is_short_it_says_how_far_it_looked(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("ros2_memory.queries.READING_S", 0.0)
+
+    def ask(topic: str, memory: Memory, call: Call) -> Match:
+        return find_last_match(memory, call, topic, "contains", "mug")
+
+    call = Call(Deadline.after(60))
+    found, lake = robot.asked(partial(ask, SEEN), call)
+    assert found.found is None
+    assert lake is not None
+    [note] = lake.notes
+    assert note.startswith("the lake has days before ")
+    with pytest.raises(NoDataError, match=r"/none.*; the lake has days before "):
+        robot.asked(partial(ask, "/none"), Call(Deadline.after(60)))

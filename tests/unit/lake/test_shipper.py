@@ -1,5 +1,7 @@
 """Each bag comes into the lake once, whatever happens while it is shipped."""
 
+from __future__ import annotations
+
 import os
 import random
 import shutil
@@ -23,11 +25,13 @@ from tests.support.lakes import (
     location,
     robot_bags,
     ship,
+    ship_and_ask,
     ship_from,
     shipping,
     write_bag,
 )
 from tests.support.processes import until
+from tests.support.rest_catalogue import rest_catalogue
 
 ROBOTS = ("hall", "kitchen")
 BAGS = 3
@@ -281,3 +285,10 @@ def test_killed_at_any_point_it_loses_and_doubles_nothing(
     assert len(lake_column(tmp_path / "lake", "bags", "bag_id")) == bags
     assert lake_column(tmp_path / "lake", "sightings", "label") == ["cup"] * bags
     assert len(read_receipts(tmp_path / "hall")) == bags
+
+
+def test_bags_are_shipped_once_and_asked_through_a_rest_catalogue(tmp_path: Path) -> None:
+    with rest_catalogue(tmp_path / "lake") as uri:
+        where = replace(location(tmp_path / "lake"), catalog="rest", uri=uri)
+        ship_and_ask(where, tmp_path / "hall")
+        assert where.last_commit() is not None

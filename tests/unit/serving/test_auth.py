@@ -1,10 +1,13 @@
-"""What the gate lets in, and what it asks for."""
+"""What the gate lets in; the token that it asks for: where it comes from, what it must be."""
 
 from __future__ import annotations
 
 import gc
 import hmac
-from typing import Any
+import os
+import traceback
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 import httpx2
 import pytest
@@ -13,7 +16,21 @@ from hypothesis import strategies as st
 from starlette.responses import PlainTextResponse
 from structlog.testing import capture_logs
 
-from ros2_memory.serving.auth import AUTHENTICATED, LOG_INTERVAL_S, TokenGate
+from ros2_memory.config import load_settings
+from ros2_memory.core.errors import ConfigError
+from ros2_memory.recorder.process.installation import without_ours
+from ros2_memory.serving.auth import (
+    AUTHENTICATED,
+    LOG_INTERVAL_S,
+    LONGEST_TOKEN,
+    SHORTEST_TOKEN,
+    TokenGate,
+    api_token,
+    take_token,
+)
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 GOOD = "kJ7-x._~+/0123456789=="
 
@@ -175,3 +192,137 @@ def test_it_keeps_no_token() -> None:
     assert GOOD not in kept
     assert GOOD.encode() not in kept
     assert GOOD not in repr(vars(held))
+
+
+UNUSABLE = {
+    "short": "sEcReT7",
+    "one_too_few": "s" * (SHORTEST_TOKEN - 1),
+    "inner_space": "sEcReT7 sEcReT7 sEcReT7",
+    "line_break": "sEcReT7sEcReT7\nX-Other: sEcReT7",
+    "quote": 'sEcReT7sEcReT7"sEcReT7',
+    "not_ascii": "sEcReT7sEcReT7\u00e9sEcReT7",
+    "padding_alone": "=" * 20,
+    "padding_inside": "sEcReT7=sEcReT7sEcReT7",
+    "nothing_but_spaces": " " * 20,
+    "control": "sEcReT7sEcReT7\x00sEcReT7",
+    "long": "s" * (LONGEST_TOKEN + 1),
+}
+
+
+def refused(env: dict[str, str]) -> str:
+    """The sentence that refuses an environment; whatever a traceback of it shows is looked at."""
+    with pytest.raises(ConfigError) as caught:
+        api_token(env)
+    shown = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
+    assert "sEcReT7" not in shown
+    assert "ssss" not in shown
+    return str(caught.value)
+
+
+def revealed(env: dict[str, str]) -> str | None:
+    token = api_token(env)
+    return token.get_secret_value() if token else None
+
+
+def test_there_is_none_where_nothing_gives_one(tmp_path: Path) -> None:
+    assert api_token({}) is None
+    assert api_token({"MEMORY_API_TOKEN": "", "MEMORY_API_TOKEN_FILE": ""}) is None
+    assert api_token({"CREDENTIALS_DIRECTORY": str(tmp_path)}) is None
+
+
+@pytest.mark.parametrize("ending", ["", "\n", "\r\n"])
+def test_it_comes_from_a_file_whose_last_line_may_end(tmp_path: Path, ending: str) -> None:
+    file = tmp_path / "token"
+    file.write_bytes((GOOD + ending).encode())
+    assert revealed({"MEMORY_API_TOKEN_FILE": str(file)}) == GOOD
+
+
+def test_it_comes_from_the_credentials_of_a_systemd_unit(tmp_path: Path) -> None:
+    (tmp_path / "memory_api_token").write_text(GOOD + "\n")
+    assert revealed({"CREDENTIALS_DIRECTORY": str(tmp_path)}) == GOOD
+
+
+def test_two_that_give_it_are_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "memory_api_token").write_text(GOOD)
+    reply = refused({"MEMORY_API_TOKEN": GOOD, "CREDENTIALS_DIRECTORY": str(tmp_path)})
+    assert "MEMORY_API_TOKEN and the credential memory_api_token" in reply
+
+
+@pytest.mark.parametrize("text", UNUSABLE.values(), ids=UNUSABLE)
+def test_one_that_cannot_be_used_is_refused_without_being_shown(tmp_path: Path, text: str) -> None:
+    reply = refused({"MEMORY_API_TOKEN": text})
+    assert reply.startswith("MEMORY_API_TOKEN: the API token")
+    assert "openssl rand -hex 32" in reply
+    file = tmp_path / "token"
+    file.write_text(text, encoding="utf-8")
+    assert refused({"MEMORY_API_TOKEN_FILE": str(file)}).startswith(
+        "MEMORY_API_TOKEN_FILE: the API"
+    )
+
+
+@pytest.mark.parametrize("text", ["", "\n"])
+def test_an_empty_file_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "token"
+    file.write_text(text)
+    assert "is empty" in refused({"MEMORY_API_TOKEN_FILE": str(file)})
+
+
+def test_what_is_no_file_is_refused_and_not_waited_for(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(pipe)})
+    assert "not a regular file" in refused({"MEMORY_API_TOKEN_FILE": str(tmp_path)})
+    reply = refused({"MEMORY_API_TOKEN_FILE": str(tmp_path / "none")})
+    assert "No such file" in reply
+    assert "none" in reply
+
+
+@given(st.text(min_size=SHORTEST_TOKEN, max_size=60))
+def test_what_is_taken_can_stand_in_a_header(text: str) -> None:
+    with suppress(ConfigError):
+        assert revealed({"MEMORY_API_TOKEN": text}) == text
+        assert text.isascii()
+        assert text.isprintable()
+        assert " " not in text
+
+
+def test_a_server_that_others_can_reach_needs_one() -> None:
+    with pytest.raises(ConfigError, match=r"^MEMORY_API_TOKEN: missing") as caught:
+        take_token({}, host="robot.lan", loopback=False)
+    for reply in ("'robot.lan'", "MEMORY_API_TOKEN_FILE", "LoadCredential", "127.0.0.1"):
+        assert reply in str(caught.value)
+    token = take_token({"MEMORY_API_TOKEN": GOOD}, host="robot.lan", loopback=False)
+    assert token is not None
+
+
+def test_a_server_on_the_loopback_address_may_have_one() -> None:
+    assert take_token({}, host="127.0.0.1", loopback=True) is None
+    assert take_token({"MEMORY_API_TOKEN": GOOD}, host="127.0.0.1", loopback=True)
+
+
+def test_what_the_server_starts_does_not_inherit_it() -> None:
+    env = {"MEMORY_API_TOKEN": GOOD, "PATH": "/bin"}
+    assert take_token(env, host="127.0.0.1", loopback=True)
+    assert env == {"PATH": "/bin"}
+    assert "MEMORY_API_TOKEN" not in without_ours({"MEMORY_API_TOKEN": GOOD})
+
+
+class TestTakenForASetting:
+    """Somebody writes the token where settings go: it is refused, and not repeated."""
+
+    @pytest.mark.parametrize(
+        "text",
+        ["server.api_token=sEcReT7sEcReT7sEcReT7", "+api_token=[sEcReT7", "API_TOKEN='sEcReT7"],
+    )
+    def test_on_the_command_line_or_in_the_environment(self, text: str) -> None:
+        for overrides, env in (([text], {}), ((), {"MEMORY_CONFIG_OVERRIDES": text})):
+            with pytest.raises(ConfigError) as caught:
+                load_settings(overrides, env)
+            assert "sEcReT7" not in "".join(traceback.format_exception(caught.value))
+
+    def test_in_a_file_of_the_configuration(self, tmp_path: Path) -> None:
+        (tmp_path / "config.yaml").write_text("server:\n  api_token: sEcReT7sEcReT7sEcReT7\n")
+        with pytest.raises(ConfigError) as caught:
+            load_settings((), {"MEMORY_CONFIG_DIR": str(tmp_path)})
+        assert "server.api_token" in str(caught.value)
+        assert "sEcReT7" not in str(caught.value)

@@ -135,9 +135,7 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path:
     assert stored(memory) == ["rec/rec_0.mcap"]
 
 
-async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(
-    tmp_path: Path,
-) -> None:
+async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(tmp_path: Path) -> None:
     bag(tmp_path, 0)
     _, backfill = storing(tmp_path)
     begun: list[int] = []
@@ -146,9 +144,10 @@ async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(
         begun.append(backfill.progress().waiting)
         return len(begun) == 2
 
+    backfill.helper, backfill.warm_up = ["/no/such/program"], warm_up
     with anyio.fail_after(30):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, backfill, ["/no/such/program"], 0.001, warm_up)
+            tasks.start_soon(keep_backfilled, backfill, 0.001)
             while len(begun) < 2:
                 await anyio.lowlevel.checkpoint()
             bag(tmp_path, 1)
@@ -165,9 +164,10 @@ async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
     for number in range(BACKLOG + 2):
         bag(tmp_path, number)
     _, backfill = storing(tmp_path)
+    backfill.helper = helper
     with anyio.fail_after(60):
         async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, backfill, helper, 0.001)
+            tasks.start_soon(keep_backfilled, backfill, 0.001)
             while backfill.progress().waiting:
                 await anyio.lowlevel.checkpoint()
             tasks.cancel_scope.cancel()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any, Final
 
 import pytest
@@ -97,18 +98,14 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_query_that_nobody_waits_for_reads_no_further(
     bag_dir: Path, name: str, given: dict[str, Any]
 ) -> None:
-    def asked(leaves_after: int) -> Watched:
+    def read(leaves_after: int, ending: AbstractContextManager[object]) -> int:
         reader = Watched(bag_dir, leaves_after)
         memory = memory_of(bag_dir, reader=reader)
         call = Call(Deadline.after(25.0, lambda: math.inf if reader.is_left else 0.0))
-        TOOLS[name].question(given)(memory, call)
-        return reader
+        with ending:
+            TOOLS[name].question(given)(memory, call)
+        return reader.read
 
-    whole = asked(1 << 60).read
+    whole = read(1 << 60, nullcontext())
     assert whole > 2 * AT_MOST, "it must have something left to read"
-    reader = Watched(bag_dir, whole // 4)
-    memory = memory_of(bag_dir, reader=reader)
-    call = Call(Deadline.after(25.0, lambda: math.inf if reader.is_left else 0.0))
-    with pytest.raises(QueryTimeoutError):
-        TOOLS[name].question(given)(memory, call)
-    assert reader.read <= whole // 4 + AT_MOST
+    assert read(whole // 4, pytest.raises(QueryTimeoutError)) <= whole // 4 + AT_MOST

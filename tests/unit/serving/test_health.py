@@ -152,9 +152,7 @@ async def test_a_recorder_that_was_stopped_is_no_problem(tmp_path: Path) -> None
     assert (await Health(memory_at(tmp_path, seconds=600), "1")())["status"] == "ok"
 
 
-async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(
-    tmp_path: Path,
-) -> None:
+async def test_a_disk_that_hangs_costs_one_thread_however_often_it_is_asked(tmp_path: Path) -> None:
     released = threading.Event()
     looks: list[int] = []
 

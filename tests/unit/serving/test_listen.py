@@ -40,10 +40,3 @@ def test_what_is_judged_is_what_is_listened_on() -> None:
     with bound(address) as listening:
         assert listening.getsockname()[0] == address.ip
         assert listening.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-
-
-def test_a_port_in_use_is_told_with_what_to_do() -> None:
-    with bound(resolved("127.0.0.1", 0)) as listening:
-        port = listening.getsockname()[1]
-        with pytest.raises(CannotListenError, match="choose another port with MCP_PORT"):
-            bound(resolved("127.0.0.1", port))

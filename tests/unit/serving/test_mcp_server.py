@@ -1,4 +1,4 @@
-"""What a client reads besides tools: resources and the prompt, over the whole house."""
+"""What a client reads besides tools: resources, the prompt, and the view of MCP Apps."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import anyio
 import pytest
 from mcp import Client
+from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
 from mcp.shared.exceptions import MCPError
 from mcp.types import (
     INVALID_PARAMS,
@@ -29,7 +30,7 @@ from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings, load_settings
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import QuerySettings
-from ros2_memory.serving.mcp_server import EpisodicServer
+from ros2_memory.serving.mcp_server import TOOLS_WITH_VIEW, VIEW_URI, EpisodicServer, view
 from ros2_memory.tools.build import build_tools, readable_tools
 from tests.support.robot_run import CALLS, write_run
 
@@ -235,3 +236,47 @@ async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path
         assert "remember_moment" not in {each.name for each in (await client.list_tools()).tools}
         refused = await client.call_tool("remember_moment", {"label": "x"})
         assert "remember_moment is not offered here: it needs a recorder" in str(refused.content)
+
+
+MOST_BYTES = 300_000
+LOADS = re.compile(
+    r"\b(src|href)\s*=|@import|url\(|\bfetch\(|XMLHttpRequest|WebSocket|importScripts"
+)
+
+
+def seen_by_a_client(bag_dir: Path) -> dict[str, Any]:
+    async def asked() -> dict[str, Any]:
+        async with Client(server(bag_dir)) as client:
+            listed = (await client.list_tools()).tools
+            resources = (await client.list_resources()).resources
+            [content] = (await client.read_resource(VIEW_URI)).contents
+            return {
+                "extensions": client.server_capabilities.extensions,
+                "meta": {tool.name: tool.meta for tool in listed},
+                "resources": [resource.uri for resource in resources],
+                "content": content,
+            }
+
+    return anyio.run(asked)
+
+
+def test_six_tools_name_the_view_which_is_read_and_not_listed(tmp_path: Path) -> None:
+    seen = seen_by_a_client(tmp_path)
+    meta = {"ui": {"resourceUri": VIEW_URI}}
+    named = {name: own for name, own in seen["meta"].items() if own is not None}
+    assert named == dict.fromkeys(TOOLS_WITH_VIEW, meta)
+    assert len(TOOLS_WITH_VIEW) == 6
+    assert VIEW_URI not in seen["resources"]
+    assert EXTENSION_ID in seen["extensions"]
+    content = seen["content"]
+    assert (content.uri, content.mime_type) == (VIEW_URI, APP_MIME_TYPE)
+    assert content.meta == {"ui": {"prefersBorder": True}}
+    assert content.text == view().content
+
+
+def test_the_document_is_one_file_that_loads_nothing() -> None:
+    html = view().content
+    assert isinstance(html, str)
+    assert len(html.encode()) < MOST_BYTES
+    assert html.count("<script>") == html.count("</script>") == html.count("<style>") == 1
+    assert LOADS.findall(html) == []

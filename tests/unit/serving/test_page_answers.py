@@ -42,12 +42,7 @@ from ros2_memory.serving.page.routes import (
     warm_up,
     window_asked,
 )
-from ros2_memory.serving.page.span import (
-    MOST_POINTS,
-    driven_cells,
-    span_shown,
-    thinned,
-)
+from ros2_memory.serving.page.span import MOST_POINTS, driven_cells, span_shown, thinned
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
@@ -61,6 +56,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.reply import JsonObject
 
 S = NS_PER_S
 BEGIN = 1_784_000_000 * S
@@ -101,17 +97,17 @@ def memory(bag_dir: Path, request: pytest.FixtureRequest) -> Memory:
     return with_store(found, bag_dir) if request.param == "store" else found
 
 
-def shown(memory: Memory, query: str = "", **more: Any) -> dict[str, Any]:
+def received(reply: JsonObject) -> Any:
     """What the page receives, as JSON makes it."""
-    asked = span_request(QueryParams(query))
-    reply: dict[str, Any] = json.loads(to_json_text(span_shown(memory, Call(), asked, **more)))
-    return reply
+    return json.loads(to_json_text(reply))
 
 
-def moment(memory: Memory, query: str) -> dict[str, Any]:
-    reply = moment_asked(QueryParams(query), memory, Call())
-    found: dict[str, Any] = json.loads(to_json_text(reply))
-    return found
+def shown(memory: Memory, query: str = "", **more: Any) -> Any:
+    return received(span_shown(memory, Call(), span_request(QueryParams(query)), **more))
+
+
+def moment(memory: Memory, query: str) -> Any:
+    return received(moment_asked(QueryParams(query), memory, Call()))
 
 
 def test_a_first_look_has_all_that_the_page_draws(memory: Memory) -> None:
@@ -231,16 +227,8 @@ def test_what_is_wrong_with_a_signal_is_said_and_costs_no_other(
         (window_asked, "start=2&end=1", "give start"),
         (box_asked, "x0=0&y0=0&x1=1&y1=1", "give x0"),
         (box_asked, "x0=0&y0=0&x1=1&y1=1&pixel=-1", "give x0"),
-        (
-            moment_of,
-            "label=cup",
-            "give t, or start and end",
-        ),
-        (
-            moment_of,
-            f"t=1&label={'x' * 201}",
-            "longer than",
-        ),
+        (moment_of, "label=cup", "give t, or start and end"),
+        (moment_of, f"t=1&label={'x' * 201}", "longer than"),
     ],
 )
 def test_what_cannot_be_asked_is_refused_with_the_reason(read: Any, query: str, why: str) -> None:
@@ -348,6 +336,11 @@ def test_a_folder_of_several_recordings_is_listed_too(tmp_path: Path) -> None:
     assert len(recordings.alone("robin").index.snapshot().bags) == 2
 
 
+def paths_in(memory: Memory, start_s: int, stop_s: int) -> Any:
+    window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
+    return Recordings(memory).paths(memory, Call(), window)["paths"]
+
+
 def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     tmp_path: Path,
 ) -> None:
@@ -364,8 +357,7 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     memory = memory_of(tmp_path)
 
     def paths(start_s: int, stop_s: int) -> dict[str, tuple[float, float]]:
-        window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
-        found: Any = Recordings(memory).paths(memory, Call(), window)["paths"]
+        found = paths_in(memory, start_s, stop_s)
         return {each["name"]: (each["x"][0], each["x"][-1]) for each in found}
 
     assert paths(0, 30) == {"robin": (10, 20), "wren": (20, 40)}
@@ -385,9 +377,7 @@ def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_un
     memory = memory_of(tmp_path)
 
     def robots(start_s: int, stop_s: int) -> list[str]:
-        window = TimeWindow(BEGIN + start_s * S, BEGIN + stop_s * S)
-        found: Any = Recordings(memory).paths(memory, Call(), window)["paths"]
-        return [each["name"] for each in found]
+        return [each["name"] for each in paths_in(memory, start_s, stop_s)]
 
     assert robots(0, 600) == ["robin", "wren"]
     assert robots(0, 1000) == ["jay", "robin", "wren"]
@@ -463,10 +453,8 @@ def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: floa
     assert len(cells) <= 8_000
 
 
-def topics(memory: Memory, query: str) -> dict[str, Any]:
-    reply = topics_shown(memory, Call(), window_asked(QueryParams(query)))
-    found: dict[str, Any] = json.loads(to_json_text(reply))
-    return found
+def topics(memory: Memory, query: str) -> Any:
+    return received(topics_shown(memory, Call(), window_asked(QueryParams(query))))
 
 
 def test_topics_have_their_rate_when_they_spoke_and_their_numbers(memory: Memory) -> None:
@@ -506,7 +494,7 @@ def test_a_receiver_that_is_chosen_gives_a_map_in_metres_from_its_first_fix(tmp_
 def test_a_label_has_all_its_sightings_also_one_that_is_seen_throughout(memory: Memory) -> None:
     def labels(start_s: float, end_s: float) -> dict[str, Any]:
         window = TimeWindow.from_unix(BEGIN_S + start_s, BEGIN_S + end_s)
-        found: Any = json.loads(to_json_text(labels_shown(memory, Call(), window)))
+        found = received(labels_shown(memory, Call(), window))
         return {row["label"]: row for row in found["labels"]}
 
     found = labels(0, 200)

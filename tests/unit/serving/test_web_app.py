@@ -123,6 +123,40 @@ async def test_a_tool_is_called_over_mcp_in_one_request_without_a_session() -> N
     assert json.loads(block["text"])["value"] == 7
 
 
+HELLO: dict[str, Any] = {
+    "jsonrpc": "2.0",
+    "id": 1,
+    "method": "initialize",
+    "params": {
+        "protocolVersion": "2025-11-25",
+        "capabilities": {},
+        "clientInfo": {"name": "test", "version": "1"},
+    },
+}
+SESSION = "mcp-session-id"
+OLD = {SESSION: "of-before-a-restart"}
+
+
+async def test_a_conversation_is_named_where_it_begins_and_each_otherwise() -> None:
+    web = app()
+    async with running(web), client(web) as http:
+        begun = [await http.post("/mcp", json=HELLO, headers=MCP_HEADERS) for _ in range(3)]
+    names = {response.headers[SESSION] for response in begun}
+    assert len(names) == 3
+    assert all(name.isalnum() and len(name) >= 32 for name in names)
+
+
+@pytest.mark.parametrize(("body", "given"), [(HELLO, OLD), ("ask", {}), ("ask", OLD)])
+async def test_a_client_that_has_a_name_is_given_no_other_and_a_call_needs_none(
+    body: Any, given: dict[str, str]
+) -> None:
+    web = app()
+    async with running(web), client(web) as http:
+        asked = call_tool(body) if body == "ask" else body
+        response = await http.post("/mcp", json=asked, headers=MCP_HEADERS | given)
+    assert (response.status_code, SESSION in response.headers) == (200, False)
+
+
 FOREIGN = [
     *("evil.example", "localhost.evil.example:9203", "127.0.0.1.nip.io", "localhost:80.evil.com"),
     *("[::1].evil.com", "[::1].evil.com:9203", "[::1]evil.com", "[::1]:80.evil.com", "[localhost]"),

@@ -52,11 +52,7 @@ CALLS: Final[dict[str, tuple[str, dict[str, object], list[str]]]] = {
         {"topic": "/speech", "timestamps": [T0_S + 1, T0_S + 9], "tolerance_s": 2},
         ["results.value.value"],
     ),
-    "samples": (
-        "get_topic_in_range",
-        {"topic": "/rosout", **AROUND},
-        ["samples.value.msg"],
-    ),
+    "samples": ("get_topic_in_range", {"topic": "/rosout", **AROUND}, ["samples.value.msg"]),
     "a table": (
         "get_topic_in_range",
         {"topic": "/rosout", **AROUND, "fields": ["msg"]},
@@ -68,11 +64,7 @@ CALLS: Final[dict[str, tuple[str, dict[str, object], list[str]]]] = {
         ["rows.detections.label"],
     ),
     "last match": ("find_last_match", {"topic": "/speech", **CONTAINS}, ["value.value"]),
-    "last match of a log": (
-        "find_last_match",
-        {"topic": "/rosout", **CONTAINS},
-        ["value.msg"],
-    ),
+    "last match of a log": ("find_last_match", {"topic": "/rosout", **CONTAINS}, ["value.msg"]),
     "value when": (
         "get_value_when",
         {"value_topic": "/speech", "condition_topic": "/diagnostics", **CONTAINS},

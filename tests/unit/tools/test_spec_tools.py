@@ -17,11 +17,7 @@ from ros2_memory.history.view import AtTime
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import _listed
 from ros2_memory.tools import extra_tools, spec_tools
-from ros2_memory.tools.arguments import (
-    At,
-    LastMatchArguments,
-    MotionArguments,
-)
+from ros2_memory.tools.arguments import At, LastMatchArguments, MotionArguments
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature, Tool, ToolDeclaration
 from ros2_memory.tools.instructions import instructions
@@ -106,24 +102,6 @@ def test_the_listing_stays_within_its_size(additions: bool, most: int) -> None:
     tools = build_tools(QuerySettings(), additions=additions, writing=True)
     listing = ListToolsResult(tools=[_listed(tool) for tool in tools])
     assert len(listing.model_dump_json(by_alias=True, exclude_none=True).encode()) <= most
-
-
-@pytest.mark.parametrize("tool", TOOLS.values(), ids=NAMES)
-def test_arguments_of_a_form_of_their_own_show_it(tool: Tool) -> None:
-    """`where` does so where it is in full, and elsewhere names that tool. Each says what it is."""
-    if tool.description.removeprefix("Blocking. ").startswith("As "):
-        return  # what the tool that it refers to says
-    assert all(each.get("description") for each in tool.arguments.values())
-    shown = {
-        "start": "2026-11-20T14:05",
-        "tolerance_s": "e.g. 2",
-        "while": '{"topic": "/is_docked", "condition_type"',
-        "where": "{x: [0, 5], y: [0, 9]}"
-        if tool.name == "trajectory_summary"
-        else "forms: trajectory_summary",
-    }
-    for name in shown.keys() & tool.arguments.keys():
-        assert shown[name] in str(tool.arguments[name]["description"])
 
 
 def test_recap_takes_exactly_one_form_of_a_window(tmp_path: Path) -> None:

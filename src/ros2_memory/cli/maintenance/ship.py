@@ -122,8 +122,8 @@ def _forget(
         InvalidArgumentsError: neither the lake nor the settings know the robot; nothing is done.
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
-    from ros2_memory.lake.files import Partitions  # noqa: PLC0415 - as in `ship`
     from ros2_memory.lake.upkeep import Tombstone, append_tombstone, forget_in_lake  # noqa: PLC0415
+    from ros2_memory.lake.warehouse import Partitions  # noqa: PLC0415 - as in `ship`
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:

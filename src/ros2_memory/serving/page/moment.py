@@ -4,15 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.core.reply import (
-    POSE_KEYS,
-    TENTHS_OF_S,
-    JsonObject,
-    Scope,
-    keys,
-    render,
-    rounded,
-)
+from ros2_memory.core.reply import POSE_KEYS, TENTHS_OF_S, JsonObject, Scope, keys, render, rounded
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.insights.changes_before import before
 from ros2_memory.insights.recap import found_events, recap

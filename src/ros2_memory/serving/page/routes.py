@@ -206,10 +206,10 @@ def window_asked(given: QueryParams) -> TimeWindow:
     Raises:
         InvalidArgumentsError: a number is missing or invalid, or the span has no length.
     """
-    start_s, end_s = _number(given, "start"), _number(given, "end")
-    if start_s is None or end_s is None or start_s >= end_s:
-        raise InvalidArgumentsError("give start, and end after it, in Unix seconds")
-    return TimeWindow.from_unix(start_s, end_s)
+    match _numbers(given, "start", "end"):
+        case [start_s, end_s] if start_s < end_s:
+            return TimeWindow.from_unix(start_s, end_s)
+    raise InvalidArgumentsError("give start, and end after it, in Unix seconds")
 
 
 def box_asked(given: QueryParams) -> Box:
@@ -218,12 +218,10 @@ def box_asked(given: QueryParams) -> Box:
     Raises:
         InvalidArgumentsError: a number is missing or invalid, or a pixel has no size.
     """
-    x0, y0, x1, y1, pixel_m = (
-        _number(given, name, " of metres") for name in ("x0", "y0", "x1", "y1", "pixel")
-    )
-    if x0 is None or y0 is None or x1 is None or y1 is None or pixel_m is None or pixel_m <= 0:
-        raise InvalidArgumentsError("give x0, y0, x1, y1 and pixel (above 0), in metres")
-    return Box(x0, y0, x1, y1, max(pixel_m, _LEAST_PIXEL_M))
+    match _numbers(given, "x0", "y0", "x1", "y1", "pixel", unit=" of metres"):
+        case [x0, y0, x1, y1, pixel_m] if pixel_m > 0:
+            return Box(x0, y0, x1, y1, max(pixel_m, _LEAST_PIXEL_M))
+    raise InvalidArgumentsError("give x0, y0, x1, y1 and pixel (above 0), in metres")
 
 
 def tool_arguments(given: QueryParams) -> JsonObject:
@@ -247,6 +245,12 @@ def _short(given: QueryParams, name: str, longest: int) -> str:
     if len(text) > longest:
         raise InvalidArgumentsError(f"{name} is longer than {longest} characters")
     return text
+
+
+def _numbers(given: QueryParams, *names: str, unit: str = " of seconds") -> list[float]:
+    """Returns those of some numbers that are given."""
+    numbers = [_number(given, name, unit) for name in names]
+    return [number for number in numbers if number is not None]
 
 
 def _number(given: QueryParams, name: str, unit: str = " of seconds") -> float | None:

@@ -62,7 +62,7 @@ from ros2_memory.serving.page.topics import Signal, signal_in
 from ros2_memory.things.find import find_things
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import NDArray
 
@@ -262,34 +262,25 @@ def _range_shown(memory: Memory, call: Call, snapshot: Snapshot) -> JsonObject:
 def _united_parts(
     parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
 ) -> Shown:
-    """Returns all parts as one, with how long (ms) those of the whole span took."""
+    """Returns all parts as one, or why one is not known; and how long those of the span took."""
     shown: JsonObject = {}
     notes: list[str] = []
-    whole_s = 0.0
-    for name, part, took_s in _in_time(parts, call, request):
-        shown |= part.keys
-        notes += part.notes
-        whole_s += took_s if name in _OF_WHOLE else 0.0
-    if request.things:
-        shown["whole_ms"] = round(whole_s * 1000)
-    return Shown(shown, tuple(dict.fromkeys(notes)))
-
-
-def _in_time(
-    parts: Mapping[str, Callable[[Call], Shown]], call: Call, request: SpanRequest
-) -> Iterator[tuple[str, Shown, float]]:
-    """Yields each part by name, or why it is not known yet, and the processor time (s) it took."""
-    budget_s = _PART_S if request.patient else _QUICK_S
+    budget_s, whole_s = _PART_S if request.patient else _QUICK_S, 0.0
     whole = call.deadline.within(budget_s)
     for name, part in parts.items():
         begun = time.thread_time()
         if request.first:
             budget_s = max(whole.left_s(), 0.0) / 2
         try:
-            shown = part(replace(call, deadline=call.deadline.within(budget_s)))
+            known = part(replace(call, deadline=call.deadline.within(budget_s)))
         except QueryTimeoutError as error:
-            shown = Shown({}, (f"the {name} are not known yet: {error}",))
-        yield name, shown, time.thread_time() - begun
+            known = Shown({}, (f"the {name} are not known yet: {error}",))
+        shown |= known.keys
+        notes += known.notes
+        whole_s += time.thread_time() - begun if name in _OF_WHOLE else 0.0
+    if request.things:
+        shown["whole_ms"] = round(whole_s * 1000)
+    return Shown(shown, tuple(dict.fromkeys(notes)))
 
 
 def _fresh(snapshot: Snapshot, window: TimeWindow, since_s: float | None) -> TimeWindow:

@@ -35,7 +35,7 @@ from ros2_memory.insights.fields import fields_of
 from ros2_memory.insights.recap import found_events
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -68,11 +68,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     ]
     rows.sort(key=lambda row: (-float(str(row["seconds"])), str(row["label"])))
     shown: list[JsonValue] = [*rows[:MOST_LABELS]]
-    return {
-        "end": unix_from_ns(window.stop),
-        "labels": shown,
-        "labels_total": len(rows),
-    }
+    return {"end": unix_from_ns(window.stop), "labels": shown, "labels_total": len(rows)}
 
 
 def _label(
@@ -285,10 +281,13 @@ def _numbers(view: View, topic: str) -> list[str]:
 
 def _places_robot(view: View) -> list[JsonValue]:
     """Returns the topics that can place the robot; those that are its own come first."""
-    posed = [described.partition(" ")[0] for described in topics_with(view, "position")]
-    posed = posed or [described.partition(" ")[0] for described in topics_that_show_poses(view)]
+
+    def names(described: Iterable[str]) -> list[str]:
+        return [topic.partition(" ")[0] for topic in described]
+
     of_robot = {*topics_of_robot(view, "position")}
+    posed = names(topics_with(view, "position") or topics_that_show_poses(view))
     posed.sort(key=lambda topic: (topic not in of_robot, topic))
-    fixes = [described.partition(" ")[0] for described in topics_with(view, "geodetic")]
+    fixes = names(topics_with(view, "geodetic"))
     kinds = {**dict.fromkeys(fixes, "fixes"), **dict.fromkeys(posed, "poses")}
     return [{"topic": topic, "kind": kinds[topic]} for topic in dict.fromkeys([*posed, *fixes])]
