@@ -103,7 +103,7 @@ def examined(exits: Program) -> Examined:
 
     def run(code: int, *overrides: str) -> dict[str, list[dict[str, str]]]:
         wrong: dict[str, list[dict[str, str]]] = {}
-        for each in exits(code, "doctor", "--json", *overrides).json["findings"]:
+        for each in exits(code, "doctor --json", *overrides).json["findings"]:
             if each["level"] != "ok":
                 assert each["do"], each
                 wrong.setdefault(each["about"], []).append(each)
@@ -389,11 +389,11 @@ class TestTheServer:
         self, robot: Path, exits: Program, port: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("MEMORY_API_TOKEN", "a" * 32)
-        shown = exits(0, "doctor", "server.transport=stdio").out
+        shown = exits(0, "doctor server.transport=stdio").out
         assert "each client starts its own server" in shown
         assert f"answers on 127.0.0.1 port {port}: ok" in shown
         Answering.asks_for, Answering.reply = "nothing", b"{}"
-        assert "answers on" not in exits(0, "doctor", "server.transport=stdio").out
+        assert "answers on" not in exits(0, "doctor server.transport=stdio").out
 
     def test_another_program_is_recognised(self, robot: Path, examined: Examined) -> None:
         Answering.reply = b"<html>a printer</html>"

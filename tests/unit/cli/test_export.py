@@ -255,7 +255,7 @@ class TestMcap:
         source.write_bytes(b"no MCAP file")
         at = T0 / NS_PER_S + 10
         os.utime(source, (at, at))
-        assert "rec_0_0.mcap" in exits(1, "export", "--mcap", tmp_path / "out.mcap").err
+        assert "rec_0_0.mcap" in exits(1, f"export --mcap {tmp_path}/out.mcap").err
 
 
 class TestParquet:
@@ -264,8 +264,8 @@ class TestParquet:
     ) -> None:
         start, end = T0 / NS_PER_S, T0 / NS_PER_S + 60
         asked = json.dumps({"start": start, "end": end})
-        told = exits(0, "ask", "trajectory_summary", asked, "--json").json["distance_m"]
-        exits(0, "export", "--parquet", tmp_path / "rows")
+        told = exits(0, "ask trajectory_summary", asked, "--json").json["distance_m"]
+        exits(0, f"export --parquet {tmp_path}/rows")
         ((length,),) = queried(
             tmp_path / "rows",
             """
@@ -285,7 +285,7 @@ class TestParquet:
     ) -> None:
         poses = [odom(T0 + n, 0.0, 0.0, log_time=T0 + n * NS_PER_S) for n in range(3)]
         write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*poses, text(T0 + 9, "no header")])
-        exits(0, "export", "--parquet", tmp_path / "rows", tmp_path / "bags")
+        exits(0, f"export --parquet {tmp_path}/rows {tmp_path}/bags")
         found = queried(
             tmp_path / "rows", "SELECT topic, epoch_ns(header_stamp) FROM memory ORDER BY log_time"
         )
@@ -322,7 +322,7 @@ class TestParquet:
     ) -> None:
         monkeypatch.delitem(sys.modules, "ros2_memory.cli.parquet", raising=False)
         monkeypatch.setitem(sys.modules, "pyarrow", None)
-        assert "pip install '.[parquet]'" in exits(2, "export", "--parquet", tmp_path / "rows").err
+        assert "pip install '.[parquet]'" in exits(2, f"export --parquet {tmp_path}/rows").err
 
 
 def queried(folder: Path, query: str) -> list[tuple[object, ...]]:

@@ -59,7 +59,7 @@ def forget(exits: Program) -> Forget:
 
     def run(code: int, first: float, last: float, *more: str) -> Printed:
         start, end = T0 / NS_PER_S + first, T0 / NS_PER_S + last
-        return exits(code, "forget", "--start", start, "--end", end, *more)
+        return exits(code, "forget --start", start, "--end", end, *more)
 
     return run
 
@@ -110,7 +110,7 @@ def test_latched_messages_that_later_answers_need_are_carried_on(
     )
     assert record.log_time == T0
     asked = json.dumps({"parent": "base_link", "child": "laser", "timestamp": T0 / NS_PER_S + 25})
-    exits(0, "ask", "get_transform_at", asked, "--json")
+    exits(0, "ask get_transform_at", asked, "--json")
 
 
 def test_beside_a_recorder_bags_with_latched_messages_are_kept(
@@ -189,8 +189,8 @@ def test_bags_that_others_record_are_refused(
 
 
 def test_without_a_window_nothing_is_forgotten(bag_dir: Path, exits: Program) -> None:
-    exits(2, "forget", "--yes")
-    assert "--last" in exits(2, "forget", "--yes", "--start", "0").err
+    exits(2, "forget --yes")
+    assert "--last" in exits(2, "forget --yes --start 0").err
     assert len(bags(bag_dir)) == 4
 
 
@@ -230,7 +230,7 @@ class TestForeignBags:
         shown = forget(1, 190, 300, "--yes").out
         assert path.exists()
         assert f"`ros2-memory adopt {name}` first" in shown
-        exits(0, "adopt", name)
+        exits(0, f"adopt {name}")
         forget(0, 190, 300, "--yes")
         assert not path.exists()
 
@@ -271,7 +271,7 @@ class TestForeignBags:
         assert f"stays: {name}: this recorder did not make it; `ros2-memory adopt`" in shown
         assert f"`ros2-memory adopt {folder}` first" in forget(1, 65, 65, "--yes").out
         assert path.read_bytes() == before
-        exits(0, "adopt", folder)
+        exits(0, f"adopt {folder}")
         forget(0, 64, 66, "--yes", "--topic", "/odom")
         assert McapReader().summarize(path).count == 0
 
@@ -321,7 +321,7 @@ class TestUnreadable:
         shown = forget(1, 199, 10**5, "--yes").out
         assert f"stays: {name}/{path.name}: a crash left it open" in shown
         assert "ros2-memory recover closes it" in shown
-        exits(0, "recover", path)
+        exits(0, f"recover {path}")
         left(path)
         forget(0, 199, 10**5, "--yes")
         assert not path.exists()

@@ -63,18 +63,18 @@ def test_cat_refuses_to_print_less_than_one_message(
     folder: Path, exits: Program, option: str
 ) -> None:
     """It once said of a topic with messages that there were none."""
-    refused = exits(2, "cat", "/odom", folder, option).err
+    refused = exits(2, f"cat /odom {folder}", option).err
     assert "--limit and --tail must be more than 0" in refused
 
 
 def test_cat_takes_no_pattern_and_names_what_it_matches(folder: Path, exits: Program) -> None:
-    assert "/od* is a pattern; matching: /odom" in exits(2, "cat", "/od*", folder).err
+    assert "/od* is a pattern; matching: /odom" in exits(2, f"cat /od* {folder}").err
 
 
 def test_where_another_program_made_all_recordings_it_is_said_once(
     folder: Path, exits: Program
 ) -> None:
-    assert exits(0, "recordings", folder).out.count("another recorder") == 1
+    assert exits(0, f"recordings {folder}").out.count("another recorder") == 1
 
 
 class TestPaths:
@@ -84,11 +84,11 @@ class TestPaths:
     ) -> None:
         counts = {".": (5, 19), "a": (2, 10), "a/a_0.mcap": (1, 5), "loose/red.mcap": (1, 2)}
         bags, poses = counts[path]
-        shown = exits(0, "info", folder / path, "--json").json
+        shown = exits(0, f"info {folder}/{path} --json").json
         assert shown["data_time_range"]["bags"] == bags
         assert shown["memory_status"]["recorder"] is None
         counted = {
-            row["topic"]: row["count"] for row in exits(0, "topics", folder / path, "--json").json
+            row["topic"]: row["count"] for row in exits(0, f"topics {folder}/{path} --json").json
         }
         # The two loose files hold the same messages, and lie in one folder.
         assert counted["/odom"] == poses
@@ -117,7 +117,7 @@ class TestPaths:
     def test_of_an_empty_folder_one_line_says_so(self, tmp_path: Path, exits: Program) -> None:
         (tmp_path / "empty").mkdir()
         for command in ("info", "topics", "recordings"):
-            shown = exits(1, command, tmp_path / "empty").out
+            shown = exits(1, f"{command} {tmp_path}/empty").out
             assert len(shown.splitlines()) == 1
             assert str(tmp_path / "empty") in shown
 
@@ -126,7 +126,7 @@ class TestPaths:
     ) -> None:
         (tmp_path / "empty").mkdir()
         for topic, path, command in (("/odom", "empty", "info"), ("/nothing", "a", "topics")):
-            shown = exits(2, "cat", topic, folder / path).err
+            shown = exits(2, f"cat {topic} {folder}/{path}").err
             assert f"; `ros2-memory {command}` lists" in shown
             assert "data_time_range" not in shown
             assert "list_recorded_topics" not in shown
@@ -137,10 +137,10 @@ class TestPaths:
         bag = folder / "a" / "a_0.mcap"
         bag.write_bytes(bag.read_bytes()[:-20])
         os.utime(bag, (1.7e9, 1.7e9))
-        shown = exits(0, "topics", folder).out
+        shown = exits(0, f"topics {folder}").out
         assert shown.count("readable part is used") == 1
         assert "2 topics: 1 unfinished bag" in shown
-        assert [len(row["notes"]) for row in exits(0, "topics", folder, "--json").json] == [1, 1]
+        assert [len(row["notes"]) for row in exits(0, f"topics {folder} --json").json] == [1, 1]
 
     def test_errors_have_no_control_characters(self, folder: Path, exits: Program) -> None:
         assert "\x1b" not in exits(2, "cat", "/\x1b[31m", folder).err
@@ -149,29 +149,22 @@ class TestPaths:
         self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         findings = {
-            each["about"]: each
-            for each in exits(0, "doctor", folder / "a", "--json").json["findings"]
+            each["about"]: each for each in exits(0, f"doctor {folder}/a --json").json["findings"]
         }
         assert "recorder=none" in findings["recorder"]["seen"]
         assert "ros" not in findings
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        assert (
-            exits(0, "ask", "get_position_seconds_ago", "seconds_ago=0", "--json").json["age_s"]
-            == 0
-        )
+        assert exits(0, "ask get_position_seconds_ago seconds_ago=0 --json").json["age_s"] == 0
 
     def test_a_deployment_that_records_there_is_looked_at_as_it_is(
         self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         own_all(folder)
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
-        assert exits(0, "info", "--json").json["memory_status"]["budget"]["max_gb"] == 5.0
+        assert exits(0, "info --json").json["memory_status"]["budget"]["max_gb"] == 5.0
         monkeypatch.setenv("MEMORY_DEPLOYMENT", "robot")
-        assert exits(0, "info", folder, "--json").json["memory_status"]["budget"]["max_gb"] == 5.0
-        assert (
-            exits(0, "info", folder / "a", "--json").json["memory_status"]["budget"]["max_gb"]
-            is None
-        )
+        assert exits(0, f"info {folder} --json").json["memory_status"]["budget"]["max_gb"] == 5.0
+        assert exits(0, f"info {folder}/a --json").json["memory_status"]["budget"]["max_gb"] is None
 
     def test_topics_without_messages_are_named_and_the_first_of_many_faults_of_clocks(
         self, tmp_path: Path, exits: Program
@@ -181,12 +174,12 @@ class TestPaths:
         for nth in range(12):
             boot = [odom(nth * 100 * NS_PER_S, 0.0, 0.0)]  # before the clock was set
             write_mcap(tmp_path / f"r{nth}" / f"r{nth}_0.mcap", boot)
-        words = " ".join(exits(0, "info", tmp_path).out.split())
+        words = " ".join(exits(0, f"info {tmp_path}").out.split())
         assert "topics_without_messages /idle, /lost" in words
         assert "silent_topics" not in words
         assert words.count("the clock was not set") == 10
         assert "2 more clock_faults: --json lists them" in words
-        reply = exits(0, "info", tmp_path, "--json").json
+        reply = exits(0, f"info {tmp_path} --json").json
         assert reply["held"]["topics_without_messages"] == ["/idle", "/lost"]
         assert len(reply["data_time_range"]["clock_faults"]) == 12
 
@@ -195,7 +188,7 @@ class TestRecordings:
     def test_folders_are_recordings_and_so_are_files_that_lie_loose(
         self, folder: Path, exits: Program
     ) -> None:
-        rows = {row["recording"]: row for row in exits(0, "recordings", folder, "--json").json}
+        rows = {row["recording"]: row for row in exits(0, f"recordings {folder} --json").json}
         assert {name: row["bags"] for name, row in rows.items()} == {
             "a": 2,
             "b": 1,
@@ -212,10 +205,10 @@ class TestRecordings:
         write_mcap(folder / "c" / "c_0.mcap", seconds(300, 2))
         (folder / "c" / "c_1.mcap").write_bytes(b"no bag at all")
         os.utime(folder / "c" / "c_1.mcap", (1_700_000_000,) * 2)
-        rows = {row["recording"]: row for row in exits(0, "recordings", folder, "--json").json}
+        rows = {row["recording"]: row for row in exits(0, f"recordings {folder} --json").json}
         assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another recorder")
         assert rows["c"]["not_read"] == 1
-        assert "1 damaged bag file; see below" in " ".join(exits(0, "info", folder).out.split())
+        assert "1 damaged bag file; see below" in " ".join(exits(0, f"info {folder}").out.split())
 
     def test_one_without_a_message_is_named_too(self, folder: Path, exits: Program) -> None:
         write_mcap(folder / "caught_nothing" / "caught_nothing_0.mcap", [])
@@ -223,33 +216,32 @@ class TestRecordings:
         write_mcap(folder / "lies_loose.mcap", [])
         silent = [
             row["recording"]
-            for row in exits(0, "recordings", folder, "--json").json
+            for row in exits(0, f"recordings {folder} --json").json
             if row["messages"] == 0
         ]
         assert silent == ["caught_nothing", "lies_loose.mcap"]
-        assert "no message was recorded" in exits(0, "recordings", folder).out
-        assert exits(0, "info", folder, "--json").json["held"]["empty_bags"] == 3
-        assert len(exits(1, "recordings", folder / "caught_nothing").out.splitlines()) == 1
+        assert "no message was recorded" in exits(0, f"recordings {folder}").out
+        assert exits(0, f"info {folder} --json").json["held"]["empty_bags"] == 3
+        assert len(exits(1, f"recordings {folder}/caught_nothing").out.splitlines()) == 1
 
     @pytest.mark.parametrize(("name", "count"), [("a", 10), ("b", 4), ("loose/blue", 3)])
     def test_each_can_be_looked_at_alone(
         self, folder: Path, exits: Program, name: str, count: int
     ) -> None:
         assert (
-            len(exits(0, "cat", "/odom", folder, "--recording", name, "--json").out.splitlines())
-            == count
+            len(exits(0, f"cat /odom {folder} --recording {name} --json").out.splitlines()) == count
         )
         assert [
             row["recording"]
-            for row in exits(0, "recordings", folder, "--recording", name, "--json").json
+            for row in exits(0, f"recordings {folder} --recording {name} --json").json
         ] == [name]
 
     def test_a_name_that_there_is_not_is_refused_with_one_like_it(
         self, folder: Path, exits: Program
     ) -> None:
         write_mcap(folder / "kitchen_run" / "kitchen_run_0.mcap", seconds(400, 1))
-        assert "similar: kitchen_run" in exits(2, "info", folder, "--recording", "kitchen_rum").err
-        assert "data.recording" in exits(2, "info", folder, "--recording", "../a").err
+        assert "similar: kitchen_run" in exits(2, f"info {folder} --recording kitchen_rum").err
+        assert "data.recording" in exits(2, f"info {folder} --recording ../a").err
 
     def test_what_is_forgotten_is_forgotten_of_one_recording_too(
         self, folder: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
@@ -260,7 +252,7 @@ class TestRecordings:
         monkeypatch.setenv("XDG_CACHE_HOME", str(folder / ".cache"))
         monkeypatch.setenv("MEMORY_BAG_DIR", str(folder))
         monkeypatch.setenv("MEMORY_CONFIG_OVERRIDES", "data.now=latest")
-        assert exits(0, "index", "data.recording=a", "--json").json == {
+        assert exits(0, "index data.recording=a --json").json == {
             "bags": 2,
             "stored": 2,
             "refused": 0,
@@ -288,7 +280,7 @@ def test_of_a_folder_without_a_recording_nobody_is_said_to_have_made_all(
     tmp_path: Path, exits: Program
 ) -> None:
     (tmp_path / "letter.mcap").write_bytes(b"a letter")
-    assert "whose" not in exits(0, "recordings", tmp_path).out
+    assert "whose" not in exits(0, f"recordings {tmp_path}").out
 
 
 class TestCat:
@@ -298,7 +290,7 @@ class TestCat:
     ) -> None:
         write_mcap(tmp_path / "rec_0.mcap", [text(T0, "\x1b[2J\x9b31m", "/speech")])
         monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
-        shown = exits(0, "cat", "/speech", option, tmp_path).out
+        shown = exits(0, "cat /speech", option, tmp_path).out
         assert not {"\x1b", "\x9b"} & {*shown}
 
     def test_letters_that_the_encoding_has_not_are_spelled_out(
@@ -315,14 +307,14 @@ class TestCat:
         write_mcap(tmp_path / "r" / "r_0.mcap", messages)
         first, second = (
             json.loads(line, parse_constant=pytest.fail)
-            for line in exits(0, "cat", "/odom", tmp_path, "--json").out.splitlines()
+            for line in exits(0, f"cat /odom {tmp_path} --json").out.splitlines()
         )
         assert (first["time_ns"], second["time_ns"]) == (T0 + 1, T0 + 2)
         assert first["value"]["position"] == {"x": None, "y": 0.123456789, "z": 0.0}
 
     def test_csv_has_a_column_for_each_field(self, folder: Path, exits: Program) -> None:
         words = ("--csv", "--field", "position.y", "--field", "header.frame_id")
-        rows = [*csv.reader(exits(0, "cat", "/odom", folder / "b", *words).out.splitlines())]
+        rows = [*csv.reader(exits(0, f"cat /odom {folder}/b", *words).out.splitlines())]
         assert rows[0] == ["time", "position.y", "header.frame_id"]
         assert rows[1:] == [[f"1700000{100 + n}.000000000", f"{n}.0", "odom"] for n in range(4)]
 
@@ -331,15 +323,13 @@ class TestCat:
         write_mcap(tmp_path / "rec" / "rec_0.mcap", lines)
         assert [
             line.split("level: ")[1].split(";")[0]
-            for line in exits(0, "cat", "/rosout", tmp_path).out.splitlines()
+            for line in exits(0, f"cat /rosout {tmp_path}").out.splitlines()
         ] == [
             "WARN (30)",
             "35",
         ]
         assert (
-            exits(0, "cat", "/rosout", tmp_path, "--field", "level", "--limit", "1").out.split(
-                "level: "
-            )[1]
+            exits(0, f"cat /rosout {tmp_path} --field level --limit 1").out.split("level: ")[1]
             == "WARN (30)\n"
         )
 
@@ -358,7 +348,7 @@ class TestCat:
     ) -> None:
         times = [
             json.loads(line)["time_ns"]
-            for line in exits(0, "cat", "/odom", folder / "a", "--json", *words).out.splitlines()
+            for line in exits(0, f"cat /odom {folder}/a --json", *words).out.splitlines()
         ]
         assert times == [T0 + n * NS_PER_S for n in expected]
 
@@ -423,7 +413,7 @@ def test_a_path_may_come_first(folder: Path, exits: Program, tmp_path: Path) -> 
 
 
 def test_a_recap_without_a_time_is_of_the_newest_day(folder: Path, exits: Program) -> None:
-    reply = exits(0, "ask", "recap", folder / "b", "--json").json
+    reply = exits(0, f"ask recap {folder}/b --json").json
     assert reply["start"] <= T0 / NS_PER_S + 100 < reply["end"]
     assert reply["end"] - reply["start"] >= 23 * 3600
 

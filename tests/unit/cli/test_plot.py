@@ -69,7 +69,7 @@ def test_where_the_poses_are_on_several_other_topics_it_names_the_option(
     write_mcap(tmp_path / "bag.mcap", other)
     assert (
         "set data.pose_topic to one of them, or give --topic"
-        in exits(2, "plot", "path", tmp_path, "--out", tmp_path / "x.svg").err
+        in exits(2, f"plot path {tmp_path} --out {tmp_path}/x.svg").err
     )
 
 
@@ -151,7 +151,9 @@ def test_each_is_a_picture_of_the_asked_kind(
 ) -> None:
     kind, *topic = words
     drawn = tmp_path / f"{kind}.svg"
-    assert exits(0, "plot", kind, *topic, bags, "--out", drawn, "--json").json["path"] == str(drawn)
+    assert exits(0, f"plot {kind}", *topic, bags, "--out", drawn, "--json").json["path"] == str(
+        drawn
+    )
     assert ET.parse(drawn).getroot().tag.endswith("svg")  # noqa: S314 - written just now
 
 
@@ -238,7 +240,7 @@ def test_a_picture_that_cannot_be_written_leaves_the_one_before(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Figure, "savefig", fill_the_disk)
-    refused = exits(2, "plot", "path", "--out", out, bags)
+    refused = exits(2, f"plot path --out {out} {bags}")
     assert refused.err == f"ros2-memory plot path: {out}: No space left on device\n"
     assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"before"]
 
@@ -247,9 +249,7 @@ def test_without_the_extra_it_names_the_command_that_installs_it(
     bags: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("ros2_memory.cli.plot.find_spec", lambda name: None)
-    assert (
-        "pip install '.[plot]'" in exits(2, "plot", "path", bags, "--out", tmp_path / "a.svg").err
-    )
+    assert "pip install '.[plot]'" in exits(2, f"plot path {bags} --out {tmp_path}/a.svg").err
 
 
 def test_a_field_that_is_not_known_at_first_is_drawn(tmp_path: Path) -> None:

@@ -12,9 +12,8 @@ import pytest
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.timebase import NS_PER_S, Deadline, WallClock
-from ros2_memory.demo.judges import CallContext
-from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.questions import QUESTIONS, judge_reply
+from ros2_memory.demo.messages import MessageSchedule
+from ros2_memory.demo.questions import QUESTIONS, CallContext, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.history.context import Call
 from ros2_memory.tools.build import build_tools

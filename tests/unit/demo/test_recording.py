@@ -12,8 +12,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.demo.messages import definition
-from ros2_memory.demo.published_topics import STREAMS, MessageSchedule, Stream
+from ros2_memory.demo.messages import STREAMS, MessageSchedule, Stream, definition
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
 

@@ -42,7 +42,7 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
         port = theirs.server_port
         with (
             pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"),
-            running_server(tmp_path, port, print, split_duration_s=5.0),
+            running_server(tmp_path, port, print),
         ):
             pass
 
@@ -56,7 +56,7 @@ def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
         "ROS_VISION_INTERFACES_PATH": "elsewhere",
         "XDG_CACHE_HOME": "/home/someone/.cache",
     }
-    environment = server_environment(caller, tmp_path, 9203, 5.0, "/elsewhere")
+    environment = server_environment(caller, tmp_path, 9203, "/elsewhere")
     overrides = environment.pop("MEMORY_CONFIG_OVERRIDES").split()
     assert environment == {
         "PATH": "/bin",
