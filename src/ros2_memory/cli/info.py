@@ -63,9 +63,9 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         print_json(rows)
     elif rows:
         without = [{key: row[key] for key in row if key != "notes"} for row in rows]
-        print_reply(stdout_console(), [*without])
+        print_reply([*without])
         if notes := _notes_of(topic_rows):
-            print_reply(stdout_console(), {"notes": notes})
+            print_reply({"notes": notes})
     else:
         _print_nothing(memory)
     return not rows
@@ -178,11 +178,7 @@ def _show(memory: Memory, report: JsonObject) -> None:
         _print_nothing(memory)
         return
     status, ranged, recorded, *lists = report.values()
-    report_shown = {
-        **_object(recorded),
-        **_for_people(_object(status)),
-        **_for_people(_object(ranged)),
-    }
+    report_shown = {**_object(recorded), **_for_people(status), **_for_people(ranged)}
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
     if budget.most is not None:  # bags that are only looked at have none
         report_shown["budget"] = describe_budget(budget)
@@ -190,13 +186,13 @@ def _show(memory: Memory, report: JsonObject) -> None:
     silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
         report_shown["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    report_shown |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
+    report_shown |= {name: report[name] for name in [*report][-len(lists) :] if report[name]}
     for name, rows in report_shown.items():
         if isinstance(rows, list) and len(rows) > _MOST_ROWS:
             report_shown[name] = rows[:_MOST_ROWS]
             left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
     notes: JsonObject = {"notes": [*left_out]} if left_out else {}
-    print_reply(stdout_console(), report_shown | notes)
+    print_reply(report_shown | notes)
 
 
 def _object(value: JsonValue) -> JsonObject:
@@ -228,8 +224,9 @@ def storage_of(bags: Sequence[BagFile]) -> str:
     return ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags}))
 
 
-def _for_people(reply: JsonObject) -> JsonObject:
+def _for_people(value: JsonValue) -> JsonObject:
     """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
+    reply = _object(value)
     has_recorder = reply.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
@@ -315,7 +312,6 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
             "empty": [*empty],
         }
         print_reply(
-            stdout_console(),
             {title: rows for title, rows in lists.items() if rows},
         )
     return not rows

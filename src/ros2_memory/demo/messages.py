@@ -13,6 +13,7 @@ import math
 from dataclasses import dataclass
 from functools import cache
 from heapq import merge
+from itertools import count
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 import numpy as np
@@ -96,11 +97,10 @@ class MessageSchedule:
 
     def messages(self, stream: Stream) -> Iterator[Message]:
         """Yields the stream's messages from the start on, without end; one if it is latched."""
-        k = self._first(stream)
-        yield self.message(stream, k)
-        while not stream.latched:
-            k += 1
+        for k in count(self._first(stream)):
             yield self.message(stream, k)
+            if stream.latched:
+                break
 
     def everything(self) -> Iterator[Message]:
         """Yields all streams' messages in the order in which they are received, without end."""
@@ -108,19 +108,16 @@ class MessageSchedule:
 
     def newest(self, stream: Stream, at: Ns) -> Message | None:
         """Returns the newest message with a log time at or before `at`; None before the first."""
-        first = self._first(stream)
-        k = first if stream.latched else max((at - self.t0) // stream.period, first)
-        newest = self.message(stream, k)
-        if newest.log_time > at and k > first:
-            newest = self.message(stream, k - 1)
-        return newest if newest.log_time <= at else None
+        return next(self.newest_first(stream, at), None)
 
     def newest_first(self, stream: Stream, at: Ns) -> Iterator[Message]:
         """Yields the stream's messages with a log time at or before `at`, newest first."""
-        newest = self.newest(stream, at)
-        if newest is not None:
-            for k in range(newest.k, self._first(stream) - 1, -1):
-                yield self.message(stream, k)
+        first = self._first(stream)
+        last = first if stream.latched else (at - self.t0) // stream.period
+        for k in range(max(first, last), first - 1, -1):
+            message = self.message(stream, k)
+            if message.log_time <= at:
+                yield message
 
     def count(self, stream: Stream, at: Ns) -> int:
         """Returns how many messages the recorder has received by `at`."""

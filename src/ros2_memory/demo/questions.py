@@ -107,10 +107,8 @@ class CallContext:
 
 
 Judge: TypeAlias = "Callable[[JsonValue, CallContext], str]"
-Told: TypeAlias = "tuple[dict[str, JsonValue], str]"
-"""What a reply has of a message, and the answer in words."""
-Tell: TypeAlias = "Callable[[Message, str], Told]"
-"""Tells of a message, whose time is given in words."""
+Expected: TypeAlias = "Callable[[float], dict[str, JsonValue]]"
+"""What a reply has of the robot at a time t."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,11 +274,15 @@ def _topics(reply: JsonValue, call: CallContext) -> str:
 
 
 def _of_message(
-    candidates: Callable[[CallContext], Sequence[Message]], tell: Tell, then: str | None = None
+    candidates: Callable[[CallContext], Sequence[Message]],
+    expected: Expected,
+    sentence: str,
+    then: str | None = None,
 ) -> Judge:
     """Judges a reply from one of a few messages.
 
-    `tell` says what it has of that message, or of the one of the topic `then` at or before it.
+    `expected` and `sentence` are of that message, or of the one of the topic `then` at or before
+    it; the sentence has what `_in_words` names.
     """
 
     def judge(reply: JsonValue, call: CallContext) -> str:
@@ -289,85 +291,72 @@ def _of_message(
         if then is not None:
             newest = call.timeline.newest(_BY_TOPIC[then], message.log_time)
             message = _message_of(_number(reply, "value_timestamp"), [newest])
+        _require(reply, expected(message.t))
         local = datetime.fromtimestamp(moment, tz=UTC).astimezone()
         when = f"at {local:%H:%M:%S}, {call.age_s(moment):.1f} s ago"
-        expected, sentence = tell(message, when)
-        _require(reply, expected)
-        return sentence
+        told = sentence.format(when=when, **_in_words(message.t))
+        return told[0].upper() + told[1:]
 
     return judge
 
 
-def _ago(topic: str, tell: Tell, seconds_ago: float) -> Judge:
+def _ago(topic: str, seconds_ago: float, expected: Expected, sentence: str) -> Judge:
     """Judges what the message of a topic so long ago holds."""
-    return _of_message(lambda call: call.ago(_BY_TOPIC[topic], seconds_ago), tell)
+    return _of_message(lambda call: call.ago(_BY_TOPIC[topic], seconds_ago), expected, sentence)
 
 
-def _last(topic: str, holds: Callable[[float], bool], tell: Tell, then: str | None = None) -> Judge:
+def _last(
+    topic: str,
+    holds: Callable[[float], bool],
+    expected: Expected,
+    sentence: str,
+    then: str | None = None,
+) -> Judge:
     """Judges when something last was so in the messages of a topic."""
-    return _of_message(lambda call: call.last_where(_BY_TOPIC[topic], holds), tell, then)
+    stream = _BY_TOPIC[topic]
+    return _of_message(lambda call: call.last_where(stream, holds), expected, sentence, then)
 
 
-def _pose(message: Message, _when: str) -> Told:
-    point, where = _place(message)
-    yaw = math.degrees(robot.pose(message.t).yaw)
-    expected = {"frame_id": "odom", **point, "yaw_deg": yaw}
-    return expected, f"{where}, facing {yaw:.0f} degrees."
-
-
-def _twist(message: Message, _when: str) -> Told:
-    forward, turning = robot.twist(message.t)
+def _in_words(t: float) -> dict[str, str]:
+    """Returns what the robot does, and what there is, for sentences."""
+    x, y, yaw = robot.pose(t)
+    forward, turning = robot.twist(t)
     way, rate = "backwards" if forward < 0 else "forwards", math.degrees(turning)
     turn = f"turning {'left' if rate > 0 else 'right'} at {abs(rate):.0f} degrees/s"
-    sentence = f"{abs(forward):.2f} m/s {way}, {turn if abs(rate) >= 1 else 'straight on'}."
-    return {"linear": {"x": forward}, "angular": {"z": turning}}, sentence
-
-
-def _charge(message: Message, _when: str) -> Told:
-    charge = robot.battery(message.t)
-    return {"value": {"percentage": charge}}, f"{charge:.1%}."
-
-
-def _objects(message: Message) -> Told:
-    """Returns what a reply has of the objects in view, and their names for a sentence."""
-    labels = [thing.label for thing in robot.seen(message.t)]
-    detections: list[JsonValue] = [{"label": label} for label in labels]
-    return {"value": {"detections": detections}}, listed_in_words(labels)
-
-
-def _seen(message: Message, when: str) -> Told:
-    expected, labels = _objects(message)
-    return expected, f"{labels.capitalize()}, {when}."
-
-
-def _seen_too(message: Message, when: str) -> Told:
-    expected, labels = _objects(message)
-    return {"topic": SCENE_OBJECTS, **expected}, f"{when.capitalize()}; in view: {labels}."
-
-
-def _was_there(message: Message, when: str) -> Told:
-    point, _ = _place(message)
-    return {"value": {"position": point}}, f"{when.capitalize()}."
-
-
-def _where(message: Message, when: str) -> Told:
-    point, where = _place(message)
-    return {"value": {"position": point}}, f"{where}, {when}."
-
-
-def _clear(_message: Message, when: str) -> Told:
-    return {"value": {"value": True}}, f"{when.capitalize()}."
-
-
-def _place(message: Message) -> Told:
-    """Returns the position (m) of the robot in `odom`, and in words where in the flat that is."""
-    x, y, _ = robot.pose(message.t)
-    room = robot.place(message.t)
-    return {"x": x, "y": y, "z": 0.0}, f"In the {room}, at x {_metres(x)}, y {_metres(y)} in odom"
+    return {
+        "place": f"in the {robot.place(t)}, at x {_metres(x)}, y {_metres(y)} in odom",
+        "facing": f"{math.degrees(yaw):.0f} degrees",
+        "motion": f"{abs(forward):.2f} m/s {way}, {turn if abs(rate) >= 1 else 'straight on'}",
+        "charge": f"{robot.battery(t):.1%}",
+        "objects": listed_in_words([thing.label for thing in robot.seen(t)]),
+    }
 
 
 def _metres(value: float) -> str:
     return f"{round(value, 2) + 0.0:.2f} m"  # nothing is -0.00 m
+
+
+def _position(t: float) -> dict[str, JsonValue]:
+    x, y, _ = robot.pose(t)
+    return {"x": x, "y": y, "z": 0.0}
+
+
+def _at_position(t: float) -> dict[str, JsonValue]:
+    return {"value": {"position": _position(t)}}
+
+
+def _pose(t: float) -> dict[str, JsonValue]:
+    yaw = math.degrees(robot.pose(t).yaw)
+    return {"frame_id": "odom", **_position(t), "yaw_deg": yaw}
+
+
+def _twist(t: float) -> dict[str, JsonValue]:
+    forward, turning = robot.twist(t)
+    return {"linear": {"x": forward}, "angular": {"z": turning}}
+
+
+def _objects(t: float) -> dict[str, JsonValue]:
+    return {"value": {"detections": [{"label": thing.label} for thing in robot.seen(t)]}}
 
 
 def _driven(seconds: float) -> Judge:
@@ -494,22 +483,25 @@ QUESTIONS: Final = (
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
         {"seconds_ago": 10},
-        _ago(ODOM, _pose, 10),
+        _ago(ODOM, 10, _pose, "{place}, facing {facing}."),
     ),
     Question(
-        "And how fast?", "get_velocity_seconds_ago", {"seconds_ago": 10}, _ago(ODOM, _twist, 10)
+        "And how fast?",
+        "get_velocity_seconds_ago",
+        {"seconds_ago": 10},
+        _ago(ODOM, 10, _twist, "{motion}."),
     ),
     Question(
         "What objects did you see at the front door?",
         "get_value_when",
         {"value_topic": SCENE_OBJECTS, "condition_topic": ODOM, **_near(robot.FRONT_DOOR)},
-        _last(ODOM, _is_near(robot.FRONT_DOOR), _seen, SCENE_OBJECTS),
+        _last(ODOM, _is_near(robot.FRONT_DOOR), _objects, "{objects}, {when}.", SCENE_OBJECTS),
     ),
     Question(
         "When was the path last clear?",
         "find_last_match",
         {"topic": PATH_CLEAR, "condition_type": "equals", "value": True},
-        _last(PATH_CLEAR, robot.path_clear, _clear),
+        _last(PATH_CLEAR, robot.path_clear, lambda _: {"value": {"value": True}}, "{when}."),
     ),
     Question(
         "How far have I driven in the last minute?",
@@ -521,19 +513,24 @@ QUESTIONS: Final = (
         "When did you last see scissors?",
         "find_last_match",
         {"topic": "/vision/*/scene_objects", **_SCISSORS},
-        _last(SCENE_OBJECTS, _sees("scissors"), _seen_too),
+        _last(
+            SCENE_OBJECTS,
+            _sees("scissors"),
+            lambda t: {"topic": SCENE_OBJECTS, **_objects(t)},
+            "{when}; in view: {objects}.",
+        ),
     ),
     Question(
         "And where were you then?",
         "get_value_when",
         {"value_topic": ODOM, "condition_topic": SCENE_OBJECTS, **_SCISSORS},
-        _last(SCENE_OBJECTS, _sees("scissors"), _where, ODOM),
+        _last(SCENE_OBJECTS, _sees("scissors"), _at_position, "{place}, {when}.", ODOM),
     ),
     Question(
         "When were you last at the kitchen counter?",
         "find_last_match",
         {"topic": ODOM, **_near(robot.KITCHEN_COUNTER)},
-        _last(ODOM, _is_near(robot.KITCHEN_COUNTER), _was_there),
+        _last(ODOM, _is_near(robot.KITCHEN_COUNTER), _at_position, "{when}."),
     ),
     Question(
         "Where in the flat was the camera 10 s ago?",
@@ -546,7 +543,7 @@ QUESTIONS: Final = (
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {"topic": BATTERY, "seconds_ago": 30, "tolerance_s": 1.5, "fields": ["percentage"]},
-        _ago(BATTERY, _charge, 30),
+        _ago(BATTERY, 30, lambda t: {"value": {"percentage": robot.battery(t)}}, "{charge}."),
     ),
     Question(
         "What did you say you saw in the last 20 s?",

@@ -308,7 +308,11 @@ def run_demo(
     port = free_port(port)
     tell: Callable[[str], object] = str if as_json else say
     with ExitStack() as stack:
-        folder = _made(bag_dir, stack)
+        if bag_dir is None:
+            temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
+            bag_dir = Path(stack.enter_context(temporary))
+        bag_dir.mkdir(parents=True, exist_ok=True)
+        folder = bag_dir.resolve()
         recorder = stack.enter_context(_recorder(folder, duration_s))
         server = stack.enter_context(running_server(folder, port, tell, verbose=verbose))
         url = f"http://{HOST}:{port}"
@@ -337,15 +341,6 @@ def run_demo(
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
     return int(right < len(questions))
-
-
-def _made(bag_dir: Path | None, stack: ExitStack) -> Path:
-    """Returns the folder of the bags; without a name one that is removed at the end."""
-    if bag_dir is None:
-        temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
-        return Path(stack.enter_context(temporary))
-    bag_dir.mkdir(parents=True, exist_ok=True)
-    return bag_dir.resolve()
 
 
 def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:

@@ -102,14 +102,9 @@ def test_a_robot_that_nobody_knows_is_not_forgotten(ship: Ship, tmp_path: Path) 
 def test_a_second_writer_ends_and_names_the_first(ship: Ship, tmp_path: Path) -> None:
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
         refused = ship(2).err
-        with (
-            pytest.raises(LakeError, match="one writer"),
-            writing_alone(tmp_path / "lake" / ".ros2-memory"),
-        ):
-            pass
+    assert "one writer" in refused
     assert "process" in refused
-    with writing_alone(tmp_path / "lake" / ".ros2-memory"):
-        pass
+    ship(0)
 
 
 def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(

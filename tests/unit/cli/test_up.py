@@ -74,6 +74,19 @@ def test_who_answers_no_has_nothing_written(
     assert not (tmp_path / "bags" / "topics.yaml").exists()
 
 
+@pytest.fixture
+def became(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The programs that `up` becomes in the end, with their arguments."""
+    programs: list[list[str]] = []
+
+    def become(program: str, argv: list[str]) -> None:
+        programs.append(argv)
+        raise SystemExit(0)
+
+    monkeypatch.setattr(os, "execvp", become)
+    return programs
+
+
 class Terminal(io.StringIO):
     """A person at a terminal, with what they type."""
 
@@ -81,14 +94,15 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.mark.usefixtures("became")
 @pytest.mark.parametrize(
     ("typed", "flags", "before", "remembers"),
     [
-        ("y\ny\n", (), False, True),
-        ("y\n\n", (), False, False),
-        ("", ("--yes",), False, False),
-        ("", ("--yes",), True, True),
-        ("", ("--yes", "memory.keep=false"), True, False),
+        ("y\ny\n", "", False, True),
+        ("y\n\n", "", False, False),
+        ("", "--yes", False, False),
+        ("", "--yes", True, True),
+        ("", "--yes memory.keep=false", True, False),
     ],
 )
 def test_only_a_person_has_something_outlive_the_bags(
@@ -96,18 +110,14 @@ def test_only_a_person_has_something_outlive_the_bags(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     typed: str,
-    flags: tuple[str, ...],
+    flags: str,
     before: bool,
     remembers: bool,
 ) -> None:
-    def become(program: str, argv: list[str]) -> None:
-        raise SystemExit(0)
-
-    monkeypatch.setattr(os, "execvp", become)
     monkeypatch.setattr(sys, "stdin", Terminal(typed))
     if before:
         (tmp_path / "bags" / "memory").mkdir(parents=True)
-    shown = exits(0, "up", *flags, "--install", "--bag-dir", tmp_path / "bags").out
+    shown = exits(0, f"up {flags} --install --bag-dir {tmp_path}/bags").out
     assert ("memory.keep=true" in shown) is remembers
 
 
@@ -128,15 +138,8 @@ def test_what_is_to_outlive_the_bags_is_asked_once(
 
 
 def test_install_hands_the_list_over_to_the_script(
-    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exits: Program, tmp_path: Path, became: list[list[str]]
 ) -> None:
-    became: list[list[str]] = []
-
-    def become(program: str, argv: list[str]) -> None:
-        became.append(argv)
-        raise SystemExit(0)
-
-    monkeypatch.setattr(os, "execvp", become)
     file = tmp_path / "bags" / "topics.yaml"
     shown = exits(0, f"up --yes --install --bag-dir {tmp_path}/bags").out
     script = str(ROOT / "deploy" / "install.sh")

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
@@ -116,10 +115,8 @@ def test_a_terminal_gets_a_table() -> None:
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(bag_dir: Path, exits: Program) -> None:
-    now = time.time_ns()
-    beat = Heartbeat(
-        1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")
-    )
+    now, lost = time.time_ns(), ("/gone", "/lost")
+    beat = Heartbeat(1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, lost)
     write_heartbeat(bag_dir, beat)
     output = exits(0, "watch --count 1").out
     assert "recorder: recording, restarted 2 times;" in output
@@ -140,9 +137,7 @@ class TestOldData:
         assert "as usual" not in output
         assert "days old; no new data; rates not checked for 1 topic" in output
 
-    def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
-        words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
-        assert cli.main(words) == 0
-        output = capsys.readouterr().out
+    def test_is_as_old_as_the_tools_say(self, old: Path, exits: Program) -> None:
+        output = exits(0, f"watch --count 1 --bag-dir {old} data.now=latest").out
         assert "which is now (data.now=latest); no new data" in output
         assert "days old" not in output

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.demo.run import run_demo, running_server, server_environment
+from ros2_memory.demo.run import run_demo, running_server
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -45,28 +45,6 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
             running_server(tmp_path, port, print),
         ):
             pass
-
-
-def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
-    caller = {
-        "PATH": "/bin",
-        "MEMORY_DEPLOYMENT": "robot",
-        "MEMORY_CONFIG_DIR": "elsewhere",
-        "MCP_TRANSPORT": "stdio",
-        "ROS_VISION_INTERFACES_PATH": "elsewhere",
-        "XDG_CACHE_HOME": "/home/someone/.cache",
-    }
-    environment = server_environment(caller, tmp_path, 9203, "/elsewhere")
-    overrides = environment.pop("MEMORY_CONFIG_OVERRIDES").split()
-    assert environment == {
-        "PATH": "/bin",
-        "MCP_TRANSPORT": "sse",
-        "MCP_HOST": "127.0.0.1",
-        "MCP_PORT": "9203",
-        "MEMORY_BAG_DIR": str(tmp_path),
-        "XDG_CACHE_HOME": "/elsewhere",
-    }
-    assert {"recorder=none", "recording.split_duration_s=5"} <= set(overrides)
 
 
 @pytest.mark.parametrize("duration_s", [89.9, 86_401.0, float("nan")])

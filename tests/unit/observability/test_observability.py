@@ -63,16 +63,6 @@ def at(found: Samples, name: str, **labels: str) -> float:
 
 
 class TestMetrics:
-    async def test_answers_are_counted_by_tool_and_outcome(self) -> None:
-        metrics = Metrics(lambda: (), "1.2.3")
-        for outcome in ("ok", "ok", "no_data: gap", "timeout"):
-            metrics.answered(call(outcome=outcome))
-        found = await scraped(metrics)
-        assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 2
-        assert at(found, "answers_total", tool="ask", outcome="no_data", reason="gap") == 1
-        assert at(found, "answers_total", tool="ask", outcome="timeout", reason="") == 1
-        assert at(found, "build_info", version="1.2.3") == 1
-
     async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
         metrics = Metrics(lambda: (), "1")
         full = tool("full", partial(asking, "full"))

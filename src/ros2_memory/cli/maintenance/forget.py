@@ -140,7 +140,10 @@ class _Forget:
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
         self._reader = build_reader(settings)  # reads files as they are
-        self._recorder = _recorder_of(self._bag_dir)
+        self._recorder: str | None = None  # why one holds the bag directory
+        if (self._bag_dir / LOCK_FILE).exists():  # else none does, and nothing is written
+            with _recorder_locked_out(self._bag_dir) as self._recorder:
+                pass
         self._unread: set[Path] = set()  # bags whose first messages are unknown
         snapshot = memory.index.snapshot()
         self._written = {aside.path: self._may_hold(aside, snapshot) for aside in snapshot.active}
@@ -541,14 +544,6 @@ def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
         with suppress(OSError):
             linked |= {path} if path.lstat().st_nlink > 1 else set()
     return linked
-
-
-def _recorder_of(bag_dir: Path) -> str | None:
-    """Returns why a recorder holds the bag directory; None where none does. Writes nothing."""
-    if not (bag_dir / LOCK_FILE).exists():
-        return None
-    with _recorder_locked_out(bag_dir) as recorder:
-        return recorder
 
 
 @contextmanager
