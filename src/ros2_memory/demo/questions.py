@@ -150,18 +150,15 @@ def _no_number(constant: str) -> float:
     raise ValueError(f"{constant} is not JSON")
 
 
-def _at(value: JsonValue, step: str | int) -> JsonValue:
-    """Returns what a reply has at a key or an index.
+def _at(value: JsonValue, key: str) -> JsonValue:
+    """Returns what an object of a reply has at a key.
 
     Raises:
         WrongAnswerError: there is nothing.
     """
-    match value, step:
-        case dict(), str() if step in value:
-            return value[step]
-        case list(), int() if -len(value) <= step < len(value):
-            return value[step]
-    raise WrongAnswerError(f"expected {step!r} in {_brief(value)}")
+    if not isinstance(value, dict) or key not in value:
+        raise WrongAnswerError(f"expected {key!r} in {_brief(value)}")
+    return value[key]
 
 
 def _number(value: JsonValue, key: str) -> float:
@@ -261,10 +258,11 @@ def _time_range(reply: JsonValue, call: CallContext) -> str:
 def _topics(reply: JsonValue, call: CallContext) -> str:
     """Judges the list of topics: the type, the count and the newest message of each."""
     counts: dict[str, int] = {}
-    rows = {str(_at(row, "topic")): row for row in _items(reply)}
-    if rows.keys() != _BY_TOPIC.keys():
-        raise WrongAnswerError(f"expected topics {sorted(_BY_TOPIC)}, not {sorted(rows)}")
-    for topic, row in rows.items():
+    rows = [(str(_at(row, "topic")), row) for row in _items(reply)]
+    topics = sorted(topic for topic, _ in rows)
+    if topics != sorted(_BY_TOPIC):
+        raise WrongAnswerError(f"expected topics {sorted(_BY_TOPIC)}, not {topics}")
+    for topic, row in rows:
         stream = _BY_TOPIC[topic]
         newest = _message_of(_number(row, "last_ts"), call.last_where(stream))
         counts[topic] = call.timeline.count(stream, newest.log_time)
@@ -278,11 +276,12 @@ def _of_message(
     expected: Expected,
     sentence: str,
     then: str | None = None,
+    off: float = _ROUNDED,
 ) -> Judge:
     """Judges a reply from one of a few messages.
 
     `expected` and `sentence` are of that message, or of the one of the topic `then` at or before
-    it; the sentence has what `_in_words` names.
+    it; the sentence has what `_in_words` names. A number may be `off`.
     """
 
     def judge(reply: JsonValue, call: CallContext) -> str:
@@ -291,7 +290,7 @@ def _of_message(
         if then is not None:
             newest = call.timeline.newest(_BY_TOPIC[then], message.log_time)
             message = _message_of(_number(reply, "value_timestamp"), [newest])
-        _require(reply, expected(message.t))
+        _require(reply, expected(message.t), off=off)
         local = datetime.fromtimestamp(moment, tz=UTC).astimezone()
         when = f"at {local:%H:%M:%S}, {call.age_s(moment):.1f} s ago"
         told = sentence.format(when=when, **_in_words(message.t))
@@ -300,9 +299,12 @@ def _of_message(
     return judge
 
 
-def _ago(topic: str, seconds_ago: float, expected: Expected, sentence: str) -> Judge:
+def _ago(
+    topic: str, seconds_ago: float, expected: Expected, sentence: str, off: float = _ROUNDED
+) -> Judge:
     """Judges what the message of a topic so long ago holds."""
-    return _of_message(lambda call: call.ago(_BY_TOPIC[topic], seconds_ago), expected, sentence)
+    stream = _BY_TOPIC[topic]
+    return _of_message(lambda call: call.ago(stream, seconds_ago), expected, sentence, off=off)
 
 
 def _last(
@@ -543,7 +545,7 @@ QUESTIONS: Final = (
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {"topic": BATTERY, "seconds_ago": 30, "tolerance_s": 1.5, "fields": ["percentage"]},
-        _ago(BATTERY, 30, lambda t: {"value": {"percentage": robot.battery(t)}}, "{charge}."),
+        _ago(BATTERY, 30, lambda t: {"value": {"percentage": robot.battery(t)}}, "{charge}.", 1e-6),
     ),
     Question(
         "What did you say you saw in the last 20 s?",

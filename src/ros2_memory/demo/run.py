@@ -14,6 +14,7 @@ import sys
 import textwrap
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -52,21 +53,16 @@ def format_exchange(number: int, exchange: Exchange) -> str:
     arguments = ", ".join(
         f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
     )
-    call = textwrap.wrap(
-        f"{question.tool}({arguments})",
-        WIDTH,
-        initial_indent=_INDENT,
-        subsequent_indent=_INDENT * 2,
-        break_on_hyphens=False,
+    filled = partial(textwrap.fill, width=WIDTH, break_on_hyphens=False)
+    call = filled(
+        f"{question.tool}({arguments})", initial_indent=_INDENT, subsequent_indent=_INDENT * 2
     )
-    answer = textwrap.fill(
+    answer = filled(
         f"{mark}{exchange.sentence}",
-        WIDTH,
         initial_indent=f"{_INDENT}=> ",
         subsequent_indent=f"{_INDENT}   ",
-        break_on_hyphens=False,
     )
-    return "\n".join([f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""])
+    return "\n".join([f"{number:>2}. {question.words}", call, answer, *_reply(exchange.reply), ""])
 
 
 def exchange_as_json(number: int, exchange: Exchange) -> str:
