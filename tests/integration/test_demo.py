@@ -27,7 +27,8 @@ PROGRAM = [str(Path(sys.executable).with_name("ros2-memory")), "demo"]
 def environment(scratch: Path) -> dict[str, str]:
     """Ours, with temporary folders where the test sees them, and settings that must not count."""
     folders = {"TMPDIR": str(scratch), "XDG_CACHE_HOME": str(scratch / "cache")}
-    return {**os.environ, **folders, "MEMORY_DEPLOYMENT": "no-such-deployment"}
+    wrong = ("MEMORY_DEPLOYMENT", "MEMORY_CONFIG_DIR", "ROS_VISION_INTERFACES_PATH")
+    return {**os.environ, **folders, **dict.fromkeys(wrong, "no-such-thing")}
 
 
 @pytest.fixture

@@ -104,14 +104,14 @@ async def test_what_was_asked_and_what_is_known_is_scraped_by_whoever_shows_the_
     }
     assert all(name.startswith("ros2_memory_") for name, *_ in found)
     answered = {
-        (dict(labels)["tool"], dict(labels)["outcome"]): value
+        tuple(map(dict(labels).get, ("tool", "outcome", "reason"))): value
         for (name, *labels), value in found.items()
         if name == "ros2_memory_answers_total"
     }
     assert answered == {
-        ("data_time_range", "ok"): 2,
-        ("get_position_at", "no_data"): 1,
-        ("unknown", "invalid_arguments"): 1,
+        ("data_time_range", "ok", ""): 2,
+        ("get_position_at", "no_data", "outside_range"): 1,
+        ("unknown", "invalid_arguments", ""): 1,
     }
     assert found["ros2_memory_bags",] == 1
     assert found["ros2_memory_kept_bytes",] == (bag_dir / "run" / "run_0.mcap").stat().st_size

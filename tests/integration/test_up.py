@@ -97,43 +97,32 @@ def started(folder: Path, env: Mapping[str, str], *words: str) -> Iterator[Up]:
         sys.stdout.write(out.read_text() + err.read_text())
 
 
-def descendants(pid: int) -> dict[str, list[str]]:
-    """The command lines of all processes below a process, by the id and the start of each."""
-    found: dict[str, list[str]] = {}
-    parents: dict[int, list[tuple[int, str]]] = {}
+def running() -> dict[str, tuple[str, list[str]]]:
+    """The parent and the command line of each process, by its id and its start."""
+    found: dict[str, tuple[str, list[str]]] = {}
     for entry in Path("/proc").glob("[0-9]*"):
         try:
             fields = (entry / "stat").read_text().rpartition(")")[2].split()
-        except OSError:
+            words = (entry / "cmdline").read_bytes().decode().split("\0")
+        except OSError:  # it has ended
             continue
         if fields[0] != "Z":
-            parents.setdefault(int(fields[1]), []).append((int(entry.name), fields[19]))
-    waiting = [pid]
-    while waiting:
-        for child, began in parents.get(waiting.pop(), []):
-            waiting.append(child)
-            found[f"{child} {began}"] = words_of(child)
+            found[f"{entry.name} {fields[19]}"] = fields[1], words
     return found
 
 
-def words_of(pid: int) -> list[str]:
-    try:
-        return Path(f"/proc/{pid}/cmdline").read_bytes().decode().split("\0")
-    except OSError:
-        return []
-
-
-def are_gone(processes: Mapping[str, list[str]]) -> bool:
-    """Whether none of them runs any more."""
-    for each in processes:
-        pid, began = each.split()
-        try:
-            fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if fields[19] == began and fields[0] != "Z":
-            return False
-    return True
+def descendants(pid: int) -> dict[str, list[str]]:
+    """The command lines of all processes below a process, by the same."""
+    found: dict[str, list[str]] = {}
+    above, all_running = {str(pid)}, running()
+    while new := {
+        key: words
+        for key, (parent, words) in all_running.items()
+        if parent in above and key not in found
+    }:
+        found |= new
+        above = {key.split()[0] for key in new}
+    return found
 
 
 def test_it_records_what_it_proposes_answers_over_sse_and_leaves_no_process(
@@ -170,7 +159,7 @@ def test_it_records_what_it_proposes_answers_over_sse_and_leaves_no_process(
         assert {"ros2_memory.recorder", "ros2_memory.server", "record"} <= modules
         up.process.send_signal(signal.SIGINT)
         assert up.code() == 0
-        assert are_gone(below)
+        assert below.keys().isdisjoint(running())
     assert "recorder and server have ended" in up.out.read_text()
     assert up.err.read_text() == ""
 
@@ -196,7 +185,7 @@ def test_a_list_that_is_there_is_used_and_a_program_that_dies_ends_it_with_code_
         server = next(each for each, words in below.items() if "ros2_memory.server" in words)
         os.kill(int(server.split()[0]), signal.SIGKILL)
         assert up.code() == 1
-        assert are_gone(below)
+        assert below.keys().isdisjoint(running())
     assert (
         "ros2-memory up: the server ended with status -9: it gave no reason\n" in up.err.read_text()
     )

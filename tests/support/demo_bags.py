@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.timebase import ns_from_unix
-from ros2_memory.demo.published_topics import MessageSchedule
+from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
 

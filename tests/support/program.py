@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from typing import Any, NamedTuple
 
 import pytest
@@ -28,9 +29,9 @@ class Program:
     def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
         self._capsys = capsys
 
-    def __call__(self, code: int, *words: object) -> Printed:
+    def __call__(self, code: int, line: object, *words: object) -> Printed:
         self._capsys.readouterr()
-        ended = cli.main([str(each) for each in words])
+        ended = cli.main([*shlex.split(str(line)), *map(str, words)])
         printed = Printed(*self._capsys.readouterr())
         assert ended == code, printed
         return printed
@@ -38,5 +39,5 @@ class Program:
 
 @pytest.fixture
 def exits(capsys: pytest.CaptureFixture[str]) -> Program:
-    """`exits(2, "cat", "/odom")`: the command must end with 2."""
+    """`exits(2, "cat /odom", "/a folder")`: the command must end with 2."""
     return Program(capsys)

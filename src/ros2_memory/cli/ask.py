@@ -25,7 +25,7 @@ from ros2_memory.cli.options import (
     parse_time,
     present_time,
 )
-from ros2_memory.cli.output import print_line, print_reply, spinner, stdout_console
+from ros2_memory.cli.output import print_line, print_reply, spinner
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -112,7 +112,7 @@ def ask(
         if as_json:
             print_line(json.dumps(rows))
         else:
-            print_reply(stdout_console(), rows)
+            print_reply(rows)
             print_line("`ros2-memory ask TOOL --help` describes a tool and its arguments")
         return False
     # A folder that is not there may stand before the tool.
@@ -127,9 +127,7 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(
-            stdout_console(), _without_waypoints(answer), unix_from_ns(present_time(memory))
-        )
+        print_reply(_without_waypoints(answer), unix_from_ns(present_time(memory)))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 

@@ -70,7 +70,17 @@ def cat(
     chosen = islice(messages, limit if tail is None else tail)
     exact = as_csv or as_json
     rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
-    lines = _csv(rows) if as_csv else (_line(*row, as_json=as_json) for row in rows)
+    if as_csv:
+        lines = _csv(rows)
+    elif as_json:
+        lines = (
+            to_json_text({"time": unix_from_ns(time), "time_ns": time, "value": value})
+            for time, value in rows
+        )
+    else:
+        lines = (
+            f"{format_time(unix_from_ns(time))}  {format_value(value)}" for time, value in rows
+        )
     count, is_screen = 0, sys.stdout.isatty()
     for line in lines:
         count += 1
@@ -116,12 +126,6 @@ def _extracted(
         view.notes.complete = False
         what = counted(left_out, "message")
         view.notes.add(f"{what} left out that cannot be decoded: `ros2-memory info` shows why")
-
-
-def _line(time: Ns, value: JsonValue, *, as_json: bool) -> str:
-    if not as_json:
-        return f"{format_time(unix_from_ns(time))}  {format_value(value)}"
-    return to_json_text({"time": unix_from_ns(time), "time_ns": time, "value": value})
 
 
 def _csv(rows: Iterable[Row]) -> Iterator[str]:

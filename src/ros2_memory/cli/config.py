@@ -4,7 +4,6 @@ import json
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import chain
 from typing import Annotated, Final
 
 import typer
@@ -63,18 +62,17 @@ def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[st
     Raises:
         ConfigError: there is no such section or key.
     """
-    if not named:
-        return values
-    of_name = {name: [key for key in values if f"{key}.".startswith(f"{name}.")] for name in named}
-    for name, keys in of_name.items():
+    chosen = {} if named else values
+    for name in named:
+        keys = [key for key in values if f"{key}.".startswith(f"{name}.")]
         if not keys:
             sections = ", ".join(dict.fromkeys(key.partition(".")[0] for key in values))
             raise ConfigError(
                 f"{name}: there is no such section or key; the sections are {sections} "
                 "(to change a setting, write key=value)"
             )
-    chosen = {*chain(*of_name.values())}
-    return {key: value for key, value in values.items() if key in chosen}
+        chosen = {key: values[key] for key in values if key in chosen or key in keys}
+    return chosen
 
 
 def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Iterable[str]) -> None:

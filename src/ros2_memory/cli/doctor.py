@@ -90,15 +90,12 @@ def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
     findings = [*_examine(bags)]
     worst = max(finding.level for finding in findings)
     if as_json:
-        rows = [
-            {"level": level.name.lower(), "about": about, "seen": seen, "do": do}
-            for level, seen, do, about in findings
-        ]
-        print_json({"status": worst.name.lower(), "findings": rows})
+        rows = [{**finding._asdict(), "level": str(finding.level)} for finding in findings]
+        print_json({"status": str(worst), "findings": rows})
         return worst
     console = stdout_console()
-    for level, seen, do, about in findings:
-        styled = (f"{level.name.lower():<8}", _STYLES[level]), (f"{about:<9}", "bold")
+    for level, about, seen, do in findings:
+        styled = (f"{level!s:<8}", _STYLES[level]), (f"{about:<9}", "bold")
         console.print(Text.assemble(*styled, escape(seen)), soft_wrap=True)
         if do:
             console.print(Text(f"{'':17}-> {escape(do)}"), soft_wrap=True)
@@ -112,13 +109,12 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         robots = settings.fleet.robots
         memory = None if robots else open_memory(settings, verbose=bags.verbose)
     except ConfigError as refused:
-        yield error(str(refused), "correct the key that it names", about="config")
+        yield Finding(Level.ERROR, "config", str(refused), "correct the key that it names")
         return
-    yield ok(f"files in use: {', '.join(files_in_use(settings))}", about="config")
+    yield Finding(Level.OK, "config", f"files in use: {', '.join(files_in_use(settings))}")
     if unused := unused_config():
-        yield warning(
-            unused, "set that, or rename the file if it is another program's", about="config"
-        )
+        do = "set that, or rename the file if it is another program's"
+        yield Finding(Level.WARNING, "config", unused, do)
     if memory is None:
         for name in robots:
             yield from _of_robot(name, *open_robot(settings, name, verbose=bags.verbose))
@@ -131,7 +127,7 @@ def _examine(bags: Bags) -> Iterator[Finding]:
         if robot.records:
             yield from _findings_of(_OF_RECORDER, robot)
         else:
-            yield ok("recorder=none: nothing is recorded here", about="recorder")
+            yield Finding(Level.OK, "recorder", "recorder=none: nothing is recorded here")
         yield from _findings_of(_OF_SETTINGS, settings)
 
 
@@ -144,7 +140,8 @@ def _findings_of(
             for finding in check(what):
                 yield finding._replace(about=finding.about or about)
         except OSError as problem:
-            yield error(reason_of(problem), f"{_READ}; else look after the disk", about=about)
+            do = f"{_READ}; else look after the disk"
+            yield Finding(Level.ERROR, about, reason_of(problem), do)
 
 
 def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
@@ -181,16 +178,14 @@ def check_bag_dir(robot: Examined) -> Iterator[Finding]:
     elif not os.access(bag_dir, os.R_OK | os.X_OK):
         yield error(f"{user} may not read {bag_dir}", _READ)
         return
-    elif not robot.records:
-        yield ok(f"{bag_dir}, readable by {user}")
-    elif os.access(bag_dir, os.W_OK):
-        yield ok(f"{bag_dir}, readable and writable by {user}")
-    else:
+    elif robot.records and not os.access(bag_dir, os.W_OK):
         do = (
             "fine if the recorder runs as another user, who may: "
             "sudo -u USER ros2-memory doctor looks as that one"
         )
         yield warning(f"{bag_dir}, readable but not writable by {user}", do)
+    else:
+        yield ok(f"{bag_dir}, readable{' and writable' if robot.records else ''} by {user}")
     if (bag_dir / ERASING_FILE).exists():
         yield warning(
             "an earlier `ros2-memory forget` was interrupted: some data to delete is still there",
@@ -206,8 +201,7 @@ def check_disk(robot: Examined) -> Iterator[Finding]:
     existing = next(path for path in (bag_dir, *bag_dir.parents) if path.is_dir())
     mount = next(path for path in (existing, *existing.parents) if os.path.ismount(path))
     free = shutil.disk_usage(existing).free / GB
-    heartbeat = robot.memory.index.heartbeat()
-    budget = budget_of(robot.memory, robot.snapshot, heartbeat, robot.now)
+    budget = budget_of(robot.memory, robot.snapshot, robot.memory.index.heartbeat(), robot.now)
     used = budget.used / GB
     seen = f"{free:.1f} GB free on {mount}; used: {describe_budget(budget)}"
     if free < limits.min_free_gb:
@@ -259,8 +253,8 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         aside.setdefault(("not read", bag.reason), []).append(bag.path.name)
     for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
         for bag in files:
-            named = f"{bag.path.name} ({bag.reason})"
-            aside.setdefault((state, _remedy(bag, memory)), []).append(named)
+            names = aside.setdefault((state, _remedy(bag, memory)), [])
+            names.append(f"{bag.path.name} ({bag.reason})")
     for (state, do), names in aside.items():
         yield warning(f"{counted(len(names), 'file is', 'files are')} {state}: {listed(names)}", do)
     yield from _check_content(memory, snapshot, covered.undecodable)
@@ -271,22 +265,22 @@ def _check_content(
     memory: Memory, snapshot: Snapshot, undecodable: Iterable[Undecodable]
 ) -> Iterator[Finding]:
     """Checks that bags are whole, as they state, and that their messages can be decoded."""
-    odd = bags_with_remarks(snapshot)
-    for forms, bags, do in (
+    for whole, forms, do in (
         (
+            False,
             ("bag is not whole", "bags are not whole"),
-            [*filterfalse(is_whole, odd)],
             "answers use the readable part; copy the bags again for the rest",
         ),
         (
+            True,
             ("bag contradicts itself", "bags contradict themselves"),
-            [*filter(is_whole, odd)],
             "nothing is missing: what it states of itself is wrong, not its messages",
         ),
     ):
-        if bags:
-            names = listed([f"{bag.path.name} ({'; '.join(bag.summary.notes)})" for bag in bags])
-            yield warning(f"{counted(len(bags), *forms)}: {names}", do)
+        odd = [bag for bag in bags_with_remarks(snapshot) if is_whole(bag) is whole]
+        names = listed([f"{bag.path.name} ({'; '.join(bag.summary.notes)})" for bag in odd])
+        if odd:
+            yield warning(f"{counted(len(odd), *forms)}: {names}", do)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield warning(sentence, "copy the missing data from its source")
     for is_mended, do in (
@@ -295,8 +289,8 @@ def _check_content(
     ):
         # The reason names the key where a configured folder would help.
         topics = [topic for topic in undecodable if (_MSG_FOLDERS in topic.reason) is is_mended]
+        names = listed([f"{topic.topic} ({topic.reason})" for topic in topics])
         if topics:
-            names = listed([f"{topic.topic} ({topic.reason})" for topic in topics])
             yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
 
 
@@ -341,12 +335,11 @@ def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
         )
 
 
-def check_columns(memory: Memory) -> Iterator[Finding]:
+def check_columns(robot: Examined) -> Iterator[Finding]:
     """Checks that columns can be stored, and names topics that are beyond their share."""
-    store = memory.columns.store
+    store = robot.memory.columns.store
     if store is None:
         return
-    dropped = store.dropped()
     if store.trouble is not None:
         do = "answers are right, and slower; free the disk, or let it be written"
         yield warning(f"the store of columns {store.trouble}", do)
@@ -354,7 +347,7 @@ def check_columns(memory: Memory) -> Iterator[Finding]:
         do = "answers are right, and slower; please report this as a defect, with the reason"
         bags = counted(store.refusals, "bag")
         yield warning(f"{bags} could not be stored ({store.refused_for})", do)
-    if dropped:
+    if dropped := store.dropped():
         since = iso_local(min(dropped.values()))
         seen = f"topics beyond store.max_share since {since}, whose bags are read: "
         yield ok(f"{seen}{', '.join(dropped)}")
@@ -455,14 +448,13 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
         build_recorder(settings, reader=robot.memory.reader).check()
     except EpisodicError as problem:
         reason, _, do = str(problem).partition("; ")
-        beat = robot.live
-        if not setup_files and beat is not None and beat.state is not RecorderState.STOPPED:
-            yield warning(
-                f"{reason} with these settings, but the running recorder has it by its own",
-                "give this command the recorder's settings (its environment and arguments)",
-            )
-        else:
+        if setup_files or robot.live is None or robot.live.state is RecorderState.STOPPED:
             yield error(reason, do or "correct recorder.setup_files")
+            return
+        seen = f"{reason} with these settings, but the running recorder has it by its own"
+        yield warning(
+            seen, "give this command the recorder's settings (its environment and arguments)"
+        )
         return
     files = ", ".join(map(str, setup_files))
     yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")
@@ -479,7 +471,7 @@ def check_topics(robot: Examined) -> Iterator[Finding]:
     except EpisodicError as problem:
         yield error(str(problem), "correct recording.topics_file")
         return
-    if live is not None and (finding := _other_list(robot, selection, live)):
+    if live is not None and (finding := _other_list(file, selection, live)):
         yield finding
         return
     yield from _lives_of_others(robot, selection)
@@ -530,16 +522,14 @@ def _list_file(settings: Settings) -> Path:
     return listed
 
 
-def _other_list(robot: Examined, selection: TopicSelection, live: Heartbeat) -> Finding | None:
+def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding | None:
     """Returns the finding on a running recorder whose list is not this one; else None."""
-    file = _list_file(robot.settings)
-    added = sorted({*selection.listed} - {*live.listed})
-    dropped = sorted({*live.listed} - {*selection.listed})
-    if live.listed and (added or dropped):
-        whats = (("adds", added), ("lacks", dropped))
-        what = "; ".join(f"{file} {how} {listed(names)}" for how, names in whats if names)
+    here, there = {*selection.listed}, {*live.listed}
+    differences = ("adds", here - there), ("lacks", there - here)
+    if there and here != there:
+        what = [f"{file} {how} {listed(sorted(names))}" for how, names in differences if names]
         do = f"{_LIST_TAKEN}; if the recorder has another file, give this command its settings"
-        return warning(f"the running recorder has another list: {what}", do)
+        return warning(f"the running recorder has another list: {'; '.join(what)}", do)
     waited = [name for name in live.missing if name not in selection.entries]
     others = [name for name in (*live.subscribed, *waited) if not selection.matches(name)]
     if not others:
@@ -557,10 +547,7 @@ def _unheard_entries(
     `received`: of those the recorder has messages, in a split that may not be closed yet.
     """
     snapshot, latching = robot.snapshot, robot.memory.limits.latching
-    if not snapshot.bags:
-        return {}
-    timeline, latest = snapshot.timeline, snapshot.dating.latest
-    heard = [*received]
+    timeline, latest, heard = snapshot.timeline, snapshot.dating.latest, [*received]
     for topic in timeline.topics():
         last = max(totals.last for totals in timeline.totals(topic).values())
         # Nobody expects a latched topic or a log to have a message in every hour.
@@ -570,7 +557,7 @@ def _unheard_entries(
     return {
         entry: get_close_matches(entry, timeline.topics(), n=2)
         for entry in selection.entries
-        if not any(map(TopicSelection((entry,)).matches, heard))
+        if snapshot.bags and not any(map(TopicSelection((entry,)).matches, heard))
     }
 
 
@@ -585,14 +572,11 @@ def check_extras(settings: Settings) -> Iterator[Finding]:
             ["opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"],
         ),
     ):
-        if not is_on:
-            continue
-        if missing := [*filterfalse(_is_installed, modules)]:
-            yield error(
-                f"{key}=true needs {', '.join(missing)}, which cannot be imported",
-                "pip install '.[observability]', or set it to false: the server does not start",
-            )
-        else:
+        missing = ", ".join(filterfalse(_is_installed, modules))
+        if is_on and missing:
+            do = "pip install '.[observability]', or set it to false: the server does not start"
+            yield error(f"{key}=true needs {missing}, which cannot be imported", do)
+        elif is_on:
             yield ok(f"what {key}=true needs is installed")
     if server.metrics and server.transport == "stdio":
         yield error(
@@ -679,12 +663,12 @@ def _health(host: str, port: int, token: str = "") -> tuple[int, dict[str, JsonV
     return response.status, reply
 
 
-_OF_BAGS: Final[Mapping[str, Callable[[Examined], Iterator[Finding]]]] = {
+_OF_BAGS: Final = {
     "bag_dir": check_bag_dir,
     "disk": check_disk,
     "clock": check_clock,
     "bags": check_bags,
-    "columns": lambda robot: check_columns(robot.memory),
+    "columns": check_columns,
 }
 _OF_RECORDER: Final = {
     "ros": check_ros,

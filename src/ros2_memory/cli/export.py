@@ -167,9 +167,8 @@ def profile_of(
     chosen = frozenset(topics)
     within = view.timeline.overlapping(window)
     bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
-    bags.update(stored.bag.path for stored in earlier)
     profiles: set[str] = set()
-    for path in bags:
+    for path in bags | {stored.bag.path for stored in earlier}:
         # A bag that cannot be read is reported when its messages are read.
         with suppress(BagError):
             profiles.add(view.memory.reader.profile(path))
@@ -200,12 +199,13 @@ def with_definitions(
 
 def describe_undefined(types: Sequence[str]) -> str:
     """Returns the sentence on types that an MCAP file has no definition of; empty without any."""
-    has = "has" if len(types) == 1 else "have"
-    lacking = (
-        f"{', '.join(types)} {has} no definition in the bags, in reader.custom_msg_paths or among "
-        "the standard types, and none in the file: other programs cannot read such messages"
+    if not types:
+        return ""
+    return (
+        f"{', '.join(types)} {'has' if len(types) == 1 else 'have'} no definition in the bags, in "
+        "reader.custom_msg_paths or among the standard types, and none in the file: other programs "
+        "cannot read such messages"
     )
-    return lacking if types else ""
 
 
 def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> int:

@@ -67,6 +67,10 @@ class Level(IntEnum):
     WARNING = 1
     ERROR = 2
 
+    def __str__(self) -> str:
+        """Returns it in small letters."""
+        return self.name.lower()
+
 
 class Finding(NamedTuple):
     """What was seen, and what to do about it; nothing where all is in order.
@@ -75,14 +79,14 @@ class Finding(NamedTuple):
     """
 
     level: Level
+    about: str
     seen: str
     do: str | None = None
-    about: str = ""
 
 
-ok: Final = partial(Finding, Level.OK)
-warning: Final = partial(Finding, Level.WARNING)
-error: Final = partial(Finding, Level.ERROR)
+ok: Final = partial(Finding, Level.OK, "")
+warning: Final = partial(Finding, Level.WARNING, "")
+error: Final = partial(Finding, Level.ERROR, "")
 
 
 def check_shipping(robot: Examined) -> Iterator[Finding]:
@@ -97,23 +101,21 @@ def check_shipping(robot: Examined) -> Iterator[Finding]:
         seen = f"{bag_dir / SHIPPED_FILE} cannot be read: {problem.strerror or problem}"
         yield error(seen, "correct its permissions: until then no bag is shipped")
         return
-    by_name = {
-        relative(bag.file, str(bag_dir)): bag
+    closed = [
+        (name, bag)
         for bag in snapshot.bags
         if bag.state is BagState.CLOSED and not is_carried(bag.path)
-    }
-    closed = {
-        name: bag for name, bag in by_name.items() if not name.startswith(f"{MOMENTS_FOLDER}/")
-    }
-    waiting = [bag for name, bag in closed.items() if not is_shipped(receipts, name, bag.size)]
+        if not (name := relative(bag.file, str(bag_dir))).startswith(f"{MOMENTS_FOLDER}/")
+    ]
+    waiting = [bag for name, bag in closed if not is_shipped(receipts, name, bag.size)]
     newest = max((receipt.at for receipt in receipts.values()), default=None)
-    count = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
+    seen = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
     if newest is None:
-        seen = f"{count}, and there is no receipt: no bag is deleted for its age"
+        seen += ", and there is no receipt: no bag is deleted for its age"
     else:
-        seen = f"{count}; the newest receipt is from {iso_local(newest)}"
-    is_late = newest is None or now - newest > _LATE_NS
-    if waiting and is_late and min(bag.end for bag in waiting) < now - _LATE_NS:
+        seen += f"; the newest receipt is from {iso_local(newest)}"
+    latest = now - _LATE_NS
+    if min((bag.end for bag in waiting), default=now) < latest and (newest or 0) < latest:
         do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
         yield warning(seen, do)
     else:
@@ -175,5 +177,5 @@ def _check_receipts(name: str, bag_dir: Path) -> Iterator[Finding]:
                     "retention.require_shipped can never work on that robot"
                 )
                 do = "mount it writable for the user of ros2-memory ship, or do not require it"
-                yield warning(seen, do, about="robot")
+                yield warning(seen, do)._replace(about="robot")
             return

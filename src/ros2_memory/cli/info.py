@@ -4,7 +4,6 @@ import json
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from itertools import chain
 from pathlib import Path
 from typing import Final
 
@@ -63,9 +62,9 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
         print_json(rows)
     elif rows:
         without = [{key: row[key] for key in row if key != "notes"} for row in rows]
-        print_reply(stdout_console(), [*without])
+        print_reply([*without])
         if notes := _notes_of(topic_rows):
-            print_reply(stdout_console(), {"notes": notes})
+            print_reply({"notes": notes})
     else:
         _print_nothing(memory)
     return not rows
@@ -110,16 +109,12 @@ def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | No
     """
     if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
         return None
-    totals = [*snapshot.timeline.totals(topic).values()]
-    if not totals:
-        return None
-    last = max(total.last for total in totals)
-    intervals, duration = 0, 0
+    last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
     window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
     bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
-    for part in chain.from_iterable(bag.summary.of(topic) for bag in bags):
-        intervals += part.count - 1
-        duration += part.last - part.first
+    parts = [part for bag in bags for part in bag.summary.of(topic)]
+    intervals = sum(part.count - 1 for part in parts)
+    duration = sum(part.last - part.first for part in parts)
     if not intervals or duration < _SHORTEST_RATED_NS:
         return None
     return round(intervals / unix_from_ns(duration), 2)
@@ -152,9 +147,9 @@ def _report(settings: Settings, memory: Memory) -> JsonObject:
     snapshot = memory.index.snapshot()
     overlapping: list[JsonValue] = []
     for pair, topic in mixed_recordings(memory, Call()):
-        first, second = pair.names
+        names = dict(zip(("recording", "and"), pair.names, strict=True))
         times = {"from": unix_from_ns(pair.start), "to": unix_from_ns(pair.end)}
-        overlapping.append({"recording": first, "and": second, **times, "robots_differ_on": topic})
+        overlapping.append({**names, **times, "robots_differ_on": topic})
     return {
         **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
         "held": _amount_recorded(snapshot),
@@ -178,11 +173,7 @@ def _show(memory: Memory, report: JsonObject) -> None:
         _print_nothing(memory)
         return
     status, ranged, recorded, *lists = report.values()
-    report_shown = {
-        **_object(recorded),
-        **_for_people(_object(status)),
-        **_for_people(_object(ranged)),
-    }
+    report_shown = {**_object(recorded), **_for_people(status), **_for_people(ranged)}
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
     if budget.most is not None:  # bags that are only looked at have none
         report_shown["budget"] = describe_budget(budget)
@@ -190,13 +181,13 @@ def _show(memory: Memory, report: JsonObject) -> None:
     silent = report_shown.get("topics_without_messages")
     if isinstance(silent, list):
         report_shown["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    report_shown |= {name: rows for name, rows in [*report.items()][-len(lists) :] if rows}
+    report_shown |= {name: report[name] for name in [*report][-len(lists) :] if report[name]}
     for name, rows in report_shown.items():
         if isinstance(rows, list) and len(rows) > _MOST_ROWS:
             report_shown[name] = rows[:_MOST_ROWS]
             left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
     notes: JsonObject = {"notes": [*left_out]} if left_out else {}
-    print_reply(stdout_console(), report_shown | notes)
+    print_reply(report_shown | notes)
 
 
 def _object(value: JsonValue) -> JsonObject:
@@ -228,8 +219,9 @@ def storage_of(bags: Sequence[BagFile]) -> str:
     return ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags}))
 
 
-def _for_people(reply: JsonObject) -> JsonObject:
+def _for_people(value: JsonValue) -> JsonObject:
     """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
+    reply = _object(value)
     has_recorder = reply.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
@@ -314,10 +306,7 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
             "not_read": [row for row in rows if "start" not in row],
             "empty": [*empty],
         }
-        print_reply(
-            stdout_console(),
-            {title: rows for title, rows in lists.items() if rows},
-        )
+        print_reply({title: rows for title, rows in lists.items() if rows})
     return not rows
 
 
@@ -329,9 +318,7 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
     for path, bags in sorted(
         recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
     ):
-        inside = [file for file in left if file.startswith(f"{path}/")]
-        for file in inside:
-            del left[file]
+        inside = [left.pop(file) for file in [*left] if file.startswith(f"{path}/")]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
         whose = None if own_recordings is None else _OTHERS
         if Path(path).is_relative_to(root / MOMENTS_FOLDER):

@@ -186,7 +186,9 @@ def settings_to_look(
         bag_dir = path
         if path.is_file():
             bag_dir, recording = _folder_of(path, recording)
-    if bag_dir is not None and not _is_recorded_now(bag_dir):
+    heartbeat = None if bag_dir is None else read_heartbeat(bag_dir.absolute()).heartbeat
+    is_recorded_now = heartbeat is not None and heartbeat.is_live(WallClock().now())
+    if bag_dir is not None and not is_recorded_now:
         is_chosen = is_deployment_chosen(given)
         if is_chosen and paths and not any(word.partition("=")[0] in GROUPS for word in given):
             deployed, _ = load_for(None, given)
@@ -227,12 +229,6 @@ def _folder_of(file: Path, recording: str | None) -> tuple[Path, str | None]:
         raise InvalidArgumentsError(f"--recording is for a folder, and {file} is one bag")
     real = file.resolve()
     return real.parent, real.name
-
-
-def _is_recorded_now(bag_dir: Path) -> bool:
-    """Returns whether a recorder is at work there."""
-    heartbeat = read_heartbeat(bag_dir.absolute()).heartbeat
-    return heartbeat is not None and heartbeat.is_live(WallClock().now())
 
 
 def require_recorder(settings: Settings) -> None:

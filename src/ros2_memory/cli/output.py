@@ -119,9 +119,9 @@ def spinner(activity: str) -> AbstractContextManager[object]:
     return console.status(activity) if console.is_terminal else nullcontext()
 
 
-def print_reply(console: Console, value: JsonValue, now: float | None = None) -> None:
+def print_reply(value: JsonValue, now: float | None = None) -> None:
     """Prints any reply. The ages of times count from `now` (Unix s), or from the reply's own."""
-    value = with_level_names(value)
+    value, console = with_level_names(value), stdout_console()
     if isinstance(value, dict):
         stated = value.get("now")
         _print_object(console, value, stated if isinstance(stated, float) else now)
@@ -180,27 +180,20 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
 
     Where a row has a time in two columns, only the exact one is shown.
     """
-    names = "columns" if "columns" in value else "fields"
-    fields, rows, totals = value.get(names), value.get("rows"), value.get(_ALL)
+    shown = {**value}
+    fields, rows = shown.pop("columns", None) or shown.pop("fields", None), shown.pop("rows", None)
     if not isinstance(fields, list) or not isinstance(rows, list):
         return value
-    shown = {key: inner for key, inner in value.items() if key not in (names, "rows")}
-    if isinstance(totals, list):  # a row of its own, without its name
+    if isinstance(totals := shown.get(_ALL), list):  # a row of its own, without its name
         del shown[_ALL]
         rows = [*rows, [_ALL, *totals]]
     named = [
         dict(zip(map(str, fields), row, strict=False)) for row in rows if isinstance(row, list)
     ]
-    return shown | {
-        "rows": [
-            {
-                name: row.get(f"{name}_unix", cell)
-                for name, cell in row.items()
-                if not name.endswith("_unix")
-            }
-            for row in named
-        ]
-    }
+    for row in named:
+        for name in [name for name in row if name.endswith("_unix")]:
+            row[name.removesuffix("_unix")] = row.pop(name)
+    return shown | {"rows": [*named]}
 
 
 def _print_rows(console: Console, rows: Sequence[Mapping[str, JsonValue]]) -> None:
@@ -224,13 +217,13 @@ def _format_line(key: str, value: JsonValue, now: float | None) -> str:
     """Formats the value of a key; a time with its age."""
     if value is None or value == []:
         return "none"
-    if not isinstance(value, float) or not _is_time(value):
-        return _format_for_key(key, value)
-    age = 0.0 if now is None else now - value
+    text = _format_for_key(key, value)
+    if now is None or not isinstance(value, float) or not _is_time(value):
+        return text
+    age = now - value
     if abs(age) < _NO_AGE_BELOW_S:
-        return format_time(value)
-    described = f"{format_duration(age)} ago" if age > 0 else f"in {format_duration(-age)}"
-    return f"{format_time(value)} ({described})"
+        return text
+    return f"{text} ({f'{format_duration(age)} ago' if age > 0 else f'in {format_duration(-age)}'})"
 
 
 def _format_for_key(key: str, value: JsonValue) -> str:
@@ -391,16 +384,12 @@ def escape(text: str) -> str:
     )
 
 
-def progress_bar(console: Console | None = None) -> Progress:
-    """Returns a progress bar that is shown on a terminal only, and removed when it ends.
-
-    Args:
-        console: where it is shown; stderr unless given.
-    """
+def progress_bar() -> Progress:
+    """Returns a progress bar on stderr, shown on a terminal only, and removed when it ends."""
     # Imported here, since it takes a while, and few commands show one.
     from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
 
-    console = console or Console(stderr=True)
+    console = Console(stderr=True)
     return Progress(
         BarColumn(),
         TextColumn("{task.percentage:>3.0f}%"),

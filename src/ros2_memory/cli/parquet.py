@@ -12,7 +12,6 @@ header its stamp, `header_stamp` (UTC, to the nanosecond).
 from __future__ import annotations
 
 import json
-from collections import OrderedDict
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -109,24 +108,24 @@ class Dataset:
         Raises:
             InvalidArgumentsError: the partition of a message existed before.
         """
-        parts: OrderedDict[tuple[str, Ns], _PartFile] = OrderedDict()
+        parts: dict[tuple[str, Ns], _PartFile] = {}  # the one used last stands last
         written: dict[Path, Path] = {}  # by its final path, where each file lies meanwhile
         self._root.mkdir(parents=True, exist_ok=True)
         with TemporaryDirectory(dir=self._root, prefix=".") as temporary:
             for stored in messages:
                 key = stored.bag.recording.name, stored.time // _DAY_NS
-                if key not in parts:
+                part = parts.pop(key, None)
+                if part is None:
                     temporary_file = Path(temporary) / str(len(written))
                     written[self._new_file(*key, written)] = temporary_file
-                    parts[key] = _PartFile(temporary_file)
-                    if len(parts) > _MAX_OPEN_FILES:
-                        _, oldest = parts.popitem(last=False)
-                        oldest.close()
-                parts.move_to_end(key)
-                parts[key].rows.append(self._row(stored.record))
+                    part = _PartFile(temporary_file)
+                    if len(parts) == _MAX_OPEN_FILES:
+                        parts.pop(next(iter(parts))).close()
+                parts[key] = part
+                part.rows.append(self._row(stored.record))
                 self.rows += 1
-                if len(parts[key].rows) >= _GROUP_ROWS:
-                    parts[key].flush()
+                if len(part.rows) >= _GROUP_ROWS:
+                    part.flush()
             for part in parts.values():
                 part.close()
             for path, temporary_file in written.items():

@@ -135,9 +135,8 @@ class DrawnPath(NamedTuple):
 
 
 class Asked(NamedTuple):
-    """What all pictures are asked for: a memory, and a window in it."""
+    """What all pictures are asked for: a window in a memory."""
 
-    memory: Memory
     view: View
     window: TimeWindow
 
@@ -155,7 +154,7 @@ class Asked(NamedTuple):
 
     def recap(self) -> Recap:
         """Returns what happened."""
-        return recap(self.memory, Call(), TimeRange.over(self.window))
+        return recap(self.view.memory, Call(), TimeRange.over(self.window))
 
 
 @plot.command("path", epilog=epilog("plot"))
@@ -310,21 +309,19 @@ def _font_folder() -> str:
 
 def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> None:
     """Draws a path, coloured by time, with named places and standstills of the same frame."""
-    from matplotlib.collections import LineCollection  # noqa: PLC0415 - as above
+    from matplotlib import patches  # noqa: PLC0415 - as above
+    from matplotlib.collections import LineCollection  # noqa: PLC0415
 
-    for place in asked.memory.limits.places:
+    for place in asked.view.limits.places:
         if place.frame_id == path.frame:
             left, right, low, high = place.region.bounds
-            corners = [(left, low), (right, low), (right, high), (left, high)]
+            outline: patches.Patch = patches.Rectangle((left, low), right - left, high - low)
             if isinstance(place.region, Polygon):
-                corners = [*place.region.corners]
+                outline = patches.Polygon(place.region.corners)
             elif isinstance(place.region, Circle):
-                x, y, radius = place.region.x, place.region.y, place.region.radius_m
-                turns = np.linspace(0, math.tau, 60)
-                corners = [
-                    *zip(x + radius * np.cos(turns), y + radius * np.sin(turns), strict=True)
-                ]
-            axes.fill(*np.array(corners).T, facecolor="#f3f4f6", edgecolor=_GREY)
+                outline = patches.Circle((place.region.x, place.region.y), place.region.radius_m)
+            outline.set(facecolor="#f3f4f6", edgecolor=_GREY)
+            axes.add_patch(outline)
             middle = ((left + right) / 2, (low + high) / 2)
             axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
     points = np.column_stack([path.xs, path.ys])
@@ -335,9 +332,11 @@ def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> 
     axes.add_collection(LineCollection([*pieces[jumps]], colors=_GREY, linestyles="dotted"))
     axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
     axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
-    if stops := stops_on(path, happened):
-        xs, ys, lengths = np.array(stops).T
-        sizes = 30 + np.minimum(lengths, 3600) / 12
+    stops = [(stop.start, stop.end) for stop in happened.events if stop.kind == "stop" and stop.end]
+    if stops:
+        starts, ends = np.array(stops).T / NS_PER_S
+        xs, ys = (np.interp((starts + ends) / 2, path.times, axis) for axis in (path.xs, path.ys))
+        sizes = 30 + np.minimum(ends - starts, 3600) / 12
         axes.scatter(xs, ys, s=sizes, color="#f59e0b", alpha=0.55, linewidths=0, label="stood")
     axes.set_aspect("equal", adjustable="datalim")
     axes.set_xlabel(f"x (m, {path.frame})")
@@ -422,7 +421,7 @@ def opened(memory: Memory, window: TimeWindow) -> Asked:
             NoDataReason.OUTSIDE_RANGE,
             "nothing was recorded in this time: `ros2-memory info` shows what is recorded",
         )
-    return Asked(memory, view, within)
+    return Asked(view, within)
 
 
 def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
@@ -442,11 +441,11 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         topic = next(iter(receivers), None)
     if topic in receivers:
         return _path_by_fixes(asked, topic)
-    frames = [asked.memory.limits.map_frame, None] if frame is None else [frame]
+    frames = [asked.view.limits.map_frame, None] if frame is None else [frame]
     for wanted in frames:
         try:
             summary = trajectory_summary(
-                asked.memory,
+                asked.view.memory,
                 Call(),
                 TimeRange.over(asked.window),
                 topic=topic,
@@ -455,9 +454,8 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
             )
             break
         except NoDataError as error:
-            detail = error.detail.replace(GIVE_TOPIC, "give --topic").replace(
-                "; give topic", "; give --topic"
-            )
+            detail = error.detail.replace(GIVE_TOPIC, "give --topic")
+            detail = detail.replace("; give topic", "; give --topic")
             raise NoDataError(error.reason, detail, error.notes) from error
         except InvalidArgumentsError:
             if wanted == frames[-1]:
@@ -473,8 +471,8 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
     jumps = times[[vertex.jump for vertex in vertices]]
     if summary.trajectory.poses <= _MOST_WAYPOINTS and not summary.skipped:
         # Waypoints leave out what is within 5 cm of a line: a curve would have corners.
-        limits = replace(asked.memory.limits, pose_topic=summary.topic)
-        view = View(replace(asked.memory, limits=limits), Call())
+        limits = replace(asked.view.limits, pose_topic=summary.topic)
+        view = View(replace(asked.view.memory, limits=limits), Call())
         poses = RobotTracks(view, summary.frame_id).poses(asked.window)
         placed = np.isfinite(poses.x) & np.isfinite(poses.y)
         times, xs, ys = poses.times[placed], poses.x[placed], poses.y[placed]
@@ -482,18 +480,6 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {summary.topic} has a place")
     jumped = np.isin(times, jumps)
     return DrawnPath(summary.frame_id, times / NS_PER_S, xs, ys, jumped, line, summary.notes)
-
-
-def stops_on(path: DrawnPath, happened: Recap) -> list[tuple[float, float, float]]:
-    """Returns where the robot stood (x, y in m), by the path at that time; and how long (s)."""
-    stops = [
-        _unix((event.start, event.end))
-        for event in happened.events
-        if event.kind == "stop" and event.end is not None
-    ]
-    middles = [(start + end) / 2 for start, end in stops]
-    xs, ys = (np.interp(middles, path.times, axis).tolist() for axis in (path.xs, path.ys))
-    return [*zip(xs, ys, [end - start for start, end in stops], strict=True)]
 
 
 def _path_by_fixes(asked: Asked, topic: str) -> DrawnPath:
@@ -521,48 +507,50 @@ def signals_of(
         InvalidArgumentsError: there is no such field, or it holds no number.
         NoDataError: there is no message in this time, or none can be decoded.
     """
-    view, extractor = asked.view, asked.memory.extractor
-    total, picked = pick(view, topic, asked.window, _MOST_SAMPLES)
-    messages = [(stored, view.bags.decode(stored)) for stored in picked]
-    readable = [(stored, message) for stored, message in messages if message is not None]
+    view, extractor = asked.view, asked.view.memory.extractor
+    total, samples = pick(view, topic, asked.window, _MOST_SAMPLES)
+    picked = [*samples]
+    decoded = ((stored, view.bags.decode(stored)) for stored in picked)
+    readable = [(stored, message) for stored, message in decoded if message is not None]
     if not readable:
-        what = "can be decoded" if messages else "is in this time"
+        what = "can be decoded" if picked else "is in this time"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} {what}")
     first, message = readable[0]
-    type_name = first.record.channel.type
-    extractor.shown(message, type_name, fields)  # refuses fields that there are not
+    extractor.shown(message, first.type, fields)  # refuses fields that there are not
     notes = [*view.notes.sentences()]
     if not fields:
-        varying = _varying([extractor.exact(message, type_name) for _, message in readable])
+        varying = _varying([extractor.exact(message, first.type) for _, message in readable])
         fields = varying[:_MOST_SIGNALS]
-        if len(varying) > len(fields):
-            notes.append(f"not drawn: {listed(varying[_MOST_SIGNALS:])}; name them with --field")
+        if left_out := varying[_MOST_SIGNALS:]:
+            notes.append(f"not drawn: {listed(left_out)}; name them with --field")
     if not fields:
-        raise InvalidArgumentsError(f"{topic} ({type_name}) has no numeric field")
-    if total > len(messages):
-        notes.append(f"{len(messages)} of {total} messages are drawn, evenly spaced")
+        raise InvalidArgumentsError(f"{topic} ({first.type}) has no numeric field")
+    if total > len(picked):
+        notes.append(f"{len(picked)} of {total} messages are drawn, evenly spaced")
     times = np.array([stored.time for stored, _ in readable])
     signals: dict[str, tuple[Floats, Floats]] = {}
     for name in fields:
-        samples = [extractor.exact_at(message, stored.type, name) for stored, message in readable]
         values = [
-            float(value) if isinstance(value, bool | int | float) else math.nan for value in samples
+            _number(extractor.exact_at(message, stored.type, name)) for stored, message in readable
         ]
-        if all(map(math.isnan, values)):
+        if np.isnan(values).all():
             raise InvalidArgumentsError(f"{name} of {topic} holds no number")
         signals[name] = _with_breaks(times, values)
     return total, signals, notes
 
 
+def _number(value: JsonValue) -> float:
+    """Returns a number, or NaN where it is none."""
+    return float(value) if isinstance(value, bool | int | float) else math.nan
+
+
 def _varying(values: Sequence[JsonValue]) -> list[str]:
     """Returns the numeric fields that change; all of the first value where none does."""
-    first: dict[str, float] = {}
-    changing: set[str] = set()
+    found: dict[str, set[float]] = {}
     for name, inner in chain.from_iterable(map(leaves, values)):
-        number = float(inner) if isinstance(inner, bool | int | float) else math.nan
-        if not math.isnan(number) and first.setdefault(name, number) != number:
-            changing.add(name)
-    return [name for name in first if name in changing] or [*first]
+        if not math.isnan(number := _number(inner)):
+            found.setdefault(name, set()).add(number)
+    return [name for name, numbers in found.items() if len(numbers) > 1] or [*found]
 
 
 def _with_breaks(times: NDArray[np.int64], values: Sequence[float]) -> tuple[Floats, Floats]:
@@ -580,11 +568,8 @@ def event_rows(asked: Asked, happened: Recap) -> list[Row]:
     recorded = without([span], [*recording_gaps(asked.view, asked.window)])
     rows: list[Row] = [("recorded", [*map(_unix, recorded)], _RECORDED)]
     for kind, (name, color) in _ROWS.items():
-        stretches = [
-            _unix((event.start, _until(event))) for event in happened.events if event.kind == kind
-        ]
-        if stretches:
-            rows.append((name, stretches, color))
+        if events := [event for event in happened.events if event.kind == kind]:
+            rows.append((name, [_unix((event.start, _until(event))) for event in events], color))
     return rows
 
 
@@ -608,7 +593,7 @@ def topic_rows(asked: Asked) -> Iterator[Row]:
         topic: sum(totals.messages for totals in timeline.totals(topic).values())
         for topic in timeline.topics()
     }
-    joined = ns_from_unix(2 * asked.memory.limits.split_duration_s)
+    joined = ns_from_unix(2 * asked.view.limits.split_duration_s)
     for topic in sorted(sorted(messages, key=lambda topic: -messages[topic])[:_MOST_TOPICS]):
         extents = ((first, last) for _, first, last in timeline.extents(topic, asked.window))
         yield topic, [*map(_unix, united(extents, joined))], _TOPIC
@@ -616,12 +601,13 @@ def topic_rows(asked: Asked) -> Iterator[Row]:
 
 def _totals(happened: Recap) -> str:
     """Returns distance, speed and time of standing in a line, as far as they are known."""
-    parts: list[str] = []
-    if happened.distance_m is not None and happened.max_speed is not None:
-        parts = [f"{happened.distance_m:.1f} m driven", f"at most {happened.max_speed:.2f} m/s"]
+    parts = [f"{count} {name}" for name, count in happened.counts]
     if happened.stood is not None:
-        parts.append(f"stood {_lasted(0, happened.stood)}")
-    return ", ".join([*parts, *(f"{count} {name}" for name, count in happened.counts)])
+        parts.insert(0, f"stood {_lasted(0, happened.stood)}")
+    if happened.distance_m is not None and happened.max_speed is not None:
+        driven = f"{happened.distance_m:.1f} m driven"
+        parts.insert(0, f"{driven}, at most {happened.max_speed:.2f} m/s")
+    return ", ".join(parts)
 
 
 def _event_lines(happened: Recap) -> Iterator[str]:

@@ -1,15 +1,20 @@
 """`ros2-memory up`: proposes what to record on a robot, and records and serves it.
 
-The recorder and the server are its children; it shows what comes in.
+It finds out what is offered by two short real recordings. The recorder and the server are its
+children; it shows what comes in.
 """
 
 import os
+import re
 import signal
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Final, NamedTuple
 
 import typer
@@ -29,6 +34,8 @@ from ros2_memory.cli.output import (
     stdout_console,
 )
 from ros2_memory.cli.proposal import (
+    INDEX_BYTES,
+    MESSAGE_BYTES,
     Choice,
     Disk,
     Offered,
@@ -38,13 +45,14 @@ from ros2_memory.cli.proposal import (
     propose,
     topics_yaml,
 )
-from ros2_memory.cli.survey import LOOK_S, Survey, survey
 from ros2_memory.config import NullRecorderNode, config_dir, is_deployment_chosen
 from ros2_memory.config_sources import given_variables, quoted
 from ros2_memory.core.errors import ConfigError, RecorderError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import WallClock, unix_from_ns
+from ros2_memory.core.timebase import Ns, WallClock, unix_from_ns
 from ros2_memory.recorder.process.child import Child, Patience, end_all
+from ros2_memory.recorder.process.command import record_argv, storage_config
 from ros2_memory.recorder.process.installation import (
     Installation,
     advice_on_rmw,
@@ -54,9 +62,12 @@ from ros2_memory.recorder.process.installation import (
     rmw_of,
     setup_files_here,
 )
-from ros2_memory.recorder.process.topics import load_topics
+from ros2_memory.recorder.process.output import LineKind, parse_line
+from ros2_memory.recorder.process.topics import TopicSelection, load_topics
+from ros2_memory.recorder.reception.reception import QueuePlan, qos_overrides
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.policy import GB
+from ros2_memory.storage.base import BagReader
 
 SECONDS: Final = 5.0
 """How long topics are measured."""
@@ -69,7 +80,34 @@ _KEEP_FOR_A_YEAR: Final = (
     "Keep for a year where the robot drove, and what and whom it saw, after the recordings are "
     "deleted?"
 )
+LOOK_S: Final = 10.0
+"""Topics are waited for so long; discovery takes 0.4 to 3 s on one machine."""
+QUIET_S: Final = 2.0
+"""No further topic is expected when none has appeared for so long."""
+MAX_BYTES: Final = 100 * 2**20
+LEAST_RATIO: Final = 0.05
+CACHE_BYTES: Final = 16 * 2**20
+_POLL_S: Final = 0.05
+_EVERYTHING: Final = TopicSelection((*("/*" * n for n in range(1, 12)), "/*/_action/status"))
+_OWN: Final = re.compile(r"^/(rosout|parameter_events)$|^/events/|^/rosbag2_|^/ros2_memory_up")
+"""Topics that every recorder offers itself."""
 _LOGGING: Final = ("logging.level=warning", "logging.format=pretty")
+
+
+class Survey(NamedTuple):
+    """What was found.
+
+    Attributes:
+        topics: those that others offer, in the order of their names.
+        unknown_types: names of topics that cannot be recorded, for want of their definition.
+        ratio: compressed bytes of a byte, over all that was recorded.
+        fixed_bytes: what a file without a message has.
+    """
+
+    topics: Sequence[Offered]
+    unknown_types: Sequence[str]
+    ratio: float
+    fixed_bytes: int
 
 
 class _Robot(NamedTuple):
@@ -115,7 +153,7 @@ def up(
     robot = _find_robot(settings.recorder.setup_files, bags, list_file, words)
     print_line(f"{robot.ros.ros2}, {robot.where}, bags in {robot.bag_dir}")
     with spinner("looking which topics there are, and measuring them"):
-        measured = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes, SECONDS)
+        measured = survey(robot.ros, build_reader(settings), settings.recorder.chunk_bytes)
     disk = Disk(
         ratio=measured.ratio,
         fixed_bytes=measured.fixed_bytes,
@@ -377,3 +415,111 @@ def _line_of(beat: Heartbeat) -> tuple[str, str]:
         line += f", silent: {listed(beat.silent)}"
     line += f", {format_size(beat.bytes_written)}{f'; {why}' if why else ''}"
     return f"{beat.state} {heard}", line
+
+
+def survey(ros: Installation, reader: BagReader, chunk_bytes: int) -> Survey:
+    """Finds out which topics there are, and how much comes on each, by two short real recordings.
+
+    The first is paused: it lists all topics with their types, and writes no message. The second
+    records those that are not left out by their type, for some seconds and a bounded number of
+    bytes. Must be called from the main thread, as every child is.
+
+    Raises:
+        BagError: what was recorded cannot be read.
+        RecorderError: `ros2 bag record` fails; the sentence has its last words.
+    """
+    with TemporaryDirectory(prefix="ros2-memory-up-") as name:
+        folder = Path(name)
+        (folder / "qos.yaml").write_text(qos_overrides({}, QueuePlan({}), latched=["/tf_static"]))
+        (folder / "storage.yaml").write_text(storage_config(chunk_bytes))
+        unknown, empty = _record(
+            ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",)
+        )
+        offered = {
+            channel.topic: Offered(
+                channel.topic, re.sub(r"[^\w/]", "?", channel.type), channel.latched
+            )
+            for channel in reader.channels(empty)
+            if not _OWN.match(channel.topic)
+        }
+        # Neither pixels nor what people say is recorded even now.
+        light = tuple(topic.topic for topic in chosen(judge(offered.values()), Choice.RECORD))
+        fixed, ratio = empty.stat().st_size, 1.0
+        if light:
+            _, bag = _record(ros, folder / "measure", TopicSelection(light), SECONDS, light)
+            ratio = _measure(reader, bag, offered, fixed)
+    return Survey([offered[topic] for topic in sorted(offered)], sorted(unknown), ratio, fixed)
+
+
+def _measure(reader: BagReader, bag: Path, offered: dict[str, Offered], fixed: int) -> float:
+    """Adds to the topics how they came in a bag; returns by how much the bag is compressed."""
+    sizes, times = defaultdict[str, list[int]](list), defaultdict[str, list[Ns]](list)
+    for batch in reader.batches(bag, offered, TimeWindow.everything()):
+        sizes[batch.channel.topic] += batch.sizes.tolist()
+        times[batch.channel.topic] += batch.log_times.tolist()
+    end = max(map(max, times.values()), default=0)
+    for topic, payloads in sizes.items():
+        # A topic is heard from its first message on: others may have been subscribed to before.
+        span_s = unix_from_ns(end - min(times[topic]))
+        count, total = len(payloads), sum(payloads)
+        hz = (count - 1) / span_s if count > 1 and span_s else 1 / max(span_s, 1.0)
+        offered[topic] = replace(offered[topic], messages=count, hz=hz, payload_bytes=total / count)
+    count = sum(map(len, sizes.values()))
+    payload = sum(map(sum, sizes.values())) + count * MESSAGE_BYTES
+    stored = bag.stat().st_size - fixed - INDEX_BYTES * count
+    return min(max(stored / payload, LEAST_RATIO), 1.0) if payload else 1.0
+
+
+def _record(
+    ros: Installation,
+    directory: Path,
+    topics: TopicSelection,
+    quiet_s: float,
+    expected: Collection[str] = (),
+    *,
+    options: Sequence[str] = (),
+) -> tuple[set[str], Path]:
+    """Records until all that is expected (else anything) came, and nothing new for `quiet_s`.
+
+    Returns the topics of unknown types, and the file.
+    """
+    argv = record_argv(
+        ros2=ros.ros2,
+        directory=directory,
+        topics=topics,
+        split_duration_s=3600,
+        qos_file=directory.with_name("qos.yaml"),
+        storage_file=directory.with_name("storage.yaml"),
+        node_name="ros2_memory_up",
+        cache_bytes=CACHE_BYTES,
+        known_options=ros.options,
+    )
+    child = Child.start([*argv, *options], {**ros.env, "ROS_LOG_DIR": str(directory.parent)})
+    heard: dict[LineKind, set[str]] = {LineKind.SUBSCRIBED: set(), LineKind.UNKNOWN_TYPE: set()}
+    lines: list[str] = []
+    began = changed = time.monotonic()
+    try:
+        while child.exit_status() is None and time.monotonic() < began + LOOK_S + quiet_s:
+            for line in map(parse_line, child.take_lines()):
+                lines.append(line.text)
+                if line.topic and line.kind in heard and not _OWN.match(line.topic):
+                    heard[line.kind].add(line.topic)
+                    changed = time.monotonic()
+            subscribed = heard[LineKind.SUBSCRIBED]
+            has_all = subscribed and subscribed.issuperset(expected)
+            if has_all and time.monotonic() > changed + quiet_s:
+                break
+            if sum(file.stat().st_size for file in directory.glob("*")) > MAX_BYTES:
+                break
+            time.sleep(_POLL_S)
+        failed = child.exit_status()
+    finally:
+        end_all([child])
+    file = next(directory.glob("*.mcap"), None)
+    if failed is not None or file is None:
+        words = "; ".join([*lines, *child.take_lines()][-3:])
+        raise RecorderError(
+            f"ros2 bag record ended by itself (status {failed}): {words}; `ros2-memory doctor` "
+            "checks the installation"
+        )
+    return heard[LineKind.UNKNOWN_TYPE], file

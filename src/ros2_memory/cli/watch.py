@@ -77,11 +77,6 @@ class TopicRate:
             return "fast"
         return AS_USUAL
 
-    def __str__(self) -> str:
-        """Returns the assessment with its rates."""
-        usual = "" if self.usual is None else f", usually {self.usual:.3g}"
-        return f"{self.assessment} ({self.rate:.3g} Hz{usual})"
-
 
 @dataclass(frozen=True, slots=True)
 class Observation:
@@ -229,7 +224,10 @@ def _line(seen: Observation) -> str:
         usual = len(seen.rates) - len(unusual)
         parts = [
             f"{counted(usual, 'topic')} at {'its' if usual == 1 else 'their'} usual rate",
-            *(f"{escape(rate.topic)} {rate}" for rate in unusual),
+            *(
+                f"{escape(odd.topic)} {odd.assessment} ({odd.rate:.3g} Hz, usually {odd.usual:.3g})"
+                for odd in unusual
+            ),
         ]
     head = seen.head("; ")
     return f"{format_time(unix_from_ns(seen.now))} {'; '.join([head, *parts, *seen.problems])}"

@@ -1,4 +1,8 @@
-"""Serializes the simulated robot's state as ROS 2 messages, and has the types' definitions.
+"""What the simulated robot publishes: its topics, when each has a message, and what is in it.
+
+Message k of a stream is published, and stamped, at `t0 + k * period`, and reaches the recorder a
+fraction of a millisecond later, its own fraction for each message. Both times are closed forms, so
+the message that answers a question is known without looking into a bag.
 
 Types are Jazzy's standard ones and `ros2_vision_interfaces`, whose definitions are below.
 """
@@ -6,25 +10,128 @@ Types are Jazzy's standard ones and `ros2_vision_interfaces`, whose definitions 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cache
+from heapq import merge
+from itertools import count
 from typing import TYPE_CHECKING, Final, TypeAlias, cast
 
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.demo import published_topics as topics
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, NS_PER_US, Ns
 from ros2_memory.demo import robot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     from rosbags.interfaces.typing import FieldDesc
     from rosbags.typesys.store import Typestore
 
-    from ros2_memory.demo.published_topics import Message
     from ros2_memory.demo.robot import Planar, SimulatedThing
+
+ODOM: Final = "/odom"
+TF: Final = "/tf"
+TF_STATIC: Final = "/tf_static"
+CMD_VEL: Final = "/cmd_vel"
+SCAN: Final = "/scan"
+BATTERY: Final = "/battery_state"
+PATH_CLEAR: Final = "/path_clear"
+SCENE_OBJECTS: Final = "/vision/scene/scene_objects"
+SCENE_DESCRIPTION: Final = "/vision/scene/scene_description"
+FOUND: Final = "/vision/find_object/detections_meta"
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One topic: its type and the time between two messages; a latched one is published once."""
+
+    topic: str
+    type: str
+    period: Ns
+    latched: bool = False
+    reliable: bool = True
+
+
+STREAMS: Final = (
+    Stream(TF_STATIC, "tf2_msgs/msg/TFMessage", NS_PER_S, latched=True),
+    Stream(ODOM, "nav_msgs/msg/Odometry", 50 * NS_PER_MS),
+    Stream(TF, "tf2_msgs/msg/TFMessage", 50 * NS_PER_MS),
+    Stream(CMD_VEL, "geometry_msgs/msg/Twist", 100 * NS_PER_MS),
+    Stream(SCAN, "sensor_msgs/msg/LaserScan", 200 * NS_PER_MS, reliable=False),
+    Stream(PATH_CLEAR, "std_msgs/msg/Bool", 500 * NS_PER_MS),
+    Stream(SCENE_OBJECTS, "ros2_vision_interfaces/msg/VisionDetectionArray", 500 * NS_PER_MS),
+    Stream(FOUND, "ros2_vision_interfaces/msg/VisionDetectionArray", NS_PER_S),
+    Stream(SCENE_DESCRIPTION, "ros2_vision_interfaces/msg/StampedString", NS_PER_S),
+    Stream(BATTERY, "sensor_msgs/msg/BatteryState", NS_PER_S),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """Message `k` of a stream; `t` is the robot's time (s since its start) that it describes."""
+
+    stream: Stream
+    k: int
+    log_time: Ns
+    publish_time: Ns
+    t: float
+
+
+@dataclass(frozen=True, slots=True)
+class MessageSchedule:
+    """The messages of a robot that started at `t0`, as a recorder receives them from `start` on.
+
+    A latched message was published at `t0` and reaches the recorder at `start`.
+    """
+
+    t0: Ns
+    start: Ns
+
+    def message(self, stream: Stream, k: int) -> Message:
+        """Returns message `k` of the stream."""
+        published = self.t0 + k * stream.period
+        heard = max(published, self.start) + _delay(stream, k)
+        return Message(stream, k, heard, published, (published - self.t0) / NS_PER_S)
+
+    def messages(self, stream: Stream) -> Iterator[Message]:
+        """Yields the stream's messages from the start on, without end; one if it is latched."""
+        for k in count(self._first(stream)):
+            yield self.message(stream, k)
+            if stream.latched:
+                break
+
+    def everything(self) -> Iterator[Message]:
+        """Yields all streams' messages in the order in which they are received, without end."""
+        return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
+
+    def newest(self, stream: Stream, at: Ns) -> Message | None:
+        """Returns the newest message with a log time at or before `at`; None before the first."""
+        return next(self.newest_first(stream, at), None)
+
+    def newest_first(self, stream: Stream, at: Ns) -> Iterator[Message]:
+        """Yields the stream's messages with a log time at or before `at`, newest first."""
+        first = self._first(stream)
+        last = first if stream.latched else (at - self.t0) // stream.period
+        for k in range(max(first, last), first - 1, -1):
+            message = self.message(stream, k)
+            if message.log_time <= at:
+                yield message
+
+    def count(self, stream: Stream, at: Ns) -> int:
+        """Returns how many messages the recorder has received by `at`."""
+        newest = self.newest(stream, at)
+        return 0 if newest is None else newest.k - self._first(stream) + 1
+
+    def _first(self, stream: Stream) -> int:
+        return 0 if stream.latched else -((self.t0 - self.start) // stream.period)
+
+
+def _delay(stream: Stream, k: int) -> Ns:
+    """Returns the time from publication to the recorder: 0.06 to 0.46 ms, in a fixed pattern."""
+    return (60 + 19 * STREAMS.index(stream) + (k * 7919) % 211) * NS_PER_US
+
 
 VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
@@ -36,8 +143,7 @@ VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
 _FOCAL_PX: Final = 320.0
-_PICTURE_PX: Final = (640, 480)
-_CENTRE_PX: Final = (320.0, 240.0)
+_CENTRE_PX: Final = np.array([320.0, 240.0])
 _THING_M: Final = 0.15
 
 Body: TypeAlias = "dict[str, object]"
@@ -47,7 +153,8 @@ Body: TypeAlias = "dict[str, object]"
 def payload(message: Message) -> bytes:
     """Returns the message in CDR, as it is published."""
     name = message.stream.type
-    return bytes(_typestore().serialize_cdr(_ros_message(name, _body(message)), name))
+    body = _BODIES[message.stream.topic](message)
+    return bytes(_typestore().serialize_cdr(_ros_message(name, body), name))
 
 
 @cache
@@ -97,52 +204,6 @@ def _field(form: FieldDesc, value: object) -> object:
     return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
 
 
-def _body(message: Message) -> Body:  # noqa: C901 - a case for each topic
-    """Returns what the robot publishes in a message."""
-    t = message.t
-    body: Body = {}
-    match message.stream.topic:
-        case topics.CMD_VEL:
-            body = _twist(t)
-        case topics.PATH_CLEAR:
-            body = {"data": robot.path_clear(t)}
-        case topics.TF:
-            body = {"transforms": [_transform(message, "odom", "base_link", robot.pose(t))]}
-        case topics.TF_STATIC:
-            fixed = [_transform(message, "map", "odom", robot.MAP_TO_ODOM)]
-            for child, (x, y, z) in (("camera", robot.CAMERA), ("laser", robot.LASER)):
-                fixed.append(_transform(message, "base_link", child, robot.Planar(x, y, 0.0), z))
-            body = {"transforms": fixed}
-        case topics.ODOM:
-            at = robot.pose(t)
-            pose = {"position": _xyz(at.x, at.y), "orientation": _rotation(at.yaw)}
-            moving = {"pose": {"pose": pose}, "twist": {"twist": _twist(t)}}
-            body = {**_headed(message, "odom"), "child_frame_id": "base_link", **moving}
-        case topics.SCAN:
-            body = {
-                **_headed(message, "laser"),
-                "angle_min": robot.SCAN_START,
-                "angle_max": robot.SCAN_START + (robot.SCAN_BEAMS - 1) * robot.SCAN_STEP,
-                "angle_increment": robot.SCAN_STEP,
-                "scan_time": 0.2,
-                "range_min": 0.05,
-                "range_max": 20.0,
-                "ranges": robot.scan(t),
-            }
-        case topics.BATTERY:
-            unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
-            measured = {"voltage": 25.2, "percentage": robot.battery(t), "present": True}
-            body = {**_headed(message, "base_link"), **dict.fromkeys(unknown, math.nan), **measured}
-        case topics.SCENE_DESCRIPTION:
-            body = {**_headed(message, "camera"), "data": description(t)}
-        case topics.SCENE_OBJECTS:
-            body = _detections(message, "scene", robot.seen(t))
-        case topics.FOUND:
-            wanted = [thing for thing in robot.seen(t) if thing.label == "scissors"]
-            body = _detections(message, "find_object", wanted)
-    return body
-
-
 def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> Body:
     detections = [
         {
@@ -170,8 +231,8 @@ def _rotation(yaw: float) -> Body:
     return {"z": math.sin(yaw / 2), "w": math.cos(yaw / 2)}
 
 
-def _twist(t: float) -> Body:
-    forward, turning = robot.twist(t)
+def _twist(message: Message) -> Body:
+    forward, turning = robot.twist(message.t)
     return {"linear": {"x": forward}, "angular": {"z": turning}}
 
 
@@ -182,13 +243,77 @@ def _transform(message: Message, parent: str, child: str, at: Planar, z: float =
 
 def _bounding_box(thing: SimulatedThing) -> list[int]:
     """Returns the pixels (left, top, right, bottom) in a pinhole camera, clipped to the image."""
-    depth = max(thing.point[0] - robot.CAMERA[0], _THING_M)
-    across = _CENTRE_PX[0] - _FOCAL_PX * thing.point[1] / depth
-    down = _CENTRE_PX[1] - _FOCAL_PX * (thing.point[2] - robot.CAMERA[2]) / depth
+    ahead, left, up = np.subtract(thing.point, robot.CAMERA)
+    depth = max(ahead, _THING_M)
+    middle = _CENTRE_PX - _FOCAL_PX * np.array([left, up]) / depth
     half = _FOCAL_PX * _THING_M / depth
-    corners = ((across - half, down - half), (across + half, down + half))
-    return [
-        min(max(round(edge), 0), size)
-        for corner in corners
-        for edge, size in zip(corner, _PICTURE_PX, strict=True)
-    ]
+    corners = np.clip([middle - half, middle + half], 0, 2 * _CENTRE_PX)
+    return [round(edge) for edge in corners.flat]
+
+
+def _fixed(message: Message) -> Body:
+    transforms = [_transform(message, "map", "odom", robot.MAP_TO_ODOM)]
+    for child, (x, y, z) in (("camera", robot.CAMERA), ("laser", robot.LASER)):
+        transforms.append(_transform(message, "base_link", child, robot.Planar(x, y, 0.0), z))
+    return {"transforms": transforms}
+
+
+def _moving(message: Message) -> Body:
+    return {"transforms": [_transform(message, "odom", "base_link", robot.pose(message.t))]}
+
+
+def _odometry(message: Message) -> Body:
+    x, y, yaw = robot.pose(message.t)
+    return {
+        **_headed(message, "odom"),
+        "child_frame_id": "base_link",
+        "pose": {"pose": {"position": _xyz(x, y), "orientation": _rotation(yaw)}},
+        "twist": {"twist": _twist(message)},
+    }
+
+
+def _scan(message: Message) -> Body:
+    return {
+        **_headed(message, "laser"),
+        "angle_min": robot.SCAN_START,
+        "angle_max": robot.SCAN_START + (robot.SCAN_BEAMS - 1) * robot.SCAN_STEP,
+        "angle_increment": robot.SCAN_STEP,
+        "scan_time": 0.2,
+        "range_min": 0.05,
+        "range_max": 20.0,
+        "ranges": robot.scan(message.t),
+    }
+
+
+def _battery(message: Message) -> Body:
+    unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
+    return {
+        **_headed(message, "base_link"),
+        **dict.fromkeys(unknown, math.nan),
+        "voltage": 25.2,
+        "percentage": robot.battery(message.t),
+        "present": True,
+    }
+
+
+def _found(message: Message) -> Body:
+    wanted = [thing for thing in robot.seen(message.t) if thing.label == "scissors"]
+    return _detections(message, "find_object", wanted)
+
+
+_BODIES: Final[Mapping[str, Callable[[Message], Body]]] = {
+    TF_STATIC: _fixed,
+    ODOM: _odometry,
+    TF: _moving,
+    CMD_VEL: _twist,
+    SCAN: _scan,
+    PATH_CLEAR: lambda message: {"data": robot.path_clear(message.t)},
+    SCENE_OBJECTS: lambda message: _detections(message, "scene", robot.seen(message.t)),
+    FOUND: _found,
+    SCENE_DESCRIPTION: lambda message: {
+        **_headed(message, "camera"),
+        "data": description(message.t),
+    },
+    BATTERY: _battery,
+}
+"""What the robot publishes in a message of each topic."""

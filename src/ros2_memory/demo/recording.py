@@ -19,8 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.core.timebase import Clock, Ns, WallClock, ns_from_unix, unix_from_ns
-from ros2_memory.demo.messages import definition, payload
-from ros2_memory.demo.published_topics import STREAMS, Message, MessageSchedule, Stream
+from ros2_memory.demo.messages import STREAMS, Message, MessageSchedule, Stream, definition, payload
 
 if TYPE_CHECKING:
     from pathlib import Path

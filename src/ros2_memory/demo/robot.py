@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -38,14 +37,9 @@ _NORTH: Final = 4.0
 _WALLS: Final = np.array(
     [
         # x0, y0, x1, y1
-        (0.0, 0.0, _EAST, 0.0),
-        (_EAST, 0.0, _EAST, _NORTH),
-        (_EAST, _NORTH, 0.0, _NORTH),
-        (0.0, _NORTH, 0.0, 0.0),
-        (_HALL_WEST, 0.0, _HALL_WEST, 1.5),
-        (_HALL_WEST, 2.5, _HALL_WEST, _NORTH),
-        (_HALL_EAST, 0.0, _HALL_EAST, 1.5),
-        (_HALL_EAST, 2.5, _HALL_EAST, _NORTH),
+        *((0.0, y, _EAST, y) for y in (0.0, _NORTH)),
+        *((x, 0.0, x, _NORTH) for x in (0.0, _EAST)),
+        *((x, *ys) for x in (_HALL_WEST, _HALL_EAST) for ys in ((0.0, x, 1.5), (2.5, x, _NORTH))),
     ]
 )
 
@@ -75,9 +69,7 @@ ROOMS: Final[Mapping[str, tuple[float, float, float, float]]] = {
 
 def room_at(x: float) -> str:
     """Returns the name of the room at `x` (the rooms lie in a row from west to east)."""
-    if x < _HALL_WEST:
-        return "living room"
-    return "hall" if x < _HALL_EAST else "kitchen"
+    return next((name for name, (_, end, *_) in ROOMS.items() if x < end), "kitchen")
 
 
 def wall_distances(x: float, y: float, bearings: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -121,12 +113,10 @@ class Planar(NamedTuple):
 
     def inverse(self) -> Planar:
         """Returns the pose of the origin relative to this one."""
-        cos, sin = math.cos(self.yaw), math.sin(self.yaw)
-        return Planar(-cos * self.x - sin * self.y, sin * self.x - cos * self.y, wrapped(-self.yaw))
+        return Planar(0.0, 0.0, -self.yaw).then(Planar(-self.x, -self.y, 0.0))
 
 
-@dataclass(frozen=True, slots=True)
-class DriveLeg:
+class DriveLeg(NamedTuple):
     """A motion from rest to rest: `length` (m, negative: backwards) while turning by `turn` (rad).
 
     Without a length it turns on the spot, without a turn it goes straight, without both it waits.
@@ -193,8 +183,8 @@ _DRIVEN: Final = tuple(accumulate((abs(leg.length) for leg in LAP), initial=0.0)
 SCAN_BEAMS: Final = 360
 SCAN_START: Final = -math.pi
 SCAN_STEP: Final = 2.0 * math.pi / SCAN_BEAMS
-_BEAMS: Final = np.array([SCAN_START + beam * SCAN_STEP for beam in range(SCAN_BEAMS)])
-_AHEAD: Final = np.array([beam * SCAN_STEP for beam in range(-15, 16)])
+_BEAMS: Final = SCAN_START + np.arange(SCAN_BEAMS, dtype=np.float64) * SCAN_STEP
+_AHEAD: Final = np.arange(-15, 16, dtype=np.float64) * SCAN_STEP
 CLEAR_M: Final = 1.0
 SIGHT_M: Final = 3.0
 SIGHT_HALF_ANGLE: Final = math.radians(40.0)
@@ -232,19 +222,17 @@ def place(t: float) -> str:
 
 def seen(t: float) -> tuple[SimulatedThing, ...]:
     """Returns the objects in the camera's view, nearest first: in range, and behind no wall."""
-    base = pose_in_map(t)
-    camera = base.then(Planar(CAMERA[0], CAMERA[1], 0.0))
-    to_base = base.inverse()
+    ahead, aside, _ = CAMERA
+    camera = pose_in_map(t).then(Planar(ahead, aside, 0.0))
     things: list[SimulatedThing] = []
     for label, (x, y, z) in THINGS.items():
-        bearing = math.atan2(y - camera.y, x - camera.x)
-        distance = math.hypot(x - camera.x, y - camera.y)
-        if distance > SIGHT_M or abs(wrapped(bearing - camera.yaw)) > SIGHT_HALF_ANGLE:
+        x, y, _ = camera.inverse().then(Planar(x, y, 0.0))  # noqa: PLW2901
+        bearing, distance = math.atan2(y, x), math.hypot(x, y)
+        if distance > SIGHT_M or abs(bearing) > SIGHT_HALF_ANGLE:
             continue
-        if wall_distances(camera.x, camera.y, np.array([bearing]))[0] < distance:
-            continue
-        point = to_base.then(Planar(x, y, 0.0))
-        things.append(SimulatedThing(label, round(0.97 - 0.1 * distance, 2), (point.x, point.y, z)))
+        if wall_distances(camera.x, camera.y, np.array([camera.yaw + bearing]))[0] >= distance:
+            score = round(0.97 - 0.1 * distance, 2)
+            things.append(SimulatedThing(label, score, (x + ahead, y + aside, z)))
     return tuple(sorted(things, key=lambda thing: -thing.score))
 
 

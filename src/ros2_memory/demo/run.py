@@ -14,6 +14,7 @@ import sys
 import textwrap
 import time
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -26,9 +27,8 @@ from mcp.types import TextContent
 
 from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.timebase import NS_PER_S, WallClock, ns_from_unix
-from ros2_memory.demo.judges import CallContext
-from ros2_memory.demo.published_topics import MessageSchedule
-from ros2_memory.demo.questions import QUESTIONS, Exchange, Question, judge_reply
+from ros2_memory.demo.messages import MessageSchedule
+from ros2_memory.demo.questions import QUESTIONS, CallContext, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S, ROOMS
 from ros2_memory.recorder.process.child import LAUNCHER
@@ -53,21 +53,16 @@ def format_exchange(number: int, exchange: Exchange) -> str:
     arguments = ", ".join(
         f"{name}={json.dumps(value)}" for name, value in question.arguments.items()
     )
-    call = textwrap.wrap(
-        f"{question.tool}({arguments})",
-        WIDTH,
-        initial_indent=_INDENT,
-        subsequent_indent=_INDENT * 2,
-        break_on_hyphens=False,
+    filled = partial(textwrap.fill, width=WIDTH, break_on_hyphens=False)
+    call = filled(
+        f"{question.tool}({arguments})", initial_indent=_INDENT, subsequent_indent=_INDENT * 2
     )
-    answer = textwrap.fill(
+    answer = filled(
         f"{mark}{exchange.sentence}",
-        WIDTH,
         initial_indent=f"{_INDENT}=> ",
         subsequent_indent=f"{_INDENT}   ",
-        break_on_hyphens=False,
     )
-    return "\n".join([f"{number:>2}. {question.words}", *call, answer, *_reply(exchange.reply), ""])
+    return "\n".join([f"{number:>2}. {question.words}", call, answer, *_reply(exchange.reply), ""])
 
 
 def exchange_as_json(number: int, exchange: Exchange) -> str:
@@ -148,7 +143,7 @@ def free_port(wanted: int) -> int:
 
 
 def server_environment(
-    environment: Mapping[str, str], bag_dir: Path, port: int, split_duration_s: float, cache: str
+    environment: Mapping[str, str], bag_dir: Path, port: int, cache: str
 ) -> dict[str, str]:
     """Returns the environment of a server of `bag_dir`, without the caller's settings."""
     kept = {name: value for name, value in environment.items() if not name.startswith(_OURS)}
@@ -160,7 +155,7 @@ def server_environment(
         "XDG_CACHE_HOME": cache,
         "MEMORY_CONFIG_OVERRIDES": (
             f"recorder=none storage=mcap reader.index_refresh_s=1 "
-            f"recording.split_duration_s={split_duration_s:g} "
+            f"recording.split_duration_s={SPLIT_DURATION_S:g} "
             f"{shlex.quote(f'data.places_file={bag_dir / PLACES_NAME}')}"
         ),
     }
@@ -168,12 +163,7 @@ def server_environment(
 
 @contextmanager
 def running_server(
-    bag_dir: Path,
-    port: int,
-    say: Callable[[str], object],
-    *,
-    split_duration_s: float,
-    verbose: bool = False,
+    bag_dir: Path, port: int, say: Callable[[str], object], *, verbose: bool = False
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Yields a server that answers, and ends it after the block; says what it waits for.
 
@@ -192,19 +182,17 @@ def running_server(
     }
     (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
-        environment = server_environment(os.environ, bag_dir, port, split_duration_s, cache)
+        # It ends with this program, also where that is killed.
+        launcher = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())]
         with log_path.open("wb") as log:
+            output = None if verbose else log
             process = subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
-                [
-                    # It ends with this program, also where that is killed.
-                    *(sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())),
-                    *(sys.executable, "-m", "ros2_memory.server"),
-                ],
+                [*launcher, sys.executable, "-m", "ros2_memory.server"],
                 stdin=subprocess.DEVNULL,
-                stdout=None if verbose else log,
-                stderr=None if verbose else log,
+                stdout=output,
+                stderr=output,
                 cwd=bag_dir,
-                env=environment,
+                env=server_environment(os.environ, bag_dir, port, cache),
                 # A Ctrl-C reaches the whole process group of a terminal; the order in which things
                 # end is ours to choose.
                 process_group=0,
@@ -224,23 +212,22 @@ def running_server(
 def _wait_until_up(
     process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], object]
 ) -> None:
-    begun = time.monotonic()
-    has_said = False
+    begun, said = time.monotonic(), False
     while (answering := _answering(port)) != process.pid:
         if answering is not None:
             raise ConfigError(f"port {port} on {HOST} is in use by another server; {_ANOTHER_PORT}")
-        code = process.poll()
-        if code is not None:
-            raise EpisodicError(f"the server ended with exit code {code}{_last_words(log_path)}")
-        waited_s = time.monotonic() - begun
-        if waited_s > _SAID_AFTER_S and not has_said:
-            has_said = True
+        waited_s, failed = time.monotonic() - begun, ""
+        if (code := process.poll()) is not None:
+            failed = f"the server ended with exit code {code}"
+        elif waited_s > _UP_WITHIN_S:
+            failed = f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
+        if failed:
+            log = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
+            words = [": its last words are", *log] if log else []
+            raise EpisodicError("\n  ".join([failed, *words]))
+        if waited_s > _SAID_AFTER_S and not said:
+            said = True
             say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer on port {port}")
-        if waited_s > _UP_WITHIN_S:
-            raise EpisodicError(
-                f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
-                f"{_last_words(log_path)}"
-            )
         time.sleep(0.05)
 
 
@@ -260,11 +247,6 @@ def _answering(port: int) -> int | None:
         return 0
     finally:
         connection.close()
-
-
-def _last_words(log_path: Path) -> str:
-    lines = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
-    return "".join(f"\n  {line}" for line in (": its last words are", *lines)) if lines else ""
 
 
 SPLIT_DURATION_S: Final = 5.0
@@ -317,16 +299,18 @@ def run_demo(
             f"--duration {duration_s:g} is not between {SHORTEST_S:g} and {LONGEST_S:g} s; "
             "the shortest is a lap of the robot and two bag files"
         )
-    if bag_dir and bag_dir.exists() and not (bag_dir.is_dir() and not any(bag_dir.iterdir())):
+    if bag_dir and bag_dir.exists() and (not bag_dir.is_dir() or any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
     port = free_port(port)
     tell: Callable[[str], object] = str if as_json else say
     with ExitStack() as stack:
-        folder = _made(bag_dir, stack)
+        if bag_dir is None:
+            temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
+            bag_dir = Path(stack.enter_context(temporary))
+        bag_dir.mkdir(parents=True, exist_ok=True)
+        folder = bag_dir.resolve()
         recorder = stack.enter_context(_recorder(folder, duration_s))
-        server = stack.enter_context(
-            running_server(folder, port, tell, split_duration_s=SPLIT_DURATION_S, verbose=verbose)
-        )
+        server = stack.enter_context(running_server(folder, port, tell, verbose=verbose))
         url = f"http://{HOST}:{port}"
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
@@ -337,24 +321,22 @@ def run_demo(
             f"  server   {url}/sse (SSE), {url}/mcp (streamable HTTP)\n"
         )
         show = exchange_as_json if as_json else format_exchange
-        wrong = _count_wrong(
-            f"{url}/sse", recorder, lambda *exchange: say(show(*exchange)), questions
-        )
-        total = len(questions)
-        tell(f"{total - wrong} of {total} answers are right.")
+        try:
+            right = anyio.run(
+                _ask_all, f"{url}/sse", recorder, lambda *asked: say(show(*asked)), questions
+            )
+        except ExceptionGroup as group:
+            # What the client raises, and what is raised while it is open, comes nested in groups.
+            cause: BaseException = group
+            while isinstance(cause, BaseExceptionGroup):
+                cause = cause.exceptions[0]
+            why = str(cause) or type(cause).__name__
+            raise EpisodicError(f"the questions broke off: {why}") from group
+        tell(f"{right} of {len(questions)} answers are right.")
         if not once:
             tell(f"\n{connection_hints(url)}")
             _wait(server, recorder)
-    return 1 if wrong else 0
-
-
-def _made(bag_dir: Path | None, stack: ExitStack) -> Path:
-    """Returns the folder of the bags; without a name one that is removed at the end."""
-    if bag_dir is None:
-        temporary = TemporaryDirectory(prefix="ros2-memory-demo-", ignore_cleanup_errors=True)
-        return Path(stack.enter_context(temporary))
-    bag_dir.mkdir(parents=True, exist_ok=True)
-    return bag_dir.resolve()
+    return int(right < len(questions))
 
 
 def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
@@ -369,31 +351,17 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
     return recorder
 
 
-def _count_wrong(
-    url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
-) -> int:
-    try:
-        return anyio.run(_ask_all, url, recorder, show, questions)
-    except ExceptionGroup as group:
-        # What the client raises, and what is raised while it is open, comes nested in groups.
-        cause: BaseException = group
-        while isinstance(cause, BaseExceptionGroup):
-            cause = cause.exceptions[0]
-        why = str(cause) or type(cause).__name__
-        raise EpisodicError(f"the questions broke off: {why}") from group
-
-
 async def _ask_all(
     url: str, recorder: DemoRecorder, show: _Show, questions: Sequence[Question]
 ) -> int:
-    """Asks every question over one connection; returns how many answers were wrong."""
-    wrong = 0
+    """Asks every question over one connection; returns how many answers were right."""
+    right = 0
     async with Client(sse_client(url, timeout=_CONNECTED_WITHIN_S)) as client:
         for number, question in enumerate(questions, start=1):
             exchange = await _ask(client, question, recorder)
             show(number, exchange)
-            wrong += not exchange.right
-    return wrong
+            right += exchange.right
+    return right
 
 
 async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Exchange:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
-from contextlib import closing
+from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING
 
+from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.columns.pack import decompressed
 from tests.support.program import exits
 
@@ -30,3 +31,13 @@ def columns_in(store: Path) -> Iterator[bytes]:
     with closing(sqlite3.connect(store)) as base:
         columns = base.execute("SELECT data FROM part_column WHERE data IS NOT NULL").fetchall()
     yield from (decompressed(blob) for (blob,) in columns)
+
+
+@contextmanager
+def locked(bag_dir: Path) -> Iterator[None]:
+    """A recorder holds the bag directory."""
+    lock = BagDirLock.acquire(bag_dir, patience_s=0.0)
+    try:
+        yield
+    finally:
+        lock.release()

@@ -10,7 +10,7 @@ import time
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import pytest
 from mcap.writer import Writer
@@ -101,9 +101,9 @@ def beat(bag_dir: Path, state: RecorderState = RecorderState.RECORDING, **more: 
 def examined(exits: Program) -> Examined:
     """Runs doctor, which must end with a code; returns what is not in order by its concern."""
 
-    def run(code: int, *overrides: str) -> dict[str, list[dict[str, str]]]:
+    def run(code: int, settings: str = "") -> dict[str, list[dict[str, str]]]:
         wrong: dict[str, list[dict[str, str]]] = {}
-        for each in exits(code, "doctor", "--json", *overrides).json["findings"]:
+        for each in exits(code, f"doctor --json {settings}").json["findings"]:
             if each["level"] != "ok":
                 assert each["do"], each
                 wrong.setdefault(each["about"], []).append(each)
@@ -151,135 +151,108 @@ def test_data_from_the_future_means_that_the_clock_is_wrong(
     assert "chrony" in wrong["clock"][0]["do"]
 
 
+class Fault(NamedTuple):
+    """What is wrong with the heartbeat, the list of topics or the settings; and what is told."""
+
+    code: int
+    told: Sequence[str]
+    beats: dict[str, Any] | None = None
+    topics: str = "/odom"
+    setting: str = ""
+
+
 @pytest.mark.parametrize(
-    ("code", "told", "topics", "beats", "words"),
+    "fault",
     [
-        (1, {"recorder": ["it was stopped"]}, "/odom", {"state": RecorderState.STOPPED}, ()),
-        (
+        Fault(1, ["recorder: it was stopped"], {"state": RecorderState.STOPPED}),
+        Fault(
             2,
-            {"recorder": ["it is paused: the disk is full"]},
-            "/odom",
+            ["recorder: it is paused: the disk is full"],
             {"state": RecorderState.PAUSED, "last_error": "the disk is full"},
-            (),
         ),
-        (
+        Fault(
             2,
-            {"recorder": ["its last heartbeat was"]},
-            "/odom",
+            ["recorder: its last heartbeat was"],
             {"updated": time.time_ns() - 3600 * NS_PER_S},
-            (),
         ),
-        (1, {"recorder": ["no messages from: /scan"]}, "/odom", {"silent": ("/scan",)}, ()),
-        (1, {"recorder": ["its last error: it died"]}, "/odom", {"last_error": "it died"}, ()),
-        (
+        Fault(1, ["recorder: .*no messages from: /scan"], {"silent": ("/scan",)}),
+        Fault(1, ["recorder: its last error: it died"], {"last_error": "it died"}),
+        Fault(
             2,
-            {"recorder": ["/odom: 2 Hz, and 10 are required", "no message has come: /scan"]},
-            "/odom",
+            [
+                "recorder: .*/odom: 2 Hz, and 10 are required",
+                "recorder: .*no message has come: /scan",
+            ],
             {"required_missing": ("/odom: 2 Hz, and 10 are required",), "unheard": ("/scan",)},
-            (),
         ),
-        (
+        Fault(
             2,
-            {"recorder": ["topics.yaml: it is not YAML"]},
-            "/odom",
-            {
-                "listed": ("/odom",),
-                "list_refused": "topics.yaml: it is not YAML; it stays",
-            },
-            (),
+            ["recorder: topics.yaml: it is not YAML"],
+            {"listed": ("/odom",), "list_refused": "topics.yaml: it is not YAML; it stays"},
         ),
-        (
+        Fault(
             1,
-            {"topics": [r"/odom_ is in .* -> is it /odom\?", r"/vision/\*/objects is in"]},
-            "/odom, /odom_, /vision/*/objects",
-            {},
-            (),
+            [r"topics: /odom_ is in .* -> is it /odom\?", r"topics: /vision/\*/objects is in"],
+            topics="/odom, /odom_, /vision/*/objects",
         ),
-        (
+        Fault(
             1,
-            {
-                "topics": [
-                    "/gone is in .*no publisher has offered it since the recorder started",
-                    "/odom is in .*no publisher has offered it since the recorder started",
-                ],
-                "recorder": ["it restarted ros2 bag record 1 time; its last error"],
-            },
-            "/odom, /gone",
+            [
+                "recorder: it restarted ros2 bag record 1 time; its last error",
+                "topics: /gone is in .*no publisher has offered it since the recorder started",
+                "topics: /odom is in .*no publisher has offered it since the recorder started",
+            ],
             {"missing": ("/odom", "/gone"), "restarts": 1, "last_error": "it died"},
-            (),
+            "/odom, /gone",
         ),
-        (
+        Fault(
             1,
-            {
-                "topics": [
-                    "ros2 bag record does not know the type of /arm -> name the workspace",
-                    "since the recorder started, or its type is unknown, too -> ",
-                ],
-                "recorder": ["/arm"],
-            },
-            "/odom, /arm, /gone",
+            [
+                "recorder: .*/arm",
+                "topics: .*record does not know the type of /arm -> name the workspace",
+                "topics: .*since the recorder started, or its type is unknown, too -> ",
+            ],
             {"missing": ("/gone",), "unknown_types": ("/arm",)},
-            (),
+            "/odom, /arm, /gone",
         ),
-        (
+        Fault(
             1,
-            {
-                "topics": [
-                    "records or waits for /bumper, /diagnostics, not listed in .* -> .*settings",
-                ]
-            },
-            "/odom, /vision/scene",
+            ["topics: .*records or waits for /bumper, /diagnostics, not listed in .*settings"],
             {"subscribed": ("/odom", "/bumper"), "missing": ("/diagnostics",)},
-            (),
+            "/odom, /vision/scene",
         ),
-        (
+        Fault(
             1,
-            {"topics": ["adds /said.*lacks /gone -> a changed list is taken within seconds"]},
-            "/odom, /said",
+            ["topics: .*adds /said.*lacks /gone -> a changed list is taken within seconds"],
             {"listed": ("/odom", "/gone")},
-            (),
+            "/odom, /said",
         ),
-        (
+        Fault(
             2,
-            {"ros": ["/opt/ros/none/setup.bash.* -> .*recorder.setup_files"]},
-            "/odom",
-            {},
-            ["recorder.setup_files=[/opt/ros/none/setup.bash]"],
+            ["ros: .*/opt/ros/none/setup.bash.* -> .*recorder.setup_files"],
+            setting="recorder.setup_files=[/opt/ros/none/setup.bash]",
         ),
-        (2, {"server": ["-> .*ros2-memory-server"]}, "/odom", {}, ["server.port=1"]),
-        (
-            2,
-            {"disk": ["-> recording pauses"]},
-            "/odom",
-            {},
-            ["retention.min_free_gb=1000000.0"],
-        ),
-        (
+        Fault(2, ["server: .*-> .*ros2-memory-server"], setting="server.port=1"),
+        Fault(2, ["disk: .*-> recording pauses"], setting="retention.min_free_gb=1000000.0"),
+        Fault(
             1,
-            {"disk": ["-> .*lower retention.max_total_gb"]},
-            "/odom",
-            {},
-            ["retention.max_total_gb=1000000.0"],
+            ["disk: .*-> .*lower retention.max_total_gb"],
+            setting="retention.max_total_gb=1000000.0",
         ),
     ],
+    ids=lambda fault: fault.told[0],
 )
-def test_a_fault_is_reported_with_what_to_do(
-    robot: Path,
-    examined: Examined,
-    code: int,
-    told: dict[str, list[str]],
-    topics: str,
-    beats: dict[str, Any],
-    words: Sequence[str],
-) -> None:
-    """Of a recorder's heartbeat, a list of topics and settings that are not in order."""
-    (robot.parent / "topics.yaml").write_text(f"topics: [{topics}]\n")
-    beat(robot, **beats)
-    wrong = examined(code, *words)
-    assert {*wrong} == {*told}
-    for about, patterns in told.items():
-        for finding, pattern in zip(wrong[about], patterns, strict=True):
-            assert re.search(pattern, f"{finding['seen']} -> {finding['do']}")
+def test_a_fault_is_reported_with_what_to_do(robot: Path, examined: Examined, fault: Fault) -> None:
+    (robot.parent / "topics.yaml").write_text(f"topics: [{fault.topics}]\n")
+    beat(robot, **(fault.beats or {}))
+    wrong = examined(fault.code, fault.setting)
+    found = [
+        f"{about}: {finding['seen']} -> {finding['do']}"
+        for about, findings in sorted(wrong.items())
+        for finding in findings
+    ]
+    for line, pattern in zip(found, fault.told, strict=True):
+        assert re.match(pattern, line)
 
 
 def lay(robot: Path, name: str, content: bytes) -> None:
@@ -389,11 +362,11 @@ class TestTheServer:
         self, robot: Path, exits: Program, port: int, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setenv("MEMORY_API_TOKEN", "a" * 32)
-        shown = exits(0, "doctor", "server.transport=stdio").out
+        shown = exits(0, "doctor server.transport=stdio").out
         assert "each client starts its own server" in shown
         assert f"answers on 127.0.0.1 port {port}: ok" in shown
         Answering.asks_for, Answering.reply = "nothing", b"{}"
-        assert "answers on" not in exits(0, "doctor", "server.transport=stdio").out
+        assert "answers on" not in exits(0, "doctor server.transport=stdio").out
 
     def test_another_program_is_recognised(self, robot: Path, examined: Examined) -> None:
         Answering.reply = b"<html>a printer</html>"
@@ -441,7 +414,7 @@ class TestExtras:
     ) -> None:
         monkeypatch.setitem(sys.modules, "prometheus_client", None)
         monkeypatch.setitem(sys.modules, "opentelemetry.sdk", None)
-        wrong = examined(2, "server.metrics=true", "server.traces=true")
+        wrong = examined(2, "server.metrics=true server.traces=true")
         seen = [each["seen"].partition(",")[0] for each in wrong["extras"]]
         assert seen == [
             "server.metrics=true needs prometheus_client",
@@ -452,7 +425,7 @@ class TestExtras:
     def test_metrics_without_http_are_reported(self, robot: Path, examined: Examined) -> None:
         pytest.importorskip("prometheus_client")
         assert examined(0, "server.metrics=true") == {}
-        wrong = examined(2, "server.metrics=true", "server.transport=stdio")
+        wrong = examined(2, "server.metrics=true server.transport=stdio")
         assert "has no /metrics" in wrong["extras"][0]["seen"]
 
 
@@ -481,8 +454,8 @@ def test_the_list_that_up_wrote_beside_the_bags_is_that_of_its_recorder(
 def test_a_shorter_life_of_a_topic_that_nobody_records_is_reported(
     robot: Path, examined: Examined
 ) -> None:
-    lives = "retention.topics={/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, /mic: {max_age_h: 1}}"
-    [finding] = examined(1, lives)["topics"]
+    lives = "{/odom: {max_age_h: 1}, /o*: {max_age_h: 1}, /mic: {max_age_h: 1}}"
+    [finding] = examined(1, f"'retention.topics={lives}'")["topics"]
     assert finding["seen"] == "/mic in retention.topics is no topic that is recorded"
 
 

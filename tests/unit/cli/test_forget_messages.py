@@ -27,7 +27,6 @@ from rosbags.rosbag2 import Reader
 from ros2_memory import cli
 from ros2_memory.bag_dir.handover_file import message_id
 from ros2_memory.bag_dir.layout import OWN_FOLDER
-from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.metadata_yaml import Contents, describing
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import ERASING, read_losses
@@ -49,7 +48,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.housekeepers import made_moment, own_all
-from tests.unit.cli.conftest import columns_in, left
+from tests.unit.cli.conftest import columns_in, left, locked
 
 if TYPE_CHECKING:
     from collections import Counter
@@ -107,9 +106,9 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return bag_dir
 
 
-def forget(first: float, last: float, *more: str) -> int:
+def forget(first: float, last: float, words: str = f"--topic {CAMERA}") -> int:
     start, end = T0 / S + first, T0 / S + last
-    return cli.main(["forget", "--start", str(start), "--end", str(end), "--yes", *more])
+    return cli.main(f"forget --start {start} --end {end} --yes {words}".split())
 
 
 def stored(recording: Path) -> list[Stored]:
@@ -171,7 +170,7 @@ def test_what_is_not_forgotten_stays_to_the_byte(
     before = stored(bag_dir / "rec_a")
     full = [whole(each) for each in splits]
     untouched = splits[2].read_bytes()
-    assert forget(3.5, 15.5, "--topic", "/camera/*") == 0
+    assert forget(3.5, 15.5, "--topic /camera/*") == 0
     expected = [each for each in before if not in_window(each, 3.5, 15.5, (CAMERA,))]
     assert len(before) - len(expected) == 12
     assert stored(bag_dir / "rec_a") == expected
@@ -190,7 +189,7 @@ def test_nothing_of_it_is_left_anywhere(
     # A query server has the file open, so that its log lies beside it.
     with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as server:
         server.execute("SELECT count(*) FROM bag").fetchone()
-        assert forget(0, 100, "--topic", CAMERA) == 0
+        assert forget(0, 100) == 0
         assert traces(tmp_path, SAID) == []
     indexed()
     assert traces(tmp_path, SAID) == []
@@ -214,7 +213,7 @@ def test_a_moment_that_is_kept_meanwhile_follows(
         return taken
 
     monkeypatch.setattr(McapWriter, "cut", slow_cut)
-    assert forget(0, 100, "--topic", CAMERA) == 0
+    assert forget(0, 100) == 0
     assert link.samefile(source)
     assert traces(tmp_path, SAID) == []
 
@@ -223,7 +222,7 @@ def test_a_hard_link_elsewhere_is_named_and_holds_nothing_up(
     tmp_path: Path, bag_dir: Path, capsys: Capture
 ) -> None:
     os.link(bag_dir / "rec_a" / "rec_a_1.mcap", tmp_path / "copy.mcap")
-    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert forget(0, 100) == 1
     assert "rec_a_1.mcap: all of it is still in 1 more hard link of it" in capsys.readouterr().out
     assert traces(bag_dir, SAID) == []
     # While it is there, no bag is shipped, none leaves a day, and no topic is cut out of one.
@@ -231,7 +230,7 @@ def test_a_hard_link_elsewhere_is_named_and_holds_nothing_up(
 
 
 def test_counts_follow(bag_dir: Path) -> None:
-    assert forget(-0.5, 14.5, "--topic", CAMERA, "--topic", MIC) == 0
+    assert forget(-0.5, 14.5, f"--topic {CAMERA} --topic {MIC}") == 0
     content = yaml.safe_load((bag_dir / "rec_a" / "metadata.yaml").read_text())
     info = content["rosbag2_bagfile_information"]
     by_topic = {
@@ -252,7 +251,7 @@ def test_sidecars_follow(bag_dir: Path) -> None:
     sidecar.write_text(json.dumps({"format": 1, "state": "counts", "counts_elsewhere": listed}))
     left(sidecar)
     written = sidecar.stat().st_mtime_ns
-    assert forget(9.5, 15, "--topic", CAMERA) == 0
+    assert forget(9.5, 15) == 0
     told = json.loads(sidecar.read_text())["counts_elsewhere"]
     assert told == {
         "rec_a_1.mcap": {staying.topic: ids[staying.topic]},
@@ -262,27 +261,19 @@ def test_sidecars_follow(bag_dir: Path) -> None:
 
 
 def test_answers_say_that_messages_were_deleted(bag_dir: Path, capsys: Capture) -> None:
-    assert forget(2.5, 4.5, "--topic", CAMERA) == 0
+    assert forget(2.5, 4.5) == 0
     losses = read_losses(bag_dir, MIN_NS, MAX_NS)
     assert [(each.topic, each.lost, each.by) for each in losses] == [(CAMERA, 2, "forgotten")]
     capsys.readouterr()
-    cli.main(
-        [
-            "ask",
-            "get_topic_in_range",
-            f"topic={CAMERA}",
-            f"start={T0 / S}",
-            f"end={T0 / S + 8}",
-            "--json",
-        ]
-    )
+    window = f"start={T0 / S} end={T0 / S + 8}"
+    cli.main(f"ask get_topic_in_range topic={CAMERA} {window} --json".split())
     assert f"2 messages deleted by request: {CAMERA} (2)" in capsys.readouterr().out
 
 
 class TestLatched:
     @pytest.fixture
     def carried(self, bag_dir: Path) -> Path:
-        assert forget(-1, 9.9) == 0
+        assert forget(-1, 9.9, "") == 0
         path = bag_dir / "latched" / "carried.mcap"
         assert path.exists()
         return path
@@ -290,33 +281,26 @@ class TestLatched:
     def test_carried_messages_follow_where_their_topic_is_named(
         self, bag_dir: Path, carried: Path
     ) -> None:
-        assert forget(-1, 100, "--topic", "/tf_static") == 0
+        assert forget(-1, 100, "--topic /tf_static") == 0
         assert not carried.exists()
         assert traces(bag_dir, "laser") == []
 
     def test_beside_a_recorder_they_stay_and_are_named(
         self, bag_dir: Path, carried: Path, capsys: Capture
     ) -> None:
-        lock = BagDirLock.acquire(bag_dir, patience_s=0.0)
-        try:
-            assert forget(-1, 100, "--topic", "/tf_static") == 1
-        finally:
-            lock.release()
+        with locked(bag_dir):
+            assert forget(-1, 100, "--topic /tf_static") == 1
         assert "stays: /tf_static: latched messages, which the recorder" in capsys.readouterr().out
         assert carried.exists()
 
 
 def test_what_a_recording_receives_again_goes_with_its_topic(bag_dir: Path) -> None:
-    again = tf(
-        T0,
-        transform(T0, "base_link", "laser", (0.1, 0.0, 0.2)),
-        topic="/tf_static",
-        log_time=T0 + 50 * S,
-    )
+    mount = transform(T0, "base_link", "laser", (0.1, 0.0, 0.2))
+    again = tf(T0, mount, topic="/tf_static", log_time=T0 + 50 * S)
     again = Msg(again.topic, again.type, again.log_time, again.body, publish_time=T0)
     left(write_mcap(bag_dir / "rec_b" / "rec_b_0.mcap", [again, odom(T0 + 51 * S, 0.0, 0.0)]))
     own_all(bag_dir)
-    assert forget(-1, 5, "--topic", "/tf_static") == 0
+    assert forget(-1, 5, "--topic /tf_static") == 0
     assert traces(bag_dir, "laser") == []
 
 
@@ -326,14 +310,14 @@ def test_what_is_being_written_is_named(bag_dir: Path, capsys: Capture, size: in
     write_mcap(active, messages(3), McapLayout(finish=False))
     if size is not None:
         os.truncate(active, size)
-    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert forget(0, 100) == 1
     assert "stays: rec_a/rec_a_3.mcap: it is being written" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("more", [(), ("--topic", CAMERA)])
+@pytest.mark.parametrize("more", ["", f"--topic {CAMERA}"])
 @pytest.mark.parametrize("name", ["rec_20990101T000000Z_0.mcap", "copied_0.db3"])
 def test_what_is_being_written_is_named_wherever_its_times_are(
-    bag_dir: Path, capsys: Capture, name: str, more: tuple[str, ...]
+    bag_dir: Path, capsys: Capture, name: str, more: str
 ) -> None:
     active = bag_dir / name.rpartition("_")[0] / name
     if active.suffix == ".mcap":
@@ -341,9 +325,9 @@ def test_what_is_being_written_is_named_wherever_its_times_are(
     else:
         write_db3(active, messages(3))
     own_all(bag_dir)
-    assert forget(30, 40, *more, "storage=rosbag2") == 1
+    assert forget(30, 40, f"{more} storage=rosbag2") == 1
     assert f"stays: {active.relative_to(bag_dir)}: " in capsys.readouterr().out
-    assert forget(10, 19.9, *more, "storage=rosbag2") == 0  # it begins later
+    assert forget(10, 19.9, f"{more} storage=rosbag2") == 0  # it begins later
 
 
 def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Capture) -> None:
@@ -353,7 +337,7 @@ def test_a_damaged_bag_stays_as_it_is_and_is_named(bag_dir: Path, capsys: Captur
     data[middle : middle + 40] = bytes(40)
     path.write_bytes(data)
     left(path)
-    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert forget(0, 100) == 1
     assert "stays: rec_a/rec_a_1.mcap: " in capsys.readouterr().out
     assert path.read_bytes() == data
 
@@ -365,7 +349,7 @@ def test_what_is_not_read_is_named_with_its_reason(
     bag_dir: Path, capsys: Capture, name: str, do: str
 ) -> None:
     (bag_dir / "rec_a" / name).write_bytes(b"any")
-    assert forget(0, 100, "--topic", CAMERA) == 1
+    assert forget(0, 100) == 1
     kept = f"stays: rec_a/{name}: "
     [line] = [line for line in capsys.readouterr().out.splitlines() if line.startswith(kept)]
     assert do in line
@@ -380,7 +364,7 @@ def test_sqlite_bags_are_written_anew(bag_dir: Path) -> None:
         every = "SELECT * FROM messages ORDER BY id"
         before = base.execute(every).fetchall()
     left(path)
-    assert forget(3.5, 100, "--topic", CAMERA, "storage=rosbag2") == 0
+    assert forget(3.5, 100, f"--topic {CAMERA} storage=rosbag2") == 0
     with closing(sqlite3.connect(path)) as base:
         (number,) = base.execute("SELECT id FROM topics WHERE name = ?", (CAMERA,)).fetchone()
         rest = [each for each in before if each[1] != number or each[2] < T0 + 3.5 * S]
@@ -437,7 +421,7 @@ class TestPlaces:
         self, home: Path, capsys: Capture
     ) -> None:
         indexed()
-        assert forget(0, 100, "--where", "bathroom", self.places) == 0
+        assert forget(0, 100, f"--where bathroom {self.places}") == 0
         assert "latched messages stay" in capsys.readouterr().out
         bag = home / "rec_h" / "rec_h_0.mcap"
         times = {}  # type: dict[str, set[int]]
@@ -478,7 +462,7 @@ class TestInterruption:
             with monkeypatch.context() as patch:
                 cut_off_after(patch, steps)
                 try:
-                    forget(0, 100, "--topic", CAMERA)
+                    forget(0, 100)
                 except PowerCutError:
                     finished = False
                 else:
@@ -492,7 +476,7 @@ class TestInterruption:
             if steps == 1:
                 assert cli.main(["doctor"]) > 0
                 assert "was interrupted" in capsys.readouterr().out
-            assert forget(500, 501, "--topic", MIC) == 0
+            assert forget(500, 501, f"--topic {MIC}") == 0
             if begun is not None:
                 assert "an earlier forget was interrupted" in capsys.readouterr().out
                 assert traces(bag_dir, SAID) == [], steps

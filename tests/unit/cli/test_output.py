@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
-import io
 from typing import TYPE_CHECKING
 
 import pytest
-from rich.console import Console
 
 from ros2_memory.cli.output import format_time, format_value, print_reply, with_commands
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ros2_memory.core.model import JsonValue
+
+    Shown = Callable[..., str]
 
 T0 = 1_700_000_000.25
 
 
-def shown(value: JsonValue, width: int = 80, now: float | None = None) -> str:
-    stream = io.StringIO()
-    print_reply(Console(file=stream, width=width), value, now)
-    lines = [line.rstrip() for line in stream.getvalue().splitlines()]
-    assert all(len(line) <= width for line in lines)
-    return "\n".join(lines)
+@pytest.fixture
+def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Shown:
+    """What is printed of a reply in so many columns."""
+
+    def run(value: JsonValue, width: int = 80, now: float | None = None) -> str:
+        monkeypatch.setenv("COLUMNS", str(width))
+        print_reply(value, now)
+        lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+        assert all(len(line) <= width for line in lines)
+        return "\n".join(lines)
+
+    return run
 
 
 @pytest.mark.parametrize(
@@ -43,27 +51,27 @@ def test_objects_in_a_cell_are_words(value: JsonValue, output: str) -> None:
     assert format_value(value) == output
 
 
-def test_a_moment_has_its_local_time_and_its_age() -> None:
+def test_a_moment_has_its_local_time_and_its_age(shown: Shown) -> None:
     output = shown({"timestamp": T0, "first": T0 - 7200.0, "next": T0 + 60.0}, now=T0)
     assert output.splitlines()[0].split(maxsplit=1) == ["timestamp", format_time(T0)]
     assert f"{format_time(T0 - 7200)} (2.0 h ago)" in output
     assert f"{format_time(T0 + 60)} (in 60.0 s)" in output
 
 
-def test_moments_in_notes_are_local_times() -> None:
+def test_moments_in_notes_are_local_times(shown: Shown) -> None:
     output = shown({"notes": [f"the memory ends at {T0:.6f}", "2 of 1300000000 samples"]})
     assert f"the memory ends at {format_time(T0)}" in output
     assert "1300000000 samples" in output
 
 
-def test_long_times_are_in_a_unit_that_suits_them() -> None:
+def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
     rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
     output = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
     assert output[:4] == ["duration_s", "2.1", "h", "total"]
     assert output[-3:] == ["days", "/b", "12.25"]
 
 
-def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
+def test_the_rows_of_a_table_have_the_names_of_its_columns(shown: Shown) -> None:
     reply: JsonValue = {
         "total": 2,
         "fields": ["timestamp", "percentage"],
@@ -75,7 +83,7 @@ def test_the_rows_of_a_table_have_the_names_of_its_columns() -> None:
     assert lines[-1][0] == format_time(T0 + 1.0)
 
 
-def test_a_time_of_a_clock_that_was_never_set_has_its_unit() -> None:
+def test_a_time_of_a_clock_that_was_never_set_has_its_unit(shown: Shown) -> None:
     assert shown({"earliest": 0.0}).split() == ["earliest", "0", "s", "after", "1970"]
     assert "0 s after 1970" in shown([{"recording": "a", "start": 2e-9}])
 
@@ -87,7 +95,7 @@ def test_a_list_of_tools_stays_one_and_a_tool_to_ask_becomes_a_command() -> None
     assert with_commands("list_recorded_topics lists all") == "`ros2-memory topics` lists all"
 
 
-def test_counts_by_day_are_a_table_whose_last_row_is_of_all() -> None:
+def test_counts_by_day_are_a_table_whose_last_row_is_of_all(shown: Shown) -> None:
     """Of a time that stands there twice, as text and exactly, people get the exact one."""
     reply: JsonValue = {
         "topic": "/bumper",
@@ -104,12 +112,12 @@ def test_counts_by_day_are_a_table_whose_last_row_is_of_all() -> None:
     ]
 
 
-def test_what_there_is_not_is_reported_in_words() -> None:
+def test_what_there_is_not_is_reported_in_words(shown: Shown) -> None:
     assert shown({"recorder": None, "gaps": []}).split() == ["recorder", "none", "gaps", "none"]
     assert shown([]) == "none"
 
 
-def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
+def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time(shown: Shown) -> None:
     rows: JsonValue = [{"topic": "/a_long_name" * 3, "first": T0, "last": T0, "count": 12345}]
     output = shown(rows)
     day, _, time = format_time(T0).partition("T")
@@ -118,7 +126,7 @@ def test_in_a_narrow_terminal_moments_are_broken_between_day_and_time() -> None:
     assert "12345" in output
 
 
-def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other() -> None:
+def test_rows_that_are_too_wide_for_a_table_stand_one_below_the_other(shown: Shown) -> None:
     row: JsonValue = {f"a_key_with_a_long_name_{n}": n for n in range(6)}
     output = shown([row, row])
     assert output.count("a_key_with_a_long_name_5  5") == 2

@@ -112,26 +112,21 @@ def test_what_lay_between_recordings_needs_a_folder(
     assert f"-o {tmp_path / 'proof'} keeps recordings apart" in differs.err
     folder = tmp_path / "proof"
     proved = exits(0, "prove", question, "-o", folder, two_days, "--json").json
-    assert proved == {
-        "path": str(folder),
-        "messages": 201,
-        "same": True,
-        "differing": [],
-        "beside": [],
-    }
+    same = {"same": True, "differing": [], "beside": []}
+    assert proved == {"path": str(folder), "messages": 201, **same}
     assert [each.name for each in sorted(folder.iterdir())] == ["rec_0", "rec_1"]
 
 
 def test_a_key_on_files_is_named_and_is_no_other_answer(
     bags: Path, tmp_path: Path, exits: Program
 ) -> None:
-    proved = exits(0, "prove", "data_time_range", "-o", tmp_path / "proof.mcap", bags)
+    proved = exits(0, f"prove data_time_range -o {tmp_path}/proof.mcap {bags}")
     assert "note: only the bags themselves give the same bags\n" in proved.err
 
 
 def test_of_nothing_there_is_no_proof(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "bags").mkdir()
-    refused = exits(2, "prove", "visits x=1 y=1", "-o", tmp_path / "proof", tmp_path / "bags")
+    refused = exits(2, f"prove 'visits x=1 y=1' -o {tmp_path}/proof {tmp_path}/bags")
     assert "contains no bag with messages; `ros2-memory info`" in refused.err
 
 

@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import os
 from collections import Counter
+from functools import partial
 from typing import TYPE_CHECKING
 
 import pytest
@@ -10,6 +11,7 @@ from mcap.reader import make_reader
 from rich.console import Console
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from ros2_memory.cli import output
 from ros2_memory.cli.maintenance.recover import RecoveryOutcome, recover_files
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, typestore, write_db3, write_mcap
@@ -44,20 +46,16 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     cut = left_open(tmp_path / "a/a_1.mcap")
     (tmp_path / "b").mkdir()
     (tmp_path / "b/b_0.mcap").write_bytes(b"")
-    before = whole.stat(), whole.read_bytes()
+    before = whole.stat().st_ino, whole.stat().st_mtime_ns, whole.read_bytes()
     count = McapReader().summarize(cut).count
     outcome, printed = recovered(tmp_path)
     assert outcome == RecoveryOutcome(whole=1, repaired=1, removed=1, failed=0, messages=count)
     assert McapReader().summarize(cut).complete
-    stat, content = before
-    after = whole.stat()
-    assert (after.st_ino, after.st_mtime_ns) == (stat.st_ino, stat.st_mtime_ns)
-    assert whole.read_bytes() == content
+    assert (whole.stat().st_ino, whole.stat().st_mtime_ns, whole.read_bytes()) == before
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
-    assert printed[1] == "b/b_0.mcap: empty, removed"
-    assert printed[2] == f"{tmp_path / 'a/metadata.yaml'}: written to match the files"
-    assert printed[-1] == str(outcome)
+    metadata = f"{tmp_path}/a/metadata.yaml: written to match the files"
+    assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, str(outcome)]
 
 
 class TestMetadata:
@@ -89,10 +87,7 @@ class TestMetadata:
             ("{", "not YAML"),
             ("rosbag2_bagfile_information: {}", "not of plain MCAP files"),
             ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "plain MCAP"),
-            (
-                "rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}",
-                "it is of version 4",
-            ),
+            ("rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}", "version 4"),
         ],
     )
     def test_of_another_form_is_kept(self, tmp_path: Path, text: str, reason: str) -> None:
@@ -173,12 +168,16 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     assert printed[0].startswith("1 bag file of another kind was left alone")
 
 
-def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(tmp_path: Path) -> None:
+def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name in ("a/a_0.mcap", "a/a_1.mcap"):
         left_open(tmp_path / name)
     terminal = io.StringIO()
-    console = Console(file=terminal, force_terminal=True, width=100)
-    recover_files(tmp_path, lambda _: None, console=console, clock=later(60))
+    monkeypatch.setattr(
+        output, "Console", partial(Console, file=terminal, force_terminal=True, width=100)
+    )
+    recover_files(tmp_path, lambda _: None, clock=later(60))
     shown = terminal.getvalue()
     assert " 50% a/a_0.mcap" in shown
     assert "100% a/a_1.mcap" in shown
@@ -192,10 +191,11 @@ def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path
     printed: list[str] = []
     outcome = recover_files(tmp_path, printed.append, dry_run=True, clock=later(60))
     assert (outcome.repaired, outcome.removed) == (1, 1)
-    assert printed[0].startswith("rec/rec_0.mcap: would be repaired")
-    assert printed[1] == "rec/rec_1.mcap: empty, would be removed"
-    assert printed[2].endswith("metadata.yaml: would be written to match the files")
-    assert printed[-1].startswith("nothing was changed")
+    repaired, removed, metadata, *_, last = printed
+    assert repaired.startswith("rec/rec_0.mcap: would be repaired")
+    assert removed == "rec/rec_1.mcap: empty, would be removed"
+    assert metadata.endswith("metadata.yaml: would be written to match the files")
+    assert last.startswith("nothing was changed")
     assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
@@ -208,8 +208,8 @@ class TestTheProgram:
         empty.parent.mkdir()
         empty.write_bytes(b"")
         monkeypatch.setattr("sys.stdin", io.StringIO(answer))
-        exits(1, "recover", tmp_path, "--force")
-        exits(2, "recover", tmp_path, "--force", "--json")
+        exits(1, f"recover {tmp_path} --force")
+        exits(2, f"recover {tmp_path} --force --json")
         assert empty.exists()
-        exits(0, "recover", tmp_path, "--force", "--yes")
+        exits(0, f"recover {tmp_path} --force --yes")
         assert not empty.exists()

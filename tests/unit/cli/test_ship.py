@@ -49,7 +49,7 @@ def ship(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exits: Pr
 
     def run(code: int, *more: object) -> Printed:
         settings = [f"fleet.robots={fleet}/*", f"lake.warehouse={tmp_path}/lake", *more]
-        return exits(code, "ship", "--once", "--json", "lake.commit_interval_s=0", *settings)
+        return exits(code, "ship --once --json lake.commit_interval_s=0", *settings)
 
     return run
 
@@ -102,14 +102,9 @@ def test_a_robot_that_nobody_knows_is_not_forgotten(ship: Ship, tmp_path: Path) 
 def test_a_second_writer_ends_and_names_the_first(ship: Ship, tmp_path: Path) -> None:
     with writing_alone(tmp_path / "lake" / ".ros2-memory"):
         refused = ship(2).err
-        with (
-            pytest.raises(LakeError, match="one writer"),
-            writing_alone(tmp_path / "lake" / ".ros2-memory"),
-        ):
-            pass
+    assert "one writer" in refused
     assert "process" in refused
-    with writing_alone(tmp_path / "lake" / ".ros2-memory"):
-        pass
+    ship(0)
 
 
 def test_a_service_tries_again_where_the_store_cannot_be_reached_when_it_starts(
@@ -217,6 +212,6 @@ def test_no_secret_is_in_an_error_or_in_the_configuration(
     with pytest.raises(LakeError) as failed, location.translated("writing"):
         raise RuntimeError("the store refused hunter2hunter2")
     assert "hunter2" not in str(failed.value)
-    assert "hunter2" not in exits(0, "config", "show", "fleet.robots={r1: /r1}", given).out
+    assert "hunter2" not in exits(0, "config show", "fleet.robots={r1: /r1}", given).out
     secrets.write_text("[hunter2hunter2]")
     assert "hunter2" not in ship(2, given).err

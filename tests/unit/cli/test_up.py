@@ -28,12 +28,12 @@ def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("STUB_OPTIONS", "--start-paused --include-hidden-topics --node-name")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("ros2_memory.cli.up.SECONDS", 0.3)
-    monkeypatch.setattr("ros2_memory.cli.survey.QUIET_S", 0.1)
+    monkeypatch.setattr("ros2_memory.cli.up.QUIET_S", 0.1)
 
 
 def test_a_deployment_that_does_not_record_is_refused(exits: Program, tmp_path: Path) -> None:
     for word in ("recorder=none", "storage=mcap", "deployment=replay"):
-        said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags", word).err
+        said = exits(2, f"up --yes --bag-dir {tmp_path}/bags", word).err
         assert "`up` records, and serves over HTTP: choose deployment=robot" in said
     assert not (tmp_path / "bags").exists()
 
@@ -44,7 +44,7 @@ def test_a_folder_that_cannot_be_written_is_named(
     bags, access = tmp_path / "bags", os.access
     # Root, as which tests may run, may write everywhere.
     monkeypatch.setattr(os, "access", lambda path, mode: path != bags and access(path, mode))
-    said = exits(2, "up", "--yes", "--bag-dir", bags).err
+    said = exits(2, f"up --yes --bag-dir {bags}").err
     assert f"{bags} cannot be written by this user; name another folder" in said
 
 
@@ -52,14 +52,14 @@ def test_a_domain_of_a_setup_file_is_checked_too(exits: Program, tmp_path: Path)
     setup = tmp_path / "setup.bash"
     setup.write_text("export ROS_DOMAIN_ID=kitchen\n")
     words = ["--bag-dir", tmp_path / "bags", f"recorder.setup_files=[{setup}]"]
-    assert "ROS_DOMAIN_ID: 'kitchen' is not allowed" in exits(2, "up", "--yes", *words).err
+    assert "ROS_DOMAIN_ID: 'kitchen' is not allowed" in exits(2, "up --yes", *words).err
 
 
 def test_a_recorder_that_fails_is_named_with_its_last_words(
     exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STUB_OPTIONS", "--include-hidden-topics")
-    said = exits(2, "up", "--yes", "--bag-dir", tmp_path / "bags").err
+    said = exits(2, f"up --yes --bag-dir {tmp_path}/bags").err
     assert "ros2 bag record ended by itself (status 2)" in said
     assert "unrecognized arguments: --start-paused" in said
     assert "`ros2-memory doctor` checks the installation" in said
@@ -69,9 +69,22 @@ def test_who_answers_no_has_nothing_written(
     exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "stdin", io.StringIO("n\n"))
-    shown = exits(1, "up", "--bag-dir", tmp_path / "bags").out
+    shown = exits(1, f"up --bag-dir {tmp_path}/bags").out
     assert "record /odom" in shown
     assert not (tmp_path / "bags" / "topics.yaml").exists()
+
+
+@pytest.fixture
+def became(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The programs that `up` becomes in the end, with their arguments."""
+    programs: list[list[str]] = []
+
+    def become(program: str, argv: list[str]) -> None:
+        programs.append(argv)
+        raise SystemExit(0)
+
+    monkeypatch.setattr(os, "execvp", become)
+    return programs
 
 
 class Terminal(io.StringIO):
@@ -81,14 +94,15 @@ class Terminal(io.StringIO):
         return True
 
 
+@pytest.mark.usefixtures("became")
 @pytest.mark.parametrize(
     ("typed", "flags", "before", "remembers"),
     [
-        ("y\ny\n", (), False, True),
-        ("y\n\n", (), False, False),
-        ("", ("--yes",), False, False),
-        ("", ("--yes",), True, True),
-        ("", ("--yes", "memory.keep=false"), True, False),
+        ("y\ny\n", "", False, True),
+        ("y\n\n", "", False, False),
+        ("", "--yes", False, False),
+        ("", "--yes", True, True),
+        ("", "--yes memory.keep=false", True, False),
     ],
 )
 def test_only_a_person_has_something_outlive_the_bags(
@@ -96,18 +110,14 @@ def test_only_a_person_has_something_outlive_the_bags(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     typed: str,
-    flags: tuple[str, ...],
+    flags: str,
     before: bool,
     remembers: bool,
 ) -> None:
-    def become(program: str, argv: list[str]) -> None:
-        raise SystemExit(0)
-
-    monkeypatch.setattr(os, "execvp", become)
     monkeypatch.setattr(sys, "stdin", Terminal(typed))
     if before:
         (tmp_path / "bags" / "memory").mkdir(parents=True)
-    shown = exits(0, "up", *flags, "--install", "--bag-dir", tmp_path / "bags").out
+    shown = exits(0, f"up {flags} --install --bag-dir {tmp_path}/bags").out
     assert ("memory.keep=true" in shown) is remembers
 
 
@@ -123,22 +133,15 @@ def test_what_is_to_outlive_the_bags_is_asked_once(
     monkeypatch.setattr("ros2_memory.cli.up._run_programs", run)
     for typed in ("y\ny\n", ""):
         monkeypatch.setattr(sys, "stdin", Terminal(typed))
-        exits(0, "up", "--bag-dir", tmp_path / "bags")
+        exits(0, f"up --bag-dir {tmp_path}/bags")
     assert ["memory.keep=true" in words for words in started] == [True, True]
 
 
 def test_install_hands_the_list_over_to_the_script(
-    exits: Program, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    exits: Program, tmp_path: Path, became: list[list[str]]
 ) -> None:
-    became: list[list[str]] = []
-
-    def become(program: str, argv: list[str]) -> None:
-        became.append(argv)
-        raise SystemExit(0)
-
-    monkeypatch.setattr(os, "execvp", become)
     file = tmp_path / "bags" / "topics.yaml"
-    shown = exits(0, "up", "--yes", "--install", "--bag-dir", tmp_path / "bags").out
+    shown = exits(0, f"up --yes --install --bag-dir {tmp_path}/bags").out
     script = str(ROOT / "deploy" / "install.sh")
     assert became[0][1:] == [f"PYTHON={sys.executable}", script, "--topics", str(file)]
     assert became[0][0] == ("sudo" if os.geteuid() else "env")

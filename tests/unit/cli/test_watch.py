@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
@@ -64,7 +63,7 @@ def test_a_rate_is_assessed_by_what_is_usual(
 
 
 def test_a_log_gets_a_line_for_each_look_that_names_what_is_odd(exits: Program) -> None:
-    lines = exits(0, "watch", "--count", "2", "--every", "0.01").out.splitlines()
+    lines = exits(0, "watch --count 2 --every 0.01").out.splitlines()
     assert len(lines) == 2
     assert "1 topic at its usual rate" in lines[0]
     assert "/chatter silent (0 Hz, usually 1" in lines[0]
@@ -79,21 +78,21 @@ def test_a_log_and_a_topic_that_was_forgotten_are_not_called_silent(
     lines = [log_entry(begin + n * NS_PER_S, 20, "nav", "hello") for n in range(30)]
     write_mcap(bag_dir / "log" / "log_0.mcap", lines)
     append_losses(bag_dir, [Loss("/chatter", begin, begin + 65 * NS_PER_S, 30, "forgotten")])
-    line = exits(0, "watch", "--count", "1").out
+    line = exits(0, "watch --count 1").out
     assert "silent" not in line
     assert "/bumper slow (0.2 Hz" in line
 
 
 def test_messages_that_two_recordings_have_count_once(bag_dir: Path, exits: Program) -> None:
     shutil.copytree(bag_dir / "rec", bag_dir / "twin")
-    rows = exits(0, "watch", "--count", "1", "--json").json["topics"]
+    rows = exits(0, "watch --count 1 --json").json["topics"]
     rates = {row["topic"]: (row["rate_hz"], row["usual_hz"]) for row in rows}
     assert rates["/odom"] == pytest.approx((10, 10), rel=0.05)
 
 
 def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "none").mkdir()
-    assert "no data" in exits(0, "watch", "--count", "1", "--bag-dir", tmp_path / "none").out
+    assert "no data" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
 
 
 def test_a_terminal_gets_a_table() -> None:
@@ -116,12 +115,10 @@ def test_a_terminal_gets_a_table() -> None:
 
 
 def test_restarts_and_topics_that_nobody_offers_are_reported(bag_dir: Path, exits: Program) -> None:
-    now = time.time_ns()
-    beat = Heartbeat(
-        1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, ("/gone", "/lost")
-    )
+    now, lost = time.time_ns(), ("/gone", "/lost")
+    beat = Heartbeat(1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, lost)
     write_heartbeat(bag_dir, beat)
-    output = exits(0, "watch", "--count", "1").out
+    output = exits(0, "watch --count 1").out
     assert "recorder: recording, restarted 2 times;" in output
     assert "offered by no publisher: /gone, /lost" in output
 
@@ -136,13 +133,11 @@ class TestOldData:
         return folder
 
     def test_is_not_judged_by_what_is_usual(self, old: Path, exits: Program) -> None:
-        output = exits(0, "watch", "--count", "1", "--bag-dir", old).out
+        output = exits(0, f"watch --count 1 --bag-dir {old}").out
         assert "as usual" not in output
         assert "days old; no new data; rates not checked for 1 topic" in output
 
-    def test_is_as_old_as_the_tools_say(self, old: Path, capsys: Capture) -> None:
-        words = ["watch", "--count", "1", "--bag-dir", str(old), "data.now=latest"]
-        assert cli.main(words) == 0
-        output = capsys.readouterr().out
+    def test_is_as_old_as_the_tools_say(self, old: Path, exits: Program) -> None:
+        output = exits(0, f"watch --count 1 --bag-dir {old} data.now=latest").out
         assert "which is now (data.now=latest); no new data" in output
         assert "days old" not in output

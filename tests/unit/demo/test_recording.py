@@ -12,8 +12,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader
 
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S
-from ros2_memory.demo.messages import definition
-from ros2_memory.demo.published_topics import STREAMS, MessageSchedule, Stream
+from ros2_memory.demo.messages import STREAMS, MessageSchedule, Stream, definition
 from ros2_memory.demo.recording import DemoRecorder
 from tests.support.clocks import FixedClock
 
@@ -100,10 +99,3 @@ def test_the_newest_message_at_a_moment_is_the_last_one_heard_by_then(
     assert TIMELINE.newest(stream, at) == (heard[-1] if heard else None)
     assert TIMELINE.count(stream, at) == len(heard)
     assert list(TIMELINE.newest_first(stream, at)) == heard[::-1]
-
-
-@given(st.sampled_from(STREAMS), st.integers(0, 10_000))
-def test_a_message_is_heard_within_a_millisecond_of_its_publication(stream: Stream, k: int) -> None:
-    message = MessageSchedule(T0, T0).message(stream, k)
-    assert message.publish_time == T0 + k * stream.period
-    assert 0 < message.log_time - message.publish_time < NS_PER_MS

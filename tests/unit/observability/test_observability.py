@@ -1,21 +1,34 @@
-"""The adapters of the telemetry port: figures for Prometheus, spans for OpenTelemetry."""
+"""The adapters of the telemetry port: figures for Prometheus, spans for OpenTelemetry.
+
+Gauges of a memory are measured without a look at its bags.
+"""
 
 from __future__ import annotations
 
 import threading
+import time
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, cast
 
 import pytest
 from mcp import Client, MCPError
 
+from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.core.errors import ConfigError, NoDataError, NoDataReason
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Telemetry
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.history.context import QuerySettings
+from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.serving.mcp_server import EpisodicServer
+from tests.support.bags import text, write_mcap
+from tests.support.clocks import SettableClock
+from tests.support.memories import memory_of
 from tests.unit.serving.test_dispatch import served, tool, value
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from opentelemetry.sdk.trace import ReadableSpan
     from prometheus_client.metrics_core import Metric
@@ -39,8 +52,9 @@ from ros2_memory.observability.opentelemetry import (
     provider_to,
     traces_from_environment,
 )
-from ros2_memory.observability.prometheus import Metrics
+from ros2_memory.observability.prometheus import MemoryGauges, Metrics
 
+T0 = 1_700_000_000 * NS_PER_S
 Samples = dict[tuple[str, frozenset[tuple[str, str]]], float]
 
 
@@ -63,16 +77,6 @@ def at(found: Samples, name: str, **labels: str) -> float:
 
 
 class TestMetrics:
-    async def test_answers_are_counted_by_tool_and_outcome(self) -> None:
-        metrics = Metrics(lambda: (), "1.2.3")
-        for outcome in ("ok", "ok", "no_data: gap", "timeout"):
-            metrics.answered(call(outcome=outcome))
-        found = await scraped(metrics)
-        assert at(found, "answers_total", tool="ask", outcome="ok", reason="") == 2
-        assert at(found, "answers_total", tool="ask", outcome="no_data", reason="gap") == 1
-        assert at(found, "answers_total", tool="ask", outcome="timeout", reason="") == 1
-        assert at(found, "build_info", version="1.2.3") == 1
-
     async def test_whatever_clients_call_their_tools_labels_stay_few_and_whole(self) -> None:
         metrics = Metrics(lambda: (), "1")
         full = tool("full", partial(asking, "full"))
@@ -108,6 +112,85 @@ class TestMetrics:
         finally:
             freed.set()
             metrics.stop()
+
+
+def heartbeat(pid: int, updated: int) -> Heartbeat:
+    return Heartbeat(
+        pid=pid,
+        updated=updated,
+        state=RecorderState.PAUSED,
+        recordings=(),
+        since=T0,
+        bytes_written=700,
+        subscribed=("/a", "/b"),
+        silent=("/b",),
+        last_error=None,
+        interval_s=2.0,
+    )
+
+
+def measured(gauges: MemoryGauges) -> dict[str, float]:
+    """The values of this moment, by name and label."""
+    return {
+        " ".join((sample.name.removeprefix("ros2_memory_"), *sample.labels.values())): sample.value
+        for family in gauges()
+        for sample in family.samples
+    }
+
+
+def test_the_bag_directory_is_not_scanned_for_them(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "a" / "a_0.mcap", [text(T0, "x")])
+    memory = memory_of(tmp_path)
+    gauges = MemoryGauges(memory)
+    assert measured(gauges) == {}
+    memory.index.refresh()
+    first = measured(gauges)
+    write_mcap(tmp_path / "b" / "b_0.mcap", [text(T0, "x")])
+    (tmp_path / "broken.mcap").write_bytes(b"x" * 1000)
+    again = measured(gauges)
+    assert (first["bags"], again["bags"], again["files_set_aside damaged"]) == (1, 1, 0)
+    memory.index.refresh()
+    last = measured(gauges)
+    assert (last["bags"], last["kept_bytes"] > first["kept_bytes"]) == (2, True)
+    aside = [last[f"files_set_aside {state}"] for state in ("active", "damaged", "unread")]
+    assert aside == [0, 1, 0]
+
+
+def test_they_show_how_much_is_kept_and_how_old_the_newest_is(tmp_path: Path) -> None:
+    path = tmp_path / "a" / "a_0.mcap"
+    write_mcap(path, [text(T0, "x"), text(T0 + NS_PER_S, "y")])
+    clock = SettableClock(time.time_ns() + 3600 * NS_PER_S)
+    kept = RetentionLimits(max_total_bytes=5000, max_age_ns=NS_PER_S, min_free_bytes=0)
+    memory = memory_of(tmp_path, clock=clock, limits=QuerySettings(kept=kept))
+    memory.index.refresh()
+    scanned, clock.at = clock.at, clock.at + 4 * NS_PER_S
+    found = measured(MemoryGauges(memory))
+    assert found["budget_bytes"] == 5000
+    assert not any(name.startswith("recorder") for name in found)
+    assert found["kept_bytes"] == path.stat().st_size
+    assert found["index_age_seconds"] == 4.0
+    assert found["newest_data_age_seconds"] == (scanned - T0) / NS_PER_S + 3
+
+
+def test_they_show_what_the_recorder_reports_and_whether_it_is_another_one(tmp_path: Path) -> None:
+    clock = SettableClock(T0 + 9 * NS_PER_S)
+    gauges = MemoryGauges(memory_of(tmp_path, clock=clock))
+    write_heartbeat(tmp_path, heartbeat(7, T0 + 5 * NS_PER_S))
+    found = measured(gauges)
+    states = {each: found[f"recorder_state {each}"] for each in RecorderState}
+    assert [each for each, is_it in states.items() if is_it] == [RecorderState.PAUSED]
+    assert (found["recorder_live"], found["recorder_heartbeat_age_seconds"]) == (1, 4.0)
+    assert found["recorder_written_bytes_total"] == 700
+    assert found["recorder_silent_topics"] == 1
+    assert found["recorder_restarts_total"] == 0
+    assert found["recorder_state_since_timestamp_seconds"] == T0 / NS_PER_S
+    write_heartbeat(tmp_path, replace(heartbeat(7, T0 + 5 * NS_PER_S), lost={"/odom": 3}))
+    assert measured(gauges)["recorder_lost_messages /odom"] == 3
+    for pid, restarts in ((7, 0), (8, 1), (8, 1), (9, 2)):
+        write_heartbeat(tmp_path, replace(heartbeat(pid, T0), interval_s=2.0))
+        assert measured(gauges)["recorder_restarts_total"] == restarts
+    clock.at += 3600 * NS_PER_S
+    assert measured(gauges)["recorder_live"] == 0
 
 
 @pytest.fixture

@@ -11,12 +11,13 @@ hold them (`retention.eraser`).
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
 
-from ros2_memory.bag_dir.handover_file import Handover, read_handover
+from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
@@ -139,7 +140,10 @@ class _Forget:
         self._dry_run = dry_run
         self._bag_dir = settings.recording.bag_dir
         self._reader = build_reader(settings)  # reads files as they are
-        self._recorder = _recorder_of(self._bag_dir)
+        self._recorder: str | None = None  # why one holds the bag directory
+        if (self._bag_dir / LOCK_FILE).exists():  # else none does, and nothing is written
+            with _recorder_locked_out(self._bag_dir) as self._recorder:
+                pass
         self._unread: set[Path] = set()  # bags whose first messages are unknown
         snapshot = memory.index.snapshot()
         self._written = {aside.path: self._may_hold(aside, snapshot) for aside in snapshot.active}
@@ -246,11 +250,9 @@ class _Forget:
         going, kept = self._planned(window)
         self._stays([*kept, *self._kept_elsewhere(going, window)])
         if not going:
-            why = (
-                "each bag with messages in the window stays, for the reason above"
-                if kept
-                else "no closed bag has messages in the window"
-            )
+            why = "no closed bag has messages in the window"
+            if kept:
+                why = "each bag with messages in the window stays, for the reason above"
             print_line(f"nothing to delete: {why}")
             self._forget_derived(())
             return
@@ -309,19 +311,16 @@ class _Forget:
 
     def _raw_bags(self, snapshot: Snapshot) -> Iterator[BagFile]:
         """Yields the bags with all messages in them, also those that do not count."""
-        handovers: dict[Path, Handover] = {}
+        handover_of = cache(read_handover)
         for bag in (*snapshot.bags, *snapshot.copies):
-            if bag.sidecar_ns:
-                if bag.recording not in handovers:
-                    handovers[bag.recording] = read_handover(bag.recording).handover
-                if handovers[bag.recording].rule(bag.path.name) is not None:
-                    try:
-                        summary = self._reader.summarize(bag.path)
-                    except BagError:
-                        self._unread.add(bag.path)
-                    else:
-                        start, end = summary.start, summary.end
-                        bag = bag._replace(summary=summary, start=start, end=end)  # noqa: PLW2901
+            if bag.sidecar_ns and handover_of(bag.recording).handover.rule(bag.path.name):
+                try:
+                    summary = self._reader.summarize(bag.path)
+                except BagError:
+                    self._unread.add(bag.path)
+                else:
+                    start, end = summary.start, summary.end
+                    bag = bag._replace(summary=summary, start=start, end=end)  # noqa: PLW2901
             yield bag
         for path in snapshot.empty:
             with suppress(BagError, OSError):
@@ -336,13 +335,12 @@ class _Forget:
         if not window.covers(bag.start, bag.end):
             return "it reaches beyond the window"
         if self._own is not None and not self._own.owns_bag(bag.path):
-            folder = self._own.name_of(bag.path.parent)
             adopt = (
-                f"`ros2-memory adopt {folder}` first"
-                if folder
-                else "move it into a directory of its own in the bag directory and let "
+                "move it into a directory of its own in the bag directory and let "
                 "`ros2-memory adopt` take that"
             )
+            if folder := self._own.name_of(bag.path.parent):
+                adopt = f"`ros2-memory adopt {folder}` first"
             return f"this recorder did not make it; to forget it, {adopt}"
         if bag.state is BagState.INCOMPLETE:
             closes = "; ros2-memory recover closes it" if bag.path.suffix == ".mcap" else ""
@@ -382,12 +380,17 @@ class _Forget:
                 for bag in planned
                 if bag[:3] in present and (self._own is None or self._own.owns_bag(bag.path))
             ]
-            kept, carried = list[str](), None
+            kept, carried, paths = list[str](), None, {bag.path for bag in bags}
             if recorder is None:
-                paths = {bag.path for bag in bags}
                 carried = self._carrier.carry(snapshot, paths, _with_other_links(bags))
-            else:
-                bags, kept = self._without_latched(bags, snapshot, recorder)
+            else:  # it carries latched messages itself, and two programs must not do so at a time
+                latched = {bag.path for bag in self._carrier.with_latched(snapshot, paths)}
+                bags = [bag for bag in bags if bag.path not in latched]
+                kept += [
+                    f"{self._name(path)}: it has latched messages, which only the recorder may "
+                    f"copy forward while it runs: {recorder}; stop the recorder, and forget again"
+                    for path in sorted(latched)
+                ]
             kept += self._ask_lake(bags)
             self._note_deletions(bags, kept)
             deleted, freed = self._delete_files(bags, kept)
@@ -413,37 +416,19 @@ class _Forget:
         for note in notes:
             print_line(note)
 
-    def _without_latched(
-        self, bags: Sequence[BagFile], snapshot: Snapshot, recorder: str
-    ) -> tuple[list[BagFile], list[str]]:
-        """Returns the bags that may go beside a recorder, and a line for each other one.
-
-        A live recorder carries latched messages itself, and two programs must not do so at a time.
-        """
-        latched = sorted(self._carrier.with_latched(snapshot, {bag.path for bag in bags}))
-        stay = {bag.path for bag in latched}
-        return [bag for bag in bags if bag.path not in stay], [
-            f"{self._name(bag)}: it has latched messages, which only the recorder may copy forward "
-            f"while it runs: {recorder}; stop the recorder, and forget again"
-            for bag in latched
-        ]
-
     def _ask_lake(self, bags: Sequence[BagFile]) -> list[str]:
         """Has a lake forget what it has of bags; returns a line on each thing that it keeps."""
-        known = [bag for bag in bags if bag.path not in self._unread]
-        kept = [
-            f"what a lake has of {self._name(bag)}, which cannot be read"
-            for bag in bags
-            if bag.path in self._unread
-        ]
-        if not known:
-            return kept
-        start = min(min(bag.summary.start, bag.start) for bag in known)
-        stop = max(bag.end for bag in known) + 1
-        forgotten = [
-            ForgottenBag(bag.recording.name, bag.path.name, bag.summary.start) for bag in known
-        ]
-        return kept + self._request_of_lake([Forgetting(start, stop, bags=tuple(forgotten))])
+        known, kept, times = list[ForgottenBag](), list[str](), list[Ns]()
+        for bag in bags:
+            if bag.path in self._unread:
+                kept.append(f"what a lake has of {self._name(bag)}, which cannot be read")
+                continue
+            start = bag.summary.start
+            known.append(ForgottenBag(bag.recording.name, bag.path.name, start))
+            times += (start, bag.start, bag.end + 1)
+        if known:
+            kept += self._request_of_lake([Forgetting(min(times), max(times), bags=tuple(known))])
+        return kept
 
     def _note_deletions(self, bags: Sequence[BagFile], kept: list[str]) -> None:
         """Writes down what is about to be deleted, so that answers do not call it unrecorded."""
@@ -486,12 +471,12 @@ class _Forget:
             if recording in open_recordings and not listing.exists():
                 yield f"{name} will list deleted bags: the recorder writes it at the end"
                 continue
-            counts: dict[str, Counter[str]] = {}
+            counts = {
+                bag.path.name: Counter[str]() for bag in deleted if bag.recording == recording
+            }
             for bag in deleted:
-                if bag.recording == recording:
-                    of_bag = counts[bag.path.name] = Counter[str]()
-                    for topic in bag.summary.topics:
-                        of_bag[topic.topic] += topic.count
+                for topic in bag.summary.topics if bag.recording == recording else ():
+                    counts[bag.path.name][topic.topic] += topic.count
             try:
                 with directories.opened(self._bag_dir, recording):
                     is_listed = take_out(recording, counts)
@@ -545,8 +530,7 @@ class _Forget:
     def _name(self, of: BagFile | SetAside | Path) -> str:
         """Returns a path as people know it: relative to the bag directory, if it is in there."""
         path = of if isinstance(of, Path) else of.path
-        inside = path.is_relative_to(self._bag_dir)
-        return str(path.relative_to(self._bag_dir) if inside else path)
+        return str(path).removeprefix(f"{self._bag_dir}/")
 
 
 def _span(first: Ns, last: Ns) -> str:
@@ -556,19 +540,10 @@ def _span(first: Ns, last: Ns) -> str:
 def _with_other_links(bags: Sequence[BagFile]) -> set[Path]:
     """Returns the bags that have further hard links, as saved moments have."""
     linked = set()
-    for bag in bags:
+    for path in (bag.path for bag in bags):
         with suppress(OSError):
-            if bag.path.lstat().st_nlink > 1:
-                linked.add(bag.path)
+            linked |= {path} if path.lstat().st_nlink > 1 else set()
     return linked
-
-
-def _recorder_of(bag_dir: Path) -> str | None:
-    """Returns why a recorder holds the bag directory; None where none does. Writes nothing."""
-    if not (bag_dir / LOCK_FILE).exists():
-        return None
-    with _recorder_locked_out(bag_dir) as recorder:
-        return recorder
 
 
 @contextmanager

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-from rich.console import Console
 
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE, METADATA_FILE
@@ -94,7 +93,6 @@ def recover_files(
     *,
     force: bool = False,
     dry_run: bool = False,
-    console: Console | None = None,
     clock: Clock | None = None,
 ) -> RecoveryOutcome:
     """Repairs one file, or every MCAP file below a directory.
@@ -104,7 +102,6 @@ def recover_files(
         report: takes a line for each file that was not whole, and one at the end.
         force: also repairs what changed in the last half minute.
         dry_run: changes nothing, and reports what would be changed.
-        console: where a progress bar is shown, if it is a terminal; stderr unless given.
         clock: the wall clock.
 
     Raises:
@@ -114,7 +111,7 @@ def recover_files(
     files, others = _files_below(path, clock)
     sizes = [size_of(file) for file in files]
     recovery = _Recovery(clock, force, build_repairer(), dry_run=dry_run)
-    with progress_bar(console) as bar:
+    with progress_bar() as bar:
         task = bar.add_task("", total=max(sum(sizes), 1))
         for file, done in zip(files, accumulate(sizes, initial=0), strict=False):
             name = str(file if file == path else file.relative_to(path))

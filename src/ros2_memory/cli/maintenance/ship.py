@@ -55,7 +55,10 @@ def ship(
     """
     settings, _ = load_for(None, overrides)
     window = _window_of(forget, times)
-    _keep_little_memory()
+    # Has what a batch took go back before the next: Arrow's own heap kept as much of each. It is
+    # read by Arrow when it is loaded, which nothing has done yet.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
+    share_one_arena()
     location, shared = lake_location(settings), shared_parts(settings)
     robots = build_robots(settings, shared)
     # The extra is there: `lake_location` has checked that.
@@ -86,13 +89,6 @@ def ship(
     if done.forgotten:
         _note_versions(location)
     return bool(done.waiting or done.problems)
-
-
-def _keep_little_memory() -> None:
-    """Has what a batch took go back before the next: Arrow's own heap kept as much of each."""
-    # Read by Arrow when it is loaded, which nothing has done yet.
-    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-    share_one_arena()
 
 
 def _window_of(robot: str | None, times: Times) -> TimeWindow | None:

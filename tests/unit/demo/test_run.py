@@ -1,7 +1,11 @@
-"""How the demo's server is started: on a free port, and by nobody's settings but the demo's."""
+"""How the demo's server is started, on a free port and by nobody's settings; and what is printed.
+
+That fits a terminal, and leaves nothing of an answer unsaid.
+"""
 
 from __future__ import annotations
 
+import json
 import threading
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -11,10 +15,40 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.errors import ConfigError
-from ros2_memory.demo.run import run_demo, running_server, server_environment
+from ros2_memory.demo.questions import QUESTIONS, Exchange, Question
+from ros2_memory.demo.run import format_exchange, run_demo, running_server
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
+REPLY = json.dumps(
+    {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},
+    separators=(",", ":"),
+)
+
+
+@pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.words)
+def test_every_line_fits_a_hundred_columns(question: Question) -> None:
+    exchange = Exchange(question, REPLY, "It was in the hall. " * 12, right=True)
+    assert all(len(line) <= 100 for line in format_exchange(12, exchange).splitlines())
+
+
+def test_the_call_is_shown_as_it_was_made() -> None:
+    question = next(one for one in QUESTIONS if one.tool == "get_position_seconds_ago")
+    lines = format_exchange(
+        3, Exchange(question, '{"x":1,"y":2}', "There.", right=True)
+    ).splitlines()
+    assert lines == [
+        " 3. Where was I 10 s ago?",
+        "    get_position_seconds_ago(seconds_ago=10)",
+        "    => There.",
+        '    {"x":1,"y":2}',
+    ]
+
+
+def test_a_long_reply_is_cut_and_says_so() -> None:
+    last = format_exchange(1, Exchange(QUESTIONS[0], REPLY, "Yes.", right=True)).splitlines()[-1]
+    assert f"{len(REPLY):,} characters in all" in last
 
 
 @contextmanager
@@ -42,31 +76,9 @@ def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_pa
         port = theirs.server_port
         with (
             pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"),
-            running_server(tmp_path, port, print, split_duration_s=5.0),
+            running_server(tmp_path, port, print),
         ):
             pass
-
-
-def test_the_callers_settings_do_not_reach_the_server(tmp_path: Path) -> None:
-    caller = {
-        "PATH": "/bin",
-        "MEMORY_DEPLOYMENT": "robot",
-        "MEMORY_CONFIG_DIR": "elsewhere",
-        "MCP_TRANSPORT": "stdio",
-        "ROS_VISION_INTERFACES_PATH": "elsewhere",
-        "XDG_CACHE_HOME": "/home/someone/.cache",
-    }
-    environment = server_environment(caller, tmp_path, 9203, 5.0, "/elsewhere")
-    overrides = environment.pop("MEMORY_CONFIG_OVERRIDES").split()
-    assert environment == {
-        "PATH": "/bin",
-        "MCP_TRANSPORT": "sse",
-        "MCP_HOST": "127.0.0.1",
-        "MCP_PORT": "9203",
-        "MEMORY_BAG_DIR": str(tmp_path),
-        "XDG_CACHE_HOME": "/elsewhere",
-    }
-    assert {"recorder=none", "recording.split_duration_s=5"} <= set(overrides)
 
 
 @pytest.mark.parametrize("duration_s", [89.9, 86_401.0, float("nan")])
