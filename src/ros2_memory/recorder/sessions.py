@@ -14,13 +14,11 @@ from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
-from ros2_memory.recorder.handover.transfer import (
+from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
     SUBSCRIBE_TIMEOUT_S,
     HandoverTransfer,
     Step,
-)
-from ros2_memory.recorder.handover.union import (
     give_up,
     settle_handover,
     unsettled_handovers,
@@ -71,7 +69,7 @@ class Orders:
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
-        subscribe_timeout_s: how long a handover waits for topics (see `handover.transfer`).
+        subscribe_timeout_s: how long a handover waits for topics (see `handover`).
     """
 
     bag_dir: Path

@@ -1,7 +1,7 @@
 """Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
 Everything happens in `tick`, which the main thread calls several times a second and which does not
-wait. `policies` and `handover.transfer` decide what to do, and `sessions` does it; here they meet.
+wait. `policies` and `handover` decide what to do, and `sessions` does it; here they meet.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, 
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.sd_notify import Watchdog
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.transfer import Step
+from ros2_memory.recorder.handover import Step
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
     RESUME_FACTOR,

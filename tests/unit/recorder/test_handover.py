@@ -22,9 +22,14 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover import union
-from ros2_memory.recorder.handover.transfer import Bounds, complete_sidecars, pending
-from ros2_memory.recorder.handover.union import intended, settle_handover, void
+from ros2_memory.recorder import handover
+from ros2_memory.recorder.handover import (
+    complete_sidecars,
+    intended,
+    pending,
+    settle_handover,
+    void,
+)
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, text, write_mcap
 from tests.support.examples import examples
@@ -140,7 +145,7 @@ def hand_over(
     clock: CutClock = CutClock.PUBLISH,
 ) -> None:
     """Writes the sidecars of a handover that was complete two seconds after both recorded."""
-    at = [T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 1, both_s + 2)]
+    began, both, ended = (T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 2))
     before, after = (bag_dir / name for name in names)
 
     def files(folder: Path) -> list[str]:
@@ -148,14 +153,16 @@ def hand_over(
         return [
             file
             for file, each in spans.items()
-            if each.empty or (each.end >= at[1] if folder == before else each.start <= at[3])
+            if each.empty or (each.end >= both if folder == before else each.start <= ended)
         ]
 
     old, new = complete_sidecars(
         read_handover(before).handover,
         before.name,
         after.name,
-        Bounds(*at),
+        began=began,
+        both=both,
+        ended=ended,
         old_files=files(before),
         new_files=files(after),
         simulated=False,
@@ -286,7 +293,7 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
 def test_where_too_many_would_be_listed_all_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(union, "MOST_LISTED", 5)
+    monkeypatch.setattr(handover, "MOST_LISTED", 5)
     published = publications(13)
     Recorder(0, 7.5).writes(tmp_path / "a", published)
     Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)

@@ -20,8 +20,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover.transfer import pending
-from ros2_memory.recorder.handover.union import intended, void
+from ros2_memory.recorder.handover import intended, pending, void
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, tf, transform, write_mcap
 from tests.support.handovers import recover_handovers

@@ -10,10 +10,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.handover_file import CutClock, Handover
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.handover.transfer import (
-    Bounds,
-    complete_sidecars,
-)
+from ros2_memory.recorder.handover import complete_sidecars
 from ros2_memory.recorder.policies import ClockReading, set_back
 
 T0 = 1_795_150_000 * NS_PER_S
@@ -55,15 +52,13 @@ def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays
     delays: tuple[float, float],
     ends_after_s: float,
 ) -> None:
-    bounds = Bounds(
-        T0, T0 + round(subscribed_s * S), T0 + round((subscribed_s + 1) * S),
-        T0 + round((subscribed_s + 2) * S),
-    )  # fmt: skip
     old, new = complete_sidecars(
         Handover(),
         "a",
         "b",
-        bounds,
+        began=T0,
+        both=T0 + round(subscribed_s * S),
+        ended=T0 + round((subscribed_s + 2) * S),
         old_files=["a.mcap"],
         new_files=["b.mcap"],
         simulated=False,
