@@ -21,7 +21,7 @@ from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.command import record_argv, storage_config
 from ros2_memory.recorder.process.output import LineKind, parse_line
 from ros2_memory.recorder.process.topics import TopicSelection
-from ros2_memory.recorder.reception.reception import QueuePlan, qos_overrides
+from ros2_memory.recorder.reception import QueuePlan, qos_overrides
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

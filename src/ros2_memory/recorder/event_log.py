@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import structlog
 
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.output import Line, LineKind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from ros2_memory.core.timebase import Clock, Ns
 
@@ -33,6 +35,7 @@ _ADVICE = {
 
 _LASTING = frozenset({LineKind.UNKNOWN_TYPE, LineKind.SEVERAL_TYPES, LineKind.QOS_REFUSED})
 _MOST_TOPICS = 1000
+_HOUSEKEEPING = "housekeeping_failed"
 
 
 class EventLog:
@@ -74,12 +77,24 @@ class EventLog:
         self._note_error(sentence)
         _log.error(event, reason=sentence, **values)
 
-    def fail_once(self, event: str, subject: str, sentence: str, **values: object) -> None:
-        """Logs as `fail` does, once for each subject until `resolve` is called for it."""
-        if (event, subject) not in self._unresolved:
+    def lasting(self, event: str, subject: str, fault: str | None, **values: object) -> None:
+        """Logs a fault as `fail` does, once for each subject until it is None."""
+        if fault is None:
+            self._unresolved.discard((event, subject))
+        elif (event, subject) not in self._unresolved:
             self._unresolved.add((event, subject))
-            self.fail(event, sentence, **values)
+            self.fail(event, fault, **values)
             self._lasting = (event, subject)
+
+    @contextmanager
+    def lasting_if_refused(self, event: str, subject: str, **values: object) -> Iterator[None]:
+        """Logs a `RecorderError` of the block as `lasting`; without one the fault is over."""
+        try:
+            yield
+        except RecorderError as error:
+            self.lasting(event, subject, str(error), **values)
+        else:
+            self.lasting(event, subject, None)
 
     def recorded(self) -> None:
         """Notes that recording goes on: the last fault is past, unless it lasts."""
@@ -97,19 +112,11 @@ class EventLog:
         self.last_error, self.last_error_at = sentence, self._clock.now()
         self.recovered, self._lasting = False, None
 
-    def resolve(self, event: str, subject: str) -> None:
-        """Has `fail_once` log the fault when it comes again."""
-        self._unresolved.discard((event, subject))
-
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each task of the housekeeper that fails, once for as long as it does."""
-        self._unresolved = {
-            (event, task)
-            for event, task in self._unresolved
-            if event != "housekeeping_failed" or task in faults
-        }
-        for task, sentence in faults.items():
-            self.fail_once("housekeeping_failed", task, sentence, task=task)
+        failed_before = [task for event, task in self._unresolved if event == _HOUSEKEEPING]
+        for task in {*failed_before, *faults}:
+            self.lasting(_HOUSEKEEPING, task, faults.get(task), task=task)
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:
         """Logs what the `ros2 bag record` of a recording printed."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ros2_memory.recorder.reception.measure import Arrival, Arrivals, SplitMeasure
+from ros2_memory.recorder.measure import Arrival, Arrivals, SplitMeasure
 
 S = 10**9
 

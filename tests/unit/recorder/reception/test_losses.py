@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.state_files import Loss
-from ros2_memory.recorder.reception.measure import (
+from ros2_memory.recorder.measure import (
     HOUR_NS,
     LossCounter,
     Position,

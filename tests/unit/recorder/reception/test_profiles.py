@@ -7,8 +7,8 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.recorder.reception.measure import OfferedQos, TopicFlow, offered_by_all
-from ros2_memory.recorder.reception.reception import plan_queues, qos_overrides
+from ros2_memory.recorder.measure import OfferedQos, TopicFlow, offered_by_all
+from ros2_memory.recorder.reception import plan_queues, qos_overrides
 
 MIB = 2**20
 RELIABLE = OfferedQos(reliable=True, latched=False)

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from ros2_memory.bag_dir.state_files import Loss, read_losses
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.recorder.reception import measure
-from ros2_memory.recorder.reception import reception as reception_module
-from ros2_memory.recorder.reception.measure import OfferedQos, TopicFlow, measure_split
-from ros2_memory.recorder.reception.reception import (
+from ros2_memory.recorder import measure
+from ros2_memory.recorder import reception as reception_module
+from ros2_memory.recorder.measure import OfferedQos, TopicFlow, measure_split
+from ros2_memory.recorder.reception import (
     ASK_AGAIN_S,
     ASKED_FOR,
     DEEPEN_EVERY_S,
@@ -32,8 +33,9 @@ def split(path: Path, hz: int, seconds: int, topic: str = "/odom") -> Path:
     return write_mcap(path, [odom(T0 + tick * NS // hz, 1.0, 2.0, topic=topic) for tick in ticks])
 
 
-def reception(queue_bytes: int = 2**26) -> Reception:
-    return Reception(McapReader(), queue_bytes, latched=["/tf_static"], background=Inline())
+def reception(bag_dir: Path, **how: Any) -> Reception:
+    given = {"latched": ["/tf_static"], **how}
+    return Reception(McapReader(), 2**26, bag_dir=bag_dir, background=Inline(), **given)
 
 
 def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
@@ -42,7 +44,7 @@ def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
 
 
 def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     assert profiles(made, "a").keys() == {"/tf_static"}
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
@@ -57,7 +59,7 @@ def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: 
 
 
 def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = made.rotation_due("a", 10.0)
@@ -72,7 +74,7 @@ def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) ->
 
 
 def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     made.recall([split(tmp_path / "old.mcap", 50, 4)])
     assert "/odom" in profiles(made, "a")
     made.refused("a", "/odom")
@@ -90,8 +92,8 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
 
 
-def test_a_topic_taken_for_latched_that_is_not_adapts_too() -> None:
-    made = reception()
+def test_a_topic_taken_for_latched_that_is_not_adapts_too(tmp_path: Path) -> None:
+    made = reception(tmp_path)
     made.overrides("a")
     made.refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
@@ -101,7 +103,7 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
     tmp_path: Path,
 ) -> None:
     """A split names the publishers that its recording had discovered, often not all."""
-    made, topics = reception(), ("/map", "/tf_static")
+    made, topics = reception(tmp_path), ("/map", "/tf_static")
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
     latched = write_mcap(tmp_path / "a.mcap", messages, McapLayout(latched=frozenset(topics)))
     made.overrides("a")
@@ -131,7 +133,7 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
 def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_has_gone(
     tmp_path: Path,
 ) -> None:
-    made = reception()
+    made = reception(tmp_path)
     splits = [split(tmp_path / f"a_{nth}.mcap", 5, 4) for nth in range(2)]
     made.overrides("a")
     made.learn("a", splits[0])
@@ -145,7 +147,7 @@ def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_h
 
 
 def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic="/map") for at in range(9)]
     layout = McapLayout(latched=frozenset(["/map"]))
     made.overrides("a")
@@ -156,7 +158,7 @@ def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -
 
 
 def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
-    made = Reception(McapReader(), bag_dir=tmp_path, background=Inline())
+    made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
     made.refused("a", "/odom")
@@ -201,7 +203,7 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
     split(folder / "x_0.mcap", 100, 20)
     (folder / "x_1.mcap").write_bytes(b"nothing")
     split(folder / "x_2.mcap", 50, 1, topic="/scan")
-    made = reception()
+    made = reception(tmp_path)
     made.recall(newest_splits(tmp_path))
     asked = profiles(made, "a")
     assert (asked["/odom"]["depth"], asked["/scan"]["depth"]) == (400, 200)
@@ -209,7 +211,7 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
 
 
 def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
-    made = Reception(McapReader(), volatile=["/rosout"], background=Inline())
+    made = reception(tmp_path, volatile=["/rosout"])
     topics = ("/rosout", "/map")
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
     layout = McapLayout(latched=frozenset(topics))
@@ -220,7 +222,7 @@ def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) ->
 
 def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> None:
     """Unless another publisher of the topic may have one, or it is not known who publishes it."""
-    made = reception()
+    made = reception(tmp_path)
     topics = ("/map", "/tf_static", "/shared", "/plan")
     messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
     layout = McapLayout(latched=frozenset(topics))

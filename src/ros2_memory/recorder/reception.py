@@ -7,7 +7,7 @@ that came later, takes a rotation. What the splits show is measured beside the r
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -21,8 +21,7 @@ from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.recorder.background import Background
-from ros2_memory.recorder.reception.measure import (
+from ros2_memory.recorder.measure import (
     Arrivals,
     LossCounter,
     TopicFlow,
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.recorder.background import Background
     from ros2_memory.storage.base import BagReader
 
 DEFAULT_DEPTH: Final = 10
@@ -59,23 +59,18 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     Where that is not enough, no topic takes more than an equal share of what the smaller ones
     leave. At least one message of each is held, however large.
     """
-    depths: dict[str, int] = {}
+    sizes = {topic: flow.message_bytes for topic, flow in flows.items()}
     for factor in (HEADROOM, 1):
         depths = {topic: max(DEFAULT_DEPTH, factor * flow.burst) for topic, flow in flows.items()}
-        if (
-            sum(depth * flows[topic].message_bytes for topic, depth in depths.items())
-            <= queue_bytes
-        ):
+        if sum(depth * sizes[topic] for topic, depth in depths.items()) <= queue_bytes:
             return QueuePlan(depths)
-    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     # One message of each, and shares of what is then left.
-    left, topics = queue_bytes - sum(flow.message_bytes for flow in flows.values()), len(wanted)
-    for topic in sorted(wanted, key=lambda name: wanted[name] * flows[name].message_bytes):
-        size = flows[topic].message_bytes
-        more = min(wanted[topic] - 1, max(0, left) // topics // size)
+    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
+    left, depths = max(0, queue_bytes - sum(sizes.values())), {}
+    for nth, topic in enumerate(sorted(wanted, key=lambda name: wanted[name] * sizes[name])):
+        more = min(wanted[topic] - 1, left // (len(wanted) - nth) // sizes[topic])
         depths[topic] = 1 + more
-        left -= more * size
-        topics -= 1
+        left -= more * sizes[topic]
     short = frozenset(topic for topic, depth in depths.items() if depth < flows[topic].burst)
     return QueuePlan(depths, short)
 
@@ -137,7 +132,6 @@ ASKED_FOR: Final = 8
 """So many recordings ask for what fits the publisher that was last refused, or best effort. What
 splits name are the publishers that were discovered in time, often not all: they do not show that it
 has gone."""
-QUEUE_BYTES: Final = 64 * 2**20
 _UNNOTICED_NS: Final[Ns] = 5 * NS_PER_S
 """So long a publisher may have sent before rosbag2 says that it was refused."""
 _PLANS_KEPT: Final = 8
@@ -184,7 +178,7 @@ class Reception:
     Args:
         reader: reads splits that are closed.
         queue_bytes: what the queues of all topics together may take.
-        bag_dir: where losses are written; nowhere where None.
+        bag_dir: where losses are written.
         latched: topics that count as latched, see `qos_overrides`.
         volatile: topics that are not asked for their earlier messages once a split has shown them.
         background: measures splits and writes losses beside the recorder's loop.
@@ -196,18 +190,18 @@ class Reception:
     def __init__(
         self,
         reader: BagReader,
-        queue_bytes: int = QUEUE_BYTES,
+        queue_bytes: int,
         *,
-        bag_dir: Path | None = None,
+        bag_dir: Path,
         latched: Collection[str] = (),
         volatile: Collection[str] = (),
-        background: Background | None = None,
+        background: Background,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
         self._latched = tuple(latched)
         self._volatile = tuple(volatile)
-        self._background = background or Background()
+        self._background = background
         self._bag_dir = bag_dir
         self._losses = LossCounter()
         self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
@@ -245,7 +239,7 @@ class Reception:
             best_effort = {
                 topic
                 for topic, asked in anew.items()
-                if asked.best_effort or topic not in {*flows, *adapting}
+                if asked.best_effort or topic not in self._flows.keys() | adapting
             }
             alone = (name for name, flow in flows.items() if flow.offered.publishers == 1)
             volatile = {*self._volatile, *self._skipped.intersection(alone), *anew}
@@ -306,9 +300,9 @@ class Reception:
     def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
             losses = take()
-        by_topic: dict[str, int] = {}
+        by_topic = Counter[str]()
         for loss in losses:
-            by_topic[loss.topic] = by_topic.get(loss.topic, 0) + loss.lost
+            by_topic[loss.topic] += loss.lost
         for topic, lost in by_topic.items():
             _log.warning(
                 "messages_missing",
@@ -318,7 +312,7 @@ class Reception:
                 "or rosbag2's count: lost on the way to the disk, or never published",
             )
         self._unwritten += losses
-        if self._bag_dir is not None and self.may_write and self._unwritten:
+        if self.may_write and self._unwritten:
             try:
                 append_losses(self._bag_dir, self._unwritten)
             except OSError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -114,17 +114,16 @@ class LossCounter:
 
     def __init__(self) -> None:
         self._measured = 0
-        # Of each recording, how many splits had been measured when it was last heard of.
-        self._heard: dict[str, int] = {}
-        # Up to which log time each recording has been measured.
-        self._reached: dict[str, Ns] = {}
+        # Of each recording, how many splits had been measured when it was last heard of, and up to
+        # which log time it has been.
+        self._recordings: dict[str, tuple[int, Ns]] = {}
         self._series: dict[str, _Series] = {}
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self._counted: set[str] = set()
 
     def begun(self, recording: str) -> None:
         """Notes that a recording begins, which may have what another one misses."""
-        self._heard[recording] = self._measured
+        self._recordings[recording] = self._measured, 0
 
     def unclear(self, topics: Collection[str] | None = None) -> None:
         """Notes that a split does not show what it has of these topics; None: of any."""
@@ -134,16 +133,17 @@ class LossCounter:
     def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
         """Takes the next split of a recording; returns the losses that are certain by now."""
         self._measured += 1
-        self._heard[recording] = self._measured
+        _, reached = self._recordings.get(recording, (0, 0))
+        ends = (progress.positions[-1].log_time for progress in split.values())
+        self._recordings[recording] = self._measured, max(reached, *ends, 0)
         for topic, progress in split.items():
-            reached = max(self._reached.get(recording, 0), progress.positions[-1].log_time)
-            self._reached[recording] = reached
             self._add(topic, progress)
-        for name, heard in [*self._heard.items()]:
-            if self._measured - heard >= RECENT:
-                del self._heard[name]
-                self._reached.pop(name, None)
-        return self._settle(min(self._reached.get(name, 0) for name in self._heard))
+        self._recordings = {
+            name: (heard, reached)
+            for name, (heard, reached) in self._recordings.items()
+            if self._measured - heard < RECENT
+        }
+        return self._settle(min(reached for _, reached in self._recordings.values()))
 
     def flush(self) -> list[Loss]:
         """Returns what no further split will fill."""
@@ -159,11 +159,11 @@ class LossCounter:
 
     def in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are missing of the last hour."""
-        lost: dict[str, int] = {}
+        lost = Counter[str]()
         for loss in self._lately:
             if loss.stop > now - HOUR_NS:
-                lost[loss.topic] = lost.get(loss.topic, 0) + loss.lost
-        return lost
+                lost[loss.topic] += loss.lost
+        return dict(lost)
 
     def _add(self, topic: str, progress: Progress) -> None:
         """Puts what a split has of a topic together with what is known of it."""
@@ -179,12 +179,13 @@ class LossCounter:
             series, positions = None, positions[back[0] :]
         elif series is not None and last.value < series.positions[0].value:
             series = None  # likewise, or the clock was set back
-        known_positions = [] if series is None else series.positions
-        by_value = dict(sorted((*known_positions, *positions), reverse=True))
-        merged = [Position(*item) for item in sorted(by_value.items())]
-        if series is not None:
-            settled = series.positions[0]
-            merged = [position for position in merged if position.value >= settled.value]
+        known = [] if series is None else series.positions
+        by_value = dict(sorted((*known, *positions), reverse=True))
+        merged = [
+            Position(value, log_time)
+            for value, log_time in sorted(by_value.items())
+            if not known or value >= known[0].value
+        ]
         self._series[topic] = _Series(progress.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:
@@ -592,8 +593,8 @@ class Arrivals:
             return {}
         start = min(split.start for split in self._splits)
         duration_s = max(self._newest + idle - start, 1) / NS_PER_S
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for split in self._splits:
             for name, arrival in split.arrivals.items():
-                counts[name] = counts.get(name, 0) + arrival.messages
+                counts[name] += arrival.messages
         return {name: count / duration_s for name, count in counts.items()}
