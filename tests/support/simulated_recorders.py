@@ -200,9 +200,7 @@ class World:
             clock=WorldClock(self),
             topics=topics,
             own=OwnRecordings(bag_dir),
-            reception=Reception(
-                self.reader, 2**26, bag_dir=bag_dir, background=self.background
-            ),
+            reception=Reception(self.reader, 2**26, bag_dir=bag_dir, background=self.background),
             background=self.background,
             required=required,
             **(plan | orders),  # type: ignore[arg-type]

@@ -51,7 +51,13 @@ from ros2_memory.bag_dir.layout import (
     split_name,
     split_number,
 )
-from ros2_memory.core.directories import Identity, identity_of, known_identity
+from ros2_memory.core.directories import (
+    Identity,
+    identity_of,
+    is_folder,
+    known_identity,
+    mode_of,
+)
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import COMPRESSED
 
@@ -282,12 +288,8 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read_if_changed()
-                folders = () if exists else self._bag_dir.iterdir()
-                left = sorted(
-                    path.name
-                    for path in folders
-                    if has_own_name(path.name) and path.is_dir() and not path.is_symlink()
-                )
+                folders = () if exists else filter(is_folder, self._bag_dir.iterdir())
+                left = sorted(path.name for path in folders if has_own_name(path.name))
             except OSError as error:
                 raise self._failure(error, "read") from error
             rows = self._find_completed(custom_data)
@@ -447,9 +449,7 @@ class OwnRecordings:
         gone = []
         for name in names:
             with suppress(OSError):  # a disk that fails hides what is there
-                try:
-                    os.lstat(self._bag_dir / name)
-                except (FileNotFoundError, NotADirectoryError):
+                if not mode_of(self._bag_dir / name):
                     gone.append(name)
         return gone
 
@@ -603,10 +603,7 @@ def is_regular(path: Path) -> bool:
     Raises:
         OSError: it cannot be looked up.
     """
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except FileNotFoundError:
-        return False
+    return stat.S_ISREG(mode_of(path))
 
 
 def bags_in(folder: Path) -> list[Path]:

@@ -115,7 +115,7 @@ class EventLog:
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each task of the housekeeper that fails, once for as long as it does."""
         failed_before = [task for event, task in self._unresolved if event == _HOUSEKEEPING]
-        for task in {*failed_before, *faults}:
+        for task in (*failed_before, *faults):
             self.lasting(_HOUSEKEEPING, task, faults.get(task), task=task)
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:

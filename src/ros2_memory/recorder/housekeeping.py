@@ -467,34 +467,30 @@ class Housekeeping(Housekeeper):
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        candidates = [path for path in paths if path.suffix == _MCAP and self._may_repair(path)]
-        if not candidates:
-            return 0
-        named, opened = _named_in_heartbeat(self._bag_dir), open_files()
-        repaired = 0
-        for path in candidates:
-            with suppress(OSError):
+        named, repaired = _named_in_heartbeat(self._bag_dir), 0
+        opened: Collection[tuple[int, int]] | None = None
+        for path in paths:
+            try:
                 status = path.lstat()
-                if path.parent in named or (status.st_dev, status.st_ino) in opened:
-                    continue
-                self._tried.add((path, status.st_size, status.st_mtime_ns))
-                repaired += self._repair_file(path)
+            except OSError:
+                continue
+            state = path, status.st_size, status.st_mtime_ns
+            if path.suffix != _MCAP or state in self._tried or path.parent in named:
+                continue
+            if self._links.is_saved(str(path)) or not self._may_repair(path, status):
+                continue
+            opened = open_files() if opened is None else opened
+            if (status.st_dev, status.st_ino) not in opened:
+                self._tried.add(state)
+                with suppress(OSError):
+                    repaired += self._repair_file(path)
         return repaired
 
-    def _may_repair(self, path: Path) -> bool:
-        """Whether a file may be repaired and its repair was not tried before.
+    def _may_repair(self, path: Path, status: os.stat_result) -> bool:
+        """Whether a file is the recorder's, or of another program and unchanged for a while.
 
-        In a recording of another program it must not have changed for a while: the heartbeat does
-        not name what other programs write.
+        The heartbeat does not name what other programs write.
         """
-        try:
-            status = path.lstat()
-        except OSError:
-            return False
-        if (path, status.st_size, status.st_mtime_ns) in self._tried:
-            return False
-        if self._links.is_saved(str(path)):
-            return False
         if self._keeps_foreign:
             return self._own.owns_bag(path)
         unchanged_for = abs(self._clock.now() - status.st_mtime_ns)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import struct
+from bisect import bisect_right
 from collections import Counter, deque
 from dataclasses import dataclass
 from functools import partial
@@ -33,6 +35,8 @@ LONGEST_NS: Final[Ns] = 5 * NS_PER_S
 """A longer hole is a publisher that was silent, and reported as that."""
 MOST_MISSING: Final = 10_000
 _TOLERANCE: Final = 0.25
+_FIELD: Final = re.compile(r"^[ \t]*(\w\S*)[ \t]+(\w+)\b(?![ \t]*=)", re.MULTILINE)
+"""Type and name of each field; a constant has a value behind a `=`."""
 _HEADERS: Final = frozenset({"std_msgs/Header", "std_msgs/msg/Header", "Header"})
 _TIMES: Final = frozenset(
     f"builtin_interfaces/{middle}{name}" for middle in ("", "msg/") for name in ("Time", "Duration")
@@ -231,7 +235,7 @@ def reader_of(schema: Schema) -> ValueReader | None:
     """Returns what shows holes in messages of this type; None where nothing does."""
     if schema.encoding != "ros2msg":
         return None
-    fields = _fields(schema.text.decode(errors="replace"))
+    fields = _FIELD.findall(schema.text.decode(errors="replace").partition("\n===")[0])
     before: list[str] = []
     for kind, name in fields:
         if name in _COUNTERS and (form := _FORMS.get(kind)) in _COUNTED:
@@ -253,16 +257,14 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
     A message that was stamped late leaves a wide step, too, but then the next ones follow in a
     burst. So what counts is how far behind the cadence the messages after the step remain.
     """
-    if len(positions) < FEWEST:
-        return None
-    if sum(before.value >= after.value for before, after in pairwise(positions)) > 1:
-        return None
     steps = [(before, after, after.value - before.value) for before, after in pairwise(positions)]
     lengths = [length for _, _, length in steps if length > 0]
-    usual = 1 if kind == "counter" else median_low(lengths or [0])
+    if len(positions) < FEWEST or len(steps) - len(lengths) > 1:
+        return None
+    usual = 1 if kind == "counter" else median_low(lengths)
     allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
     regular = [length for length in lengths if abs(length - usual) <= allowed]
-    if usual <= 0 or len(regular) < REGULAR * len(steps):
+    if len(regular) < REGULAR * len(steps):
         return None
     period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
     holes_found: list[Hole] = []
@@ -281,19 +283,6 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
         if (missing := round(behind / period)) > 0:
             holes_found.append(Hole(before, after, missing, len(later) < enough))
     return holes_found
-
-
-def _fields(text: str) -> list[tuple[str, str]]:
-    """Returns type and name of each field of the message itself."""
-    fields: list[tuple[str, str]] = []
-    for raw in text.splitlines():
-        line = raw.partition("#")[0].strip()
-        if line.startswith("==="):
-            break
-        words = line.split()
-        if len(words) >= 2 and "=" not in "".join(words[1:3]):
-            fields.append((words[0], words[1]))
-    return fields
 
 
 def _stamp(payload: bytes) -> int:
@@ -506,17 +495,13 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
 
 
 def burst_of(published: Sequence[Ns]) -> int:
-    """Returns the most messages within `HOLD_S`.
+    """Returns the most messages within `HOLD_S`, of times of one or more.
 
     A shorter topic is assumed to continue at its rate: it may have just started.
     """
     ordered = sorted(published)
-    most, first = 0, 0
-    for last, at in enumerate(ordered):
-        while at - ordered[first] >= _HOLD_NS:
-            first += 1
-        most = max(most, last - first + 1)
-    lasted = ordered[-1] - ordered[0] if ordered else 0
+    counts = (nth - bisect_right(ordered, at - _HOLD_NS) for nth, at in enumerate(ordered, 1))
+    most, lasted = max(counts), ordered[-1] - ordered[0]
     if len(ordered) >= _FEWEST and 0 < lasted < _HOLD_NS:
         return max(most, -(-(len(ordered) - 1) * _HOLD_NS // lasted))
     return most

@@ -10,7 +10,7 @@ import threading
 from collections import Counter, deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import structlog
 import yaml
@@ -75,47 +75,10 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     return QueuePlan(depths, short)
 
 
-def qos_overrides(
-    flows: Mapping[str, TopicFlow],
-    plan: QueuePlan,
-    *,
-    latched: Collection[str],
-    best_effort: Collection[str] = (),
-    volatile: Collection[str] = (),
-) -> str:
-    """Returns YAML for `--qos-profile-overrides-path`.
-
-    Args:
-        flows: the topics whose QoS is known.
-        plan: the depths of their queues.
-        latched: the topics that count as latched and may have many publishers. All of their
-            messages are asked for, unless their publishers are known to be volatile, or it is one
-            of `best_effort` or `volatile`.
-        best_effort: topics with a publisher that was refused, or is best effort. They are asked for
-            with what fits every publisher: rosbag2 itself asks for more where it has not discovered
-            all of them, and a split names only those that it had. Who subscribes with best effort
-            is sent no earlier messages, so they are volatile as well.
-        volatile: topics whose earlier messages are not asked for again, though they are latched.
-    """
-    volatile = {*volatile, *best_effort}
-    profiles = {topic: _profile(plan.depth(topic)) for topic in best_effort}
-    for topic, flow in flows.items():
-        profiles[topic] = _profile(
-            plan.depth(topic),
-            reliable=flow.offered.reliable and topic not in best_effort,
-            latched=flow.offered.latched and topic not in volatile,
-        )
-    for topic in {*latched}.difference(best_effort):
-        offered = flows[topic].offered if topic in flows else None
-        if offered is None or (offered.latched and topic not in volatile):
-            reliable = offered is None or offered.reliable
-            profiles[topic] = _profile(None, reliable=reliable, latched=True)
-    return yaml.safe_dump(profiles, sort_keys=True)
+_Profile: TypeAlias = dict[str, str | int]
 
 
-def _profile(
-    depth: int | None, *, reliable: bool = False, latched: bool = False
-) -> dict[str, str | int]:
+def _profile(depth: int | None, *, reliable: bool = False, latched: bool = False) -> _Profile:
     """Returns a QoS profile; with None in place of a depth all messages are kept."""
     return {
         **({"history": "keep_all"} if depth is None else {"history": "keep_last", "depth": depth}),
@@ -179,7 +142,7 @@ class Reception:
         reader: reads splits that are closed.
         queue_bytes: what the queues of all topics together may take.
         bag_dir: where losses are written.
-        latched: topics that count as latched, see `qos_overrides`.
+        latched: topics that count as latched.
         volatile: topics that are not asked for their earlier messages once a split has shown them.
         background: measures splits and writes losses beside the recorder's loop.
 
@@ -222,36 +185,49 @@ class Reception:
             return self._plan_queues().cut_short
 
     def overrides(self, recording: str) -> str:
-        """Returns the QoS overrides for a recording that is about to start."""
+        """Returns the QoS overrides (YAML) for a recording that is about to start."""
         with self._lock:
-            plan = self._plan_queues()
-            anew = self._asked_anew
+            plan, anew = self._plan_queues(), self._asked_anew
+            topics = {*self._flows, *anew, *self._latched}
+            profiles = {topic: self._profile_of(topic, plan) for topic in topics}
             self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
-            # A latched topic that is asked for as volatile would lose what was published before:
-            # rosbag2 decides by the publishers that it finds.
-            adapting = {
-                topic for topic in self._latched if topic in anew and not anew[topic].best_effort
-            }
-            flows = {topic: flow for topic, flow in self._flows.items() if topic not in adapting}
-            best_effort = {
-                topic
-                for topic, asked in anew.items()
-                if asked.best_effort or topic not in self._flows.keys() | adapting
-            }
-            alone = (name for name, flow in flows.items() if flow.offered.publishers == 1)
-            volatile = {*self._volatile, *self._skipped.intersection(alone), *anew}
-            latched = [topic for topic in self._latched if topic not in adapting]
             self._asked_anew = {
                 topic: asked._replace(recordings=asked.recordings - 1)
                 for topic, asked in anew.items()
                 if asked.recordings > 1
             }
-            return qos_overrides(
-                flows, plan, latched=latched, best_effort=best_effort, volatile=volatile
-            )
+        chosen = {topic: profile for topic, profile in profiles.items() if profile is not None}
+        return yaml.safe_dump(chosen, sort_keys=True)
+
+    def _profile_of(self, topic: str, plan: QueuePlan) -> _Profile | None:
+        """Returns the QoS with which a topic is asked for; None where rosbag2 chooses it.
+
+        One with a publisher that was refused, or is best effort, is asked for with what fits every
+        publisher: rosbag2 itself asks for more where it has not discovered all of them, and a split
+        names only those that it had. Who subscribes with best effort is sent no earlier messages,
+        so it is volatile as well. Of a topic that counts as latched, and may have many publishers,
+        all messages are asked for, unless its publishers are known to be volatile.
+        """
+        flow, asked = self._flows.get(topic), self._asked_anew.get(topic)
+        counts_as_latched, depth = topic in self._latched, plan.depth(topic)
+        if asked is not None and counts_as_latched and not asked.best_effort:
+            # As volatile it would lose what was published before: rosbag2 decides by the publishers
+            # that it finds.
+            return None
+        if flow is None:
+            everything = _profile(None, reliable=True, latched=True)
+            return everything if asked is None else _profile(depth)
+        reliable, latched, publishers = flow.offered
+        is_skipped = topic in self._skipped and publishers == 1
+        latched &= asked is None and topic not in self._volatile and not is_skipped
+        return _profile(
+            None if latched and counts_as_latched else depth,
+            reliable=reliable and not (asked is not None and asked.best_effort),
+            latched=latched,
+        )
 
     def skip_latched(self, topics: Collection[str]) -> None:
         """Sets the topics whose latched message the next recordings are not to ask for.
@@ -403,8 +379,7 @@ class Reception:
             for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
                 if state is None or topic not in state.refused:
-                    old_flow = self._flows.get(topic)
-                    self._flows[topic] = flow if old_flow is None else old_flow.joined(flow)
+                    self._flows[topic] = self._flows.get(topic, flow).joined(flow)
                     if not flow.offered.reliable:
                         self._asked_anew[topic] = _Anew(best_effort=True)
             short = self._plan_queues().cut_short - before

@@ -49,13 +49,11 @@ class TestRecordedTime:
 class TestSpace:
     def world(self, tmp_path: Path) -> tuple[World, PlayedHousekeeper]:
         housekeeping = PlayedHousekeeper()
-        world = World(tmp_path, housekeeper=housekeeping)
-        housekeeping.world = world
-        return world, housekeeping
+        housekeeping.world = World(tmp_path, housekeeper=housekeeping).started(3)
+        return housekeeping.world, housekeeping
 
     def test_a_disk_that_fills_is_first_made_room_on(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.started(3)
         housekeeping.frees_to = 5000
         world.free = 900
         world.run(3)
@@ -79,7 +77,6 @@ class TestSpace:
 
     def test_a_pause_that_a_stop_ends_is_noted(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.started(3)
         world.free = 900
         paused = world.wall
         world.run(30)
@@ -91,7 +88,6 @@ class TestSpace:
 
     def test_it_resumes_by_itself_when_more_than_that_is_free(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.started(3)
         world.free = 900
         paused = world.wall
         world.run(3)
@@ -118,7 +114,6 @@ class TestSpace:
 
     def test_while_it_pauses_room_is_asked_for_again_now_and_then(self, tmp_path: Path) -> None:
         world, housekeeping = self.world(tmp_path)
-        world.started(3)
         world.free = 900
         world.run(200)
         assert 3 <= housekeeping.asked.count("room 1200") <= 5

@@ -21,6 +21,8 @@ from tests.support.simulated_recorders import (
 
 pytestmark = pytest.mark.usefixtures("no_flushing")
 
+UNKNOWN = "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
+
 
 class TestWatch:
     def test_a_robot_that_falls_silent_has_its_last_split_closed_once(self, tmp_path: Path) -> None:
@@ -158,16 +160,6 @@ class TestWaiting:
         world.run(10)
         assert (world.heartbeat()["state"], world.heartbeat()["waiting_for"]) == ("recording", None)
 
-    def test_its_own_log_is_no_sign_of_the_robot(self, tmp_path: Path) -> None:
-        world = World(
-            tmp_path,
-            expected=("/rosout", "/odom"),
-            defaults={"topics": ("/rosout",), "heard": ("/rosout",)},
-        ).started(40)
-        beat = world.heartbeat()
-        assert beat["state"] == "waiting"
-        assert "no publisher offers any of the listed topics" in beat["waiting_for"]
-
     def test_a_recording_of_long_splits_waits_for_one_of_them(self, tmp_path: Path) -> None:
         world = World(tmp_path, split_duration_s=60, silent=True).started(58)
         assert world.heartbeat()["state"] == "recording"
@@ -175,23 +167,33 @@ class TestWaiting:
         assert world.heartbeat()["state"] == "waiting"
 
     @pytest.mark.parametrize(
-        ("simulated", "topics", "expected"),
-        [(True, ("/odom",), "/clock"), (False, (), "no publisher offers")],
+        ("simulated", "topics", "heard", "expected"),
+        [
+            (True, ("/odom",), (), "/clock"),
+            (False, (), (), "no publisher offers any of the listed topics"),
+            # The recorder's own log is no sign of the robot.
+            (False, ("/rosout",), ("/rosout",), "no publisher offers any of the listed topics"),
+        ],
     )
     def test_simulated_time_and_a_wrong_domain_are_told_apart(
-        self, tmp_path: Path, simulated: bool, topics: tuple[str, ...], expected: str
+        self,
+        tmp_path: Path,
+        simulated: bool,
+        topics: tuple[str, ...],
+        heard: tuple[str, ...],
+        expected: str,
     ) -> None:
+        how = {"topics": topics, "heard": heard}
         world = World(
-            tmp_path, simulated=simulated, defaults={"topics": topics, "heard": ()}, silent=True
+            tmp_path, expected=("/rosout", "/odom"), simulated=simulated, defaults=how
         ).started(40)
+        assert world.heartbeat()["state"] == "waiting"
         assert expected in world.heartbeat()["waiting_for"]
 
 
 def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> None:
     world = World(tmp_path, expected=("/bumper", "/door", "/grip", "/arm")).started(2)
-    world.recorders[0].lines.append(
-        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
-    )
+    world.recorders[0].lines.append(UNKNOWN)
     [reported] = world.logged(30, "topics_not_recorded")
     assert "not recorded: /arm;" in reported["reason"]
     assert "of those that a glob selects, others of the same type" in reported["reason"]
@@ -200,9 +202,7 @@ def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> 
 
 def test_a_topic_of_an_unknown_type_that_is_dropped_is_no_fault(tmp_path: Path) -> None:
     world = World(tmp_path / "bags", expected=("/bumper", "/door", "/arm", "/never")).started(2)
-    world.recorders[0].lines.append(
-        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
-    )
+    world.recorders[0].lines.append(UNKNOWN)
     world.run(20)
     world.topics_path.write_text("topics: [/bumper, /door]\n")
     with capture_logs() as logs:
@@ -213,9 +213,7 @@ def test_a_topic_of_an_unknown_type_that_is_dropped_is_no_fault(tmp_path: Path) 
 
 def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> None:
     world = World(tmp_path, expected=("/bumper", "/door", "/arm"))
-    world.defaults["lines"] = [
-        "[WARN] [1.0] [rosbag2_recorder]: Topic '/arm' has unknown type 'arm_msgs/msg/Arm' ."
-    ]
+    world.defaults["lines"] = [UNKNOWN]
     world.started(20)
     assert "/arm" in str(world.heartbeat()["last_error"])
     world.recorders[0].die(-9)

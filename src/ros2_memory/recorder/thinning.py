@@ -76,18 +76,20 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
     if not is_dataclass(message) or isinstance(message, type):
         return message
     values = {
-        member.name: rounded(
-            getattr(message, member.name), definition, f"{path}.{member.name}".lstrip(".")
-        )
-        for member in fields(message)
-        if not member.name.startswith("__")
+        name: rounded(value, definition, f"{path}.{name}".lstrip("."))
+        for name, value in fields_in(message)
     }
     return replace(message, **values)
 
 
-def _rounded(
-    numbers: np.ndarray[tuple[int, ...], np.dtype[np.float64]], step: Step
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def fields_in(node: object) -> Iterator[tuple[str, object]]:
+    """Yields the fields of a decoded message, by name; none of what is no message."""
+    if is_dataclass(node) and not isinstance(node, type):
+        for member in fields(node):
+            yield member.name, getattr(node, member.name)
+
+
+def _rounded(numbers: Points, step: Step) -> Points:
     with np.errstate(invalid="ignore", over="ignore"):
         if step.per_unit:
             units = 2.0 ** ceil(log2(step.per_unit))
@@ -121,8 +123,7 @@ _LONG: Final = 64
 _DEGREE_M: Final = 111_320.0
 """Metres of a degree of latitude."""
 _FRAME: Final = "child_frame_id"
-_POINTS: Final = ("position", "translation")
-_TURNS: Final = ("orientation", "rotation")
+_TURNS: Final = {"position": "orientation", "translation": "rotation"}
 _MORE_NAMES: Final = frozenset({"location", "serial_number"})
 
 
@@ -337,14 +338,14 @@ class TopicThinning:
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         for slot in np.unique(times // EXTREMES_NS).tolist():
             rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
-            if not rows.size:
-                continue
-            samples = [*zip(numbers[rows].tolist(), times[rows].tolist(), strict=True)]
-            least, greatest = min(samples), max(samples, key=itemgetter(0))
-            least_before, most_before = self._extremes.get((path, slot), (least, greatest))
-            # Of equal ones the earliest.
-            most = max(most_before, greatest, key=itemgetter(0))
-            self._extremes[path, slot] = min(least_before, least), most
+            samples = [
+                *self._extremes.get((path, slot), ()),
+                *zip(numbers[rows].tolist(), times[rows].tolist(), strict=True),
+            ]
+            if samples:
+                # Of equal ones the earliest.
+                greatest = max(samples, key=itemgetter(0))
+                self._extremes[path, slot] = min(samples), greatest
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
@@ -354,7 +355,7 @@ class TopicThinning:
     def _add_states(self, path: str, inner: Elements, times: IntArray) -> None:
         """Adds the messages in which the states of a list change, as those of goals."""
         states = [
-            column
+            column.tolist()
             for column in inner.columns.values()
             if not isinstance(column, Texts)
             if column.dtype.itemsize == 1 and np.unique(column).size <= _FEW
@@ -362,9 +363,7 @@ class TopicThinning:
         if not states:
             return
         rows: list[tuple[object, ...]] = [()] * times.size
-        for owner, *values in zip(
-            inner.owners.tolist(), *(column.tolist() for column in states), strict=True
-        ):
+        for owner, *values in zip(inner.owners.tolist(), *states, strict=True):
             rows[owner] = (*rows[owner], *values)
         codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
         numbered = np.array([codes[value] for value in rows])
@@ -416,9 +415,9 @@ def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) 
     seen |= missing
     shown = [
         {
-            name: score[1]
-            for name, score in names.items()
-            if name in missing and missing[name][0] == score[0]
+            name: score
+            for name, (step, score) in names.items()
+            if name in missing and missing[name][0] == step
         }
         for names in named
     ]
@@ -444,16 +443,12 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
     """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
     poses: dict[str, Points] = {}
     for path in columns:
-        around, _, name = path.removesuffix(".x").rpartition(".")
-        if not path.endswith(".x") or name not in _POINTS:
-            continue
-        turn = _TURNS[_POINTS.index(name)]
-        names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
-        names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
-        poses |= _stacked(
-            path[:-2],
-            [columns[name_of_column] for name_of_column in names if name_of_column in columns],
-        )
+        point = path.removesuffix(".x")
+        around, _, name = point.rpartition(".")
+        if point != path and name in _TURNS:
+            names = [f"{point}.{axis}" for axis in "xyz"]
+            names += [f"{around}.{_TURNS[name]}.{axis}".lstrip(".") for axis in "xyzw"]
+            poses |= _stacked(point, [columns[one] for one in names if one in columns])
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
         poses |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
     if {"latitude", "longitude"} <= columns.keys():

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import json
 import operator
-import os
 import shutil
 import time
 from collections import Counter
@@ -22,7 +20,6 @@ import pytest
 import structlog
 from mcap.records import Chunk
 from mcap.stream_reader import StreamReader, breakup_chunk
-from starlette.datastructures import QueryParams
 
 from ros2_memory.bag_dir import json_files
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
@@ -30,23 +27,17 @@ from ros2_memory.bag_dir.durable_write import read_small_file
 from ros2_memory.bag_dir.layout import ERASING_FILE, LEAVING_FILE, SUPERSEDED_FILE, THINNED_FILE
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import read_superseded, read_thinned
-from ros2_memory.bootstrap import build_memory
 from ros2_memory.core.errors import BagError, BagUnreachableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
-from ros2_memory.history.context import Call
+from ros2_memory.recorder.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.index_manager import IndexManager
-from ros2_memory.recorder.memory.days import GRACE_S, MONTH_NS, MemoryDays, MemoryLimits
 from ros2_memory.retention import collect
 from ros2_memory.retention.delete import remove_bag
-from ros2_memory.retention.policy import RetentionLimits
-from ros2_memory.serving.page.routes import span_request
-from ros2_memory.serving.page.span import span_shown
 from ros2_memory.storage.base import BagWriter, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
-from ros2_memory.tools.reply_size import to_json_text
 from tests.support.bags import (
     Msg,
     battery,
@@ -62,8 +53,8 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import HOUR, Direct, own_all
-from tests.support.memories import reply_over, shipped_extractor, shipped_settings
+from tests.support.housekeepers import keeper_of, own_all
+from tests.support.memories import reply_over, shipped_extractor
 from tests.support.noting_reader import fail_reading
 from tests.support.program import Program, exits
 
@@ -125,29 +116,8 @@ def days_of(
     )
 
 
-def house(
-    bag_dir: Path,
-    now: int,
-    *,
-    max_age_h: float = 10**6,
-    max_bytes: int = 10**15,
-    memory: MemoryDays | None = None,
-    monotonic: Callable[[], float] = time.monotonic,
-) -> Housekeeping:
-    return Housekeeping(
-        bag_dir,
-        BagDirReader(McapReader()),
-        McapWriter(),
-        SettableClock(now),
-        RetentionLimits(max_bytes, round(max_age_h * HOUR), keeps_foreign=True),
-        is_synchronised=lambda: True,
-        split_duration_s=60.0,
-        static_topics=("/tf_static",),
-        moments_bytes=10**15,
-        monotonic=monotonic,
-        memory=memory,
-        background=Direct(),
-    )
+def house(bag_dir: Path, now: int, **how: Any) -> Housekeeping:
+    return keeper_of(bag_dir, clock=SettableClock(now), keeps_foreign=True, **how)
 
 
 def content_of(path: Path) -> bytes:
@@ -807,30 +777,6 @@ def delete_all(bag_dir: Path) -> None:
     assert not [*bag_dir.glob("rec_A/*.mcap")]
 
 
-def test_what_bags_show_besides_messages_is_known_when_they_are_gone(
-    bag_dir: Path, tmp_path: Path
-) -> None:
-    blind_for_three_minutes(bag_dir)
-    # The clock is set back by 5 s, and the last bag is left open.
-    split(tmp_path, 535).rename(bag_dir / "rec_A" / "rec_A_9.mcap")
-    last = split(tmp_path, 595).rename(bag_dir / "rec_A" / "rec_A_10.mcap")
-    last.write_bytes(last.read_bytes()[:-400])
-    os.utime(last, (T0 / S + 655,) * 2)
-    own_all(bag_dir)
-    before = shown(bag_dir)
-    [silence] = before[0]
-    assert silence["silent_s"] > 180
-    [step] = before[1]
-    assert step["step_s"] < -4
-    assert before[2] == 1
-    delete_all(bag_dir)
-    assert shown(bag_dir) == before
-    inside = {"start": silence["start"] + 60, "end": silence["end"]}
-    reply = reply_over(bag_dir, "data_time_range", **inside)
-    assert [each["topic"] for each in reply["silences"]] == ["/vision/scene/scene_objects"]
-    assert not reply["clock_steps"]
-
-
 def test_a_silence_is_forgotten_with_its_topic(
     bag_dir: Path, monkeypatch: pytest.MonkeyPatch, exits: Program
 ) -> None:
@@ -874,17 +820,7 @@ def test_days_whose_bags_nobody_looked_at_say_so(bag_dir: Path) -> None:
     assert said.endswith("are not known")
 
 
-def test_the_page_knows_which_days_are_thinned(bag_dir: Path) -> None:
-    split(bag_dir, 0)
-    keep_all(bag_dir)
-    shutil.rmtree(bag_dir / "rec_A")
-    memory = build_memory(shipped_settings(bag_dir))
-    shown = span_shown(memory, Call(), span_request(QueryParams("last=1000")))
-    [[first, last]] = json.loads(to_json_text(shown))["range"]["thinned"]
-    assert (first, last) == pytest.approx((T0 / S, T0 / S + 60), abs=1.0)
-
-
-GOLDEN = Path(__file__).resolve().parents[3] / "data" / "memory_day_1.mcap"
+GOLDEN = Path(__file__).resolve().parents[2] / "data" / "memory_day_1.mcap"
 """A day as the first version with this folder wrote it, of one minute."""
 
 
