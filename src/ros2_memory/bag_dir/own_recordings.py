@@ -288,8 +288,10 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read_if_changed()
-                folders = () if exists else filter(is_folder, self._bag_dir.iterdir())
-                left = sorted(path.name for path in folders if has_own_name(path.name))
+                paths = () if exists else self._bag_dir.iterdir()
+                left = sorted(
+                    path.name for path in paths if has_own_name(path.name) and is_folder(path)
+                )
             except OSError as error:
                 raise self._failure(error, "read") from error
             rows = self._find_completed(custom_data)

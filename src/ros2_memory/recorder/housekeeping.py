@@ -120,7 +120,7 @@ class Housekeeping(Housekeeper):
         self._background = background or Background()
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
-        self._keeps_foreign = limits.keeps_foreign
+        self._limits = limits
         self._collector = GarbageCollector(
             bag_dir,
             limits,
@@ -151,8 +151,6 @@ class Housekeeping(Housekeeper):
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
         self._clock = clock
-        self._max_bytes = limits.max_total_bytes
-        self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._out_of_reach = False
@@ -182,7 +180,7 @@ class Housekeeping(Housekeeper):
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
-            if self._keeps_foreign:
+            if self._limits.keeps_foreign:
                 is_own = self._own.owns(directory)
                 if not is_own and self._own.began(directory):
                     # Killed before it was listed as a directory: nothing shows whose it is.
@@ -359,7 +357,7 @@ class Housekeeping(Housekeeper):
         return collected
 
     def _describe_held(self, bags: int) -> str:
-        limit = f"{self._max_age_h:g} h"
+        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
         return (
             f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
             "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
@@ -406,14 +404,15 @@ class Housekeeping(Housekeeper):
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        if before.total_bytes <= self._max_bytes < collected.total_bytes:
+        most = self._limits.max_total_bytes
+        if before.total_bytes <= most < collected.total_bytes:
             state, saved = collected.state_bytes, collected.saved_bytes
             others = collected.total_bytes - state - saved
             _log.error(
                 "budget_not_held",
                 total_bytes=collected.total_bytes,
                 state_bytes=state,
-                reason=f"files that are never deleted exceed {self._max_bytes / _MB:.3g} MB: "
+                reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
                 f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
                 f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
                 "raise retention.max_total_gb",
@@ -455,7 +454,7 @@ class Housekeeping(Housekeeper):
             for name in names:
                 path = directory / name
                 is_bag = name.endswith(_MCAP) and not left_by_repair(name)
-                if is_bag and (not self._keeps_foreign or self._own.owns_bag(path)):
+                if is_bag and (not self._limits.keeps_foreign or self._own.owns_bag(path)):
                     self._repair_file(path)
             # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
@@ -491,7 +490,7 @@ class Housekeeping(Housekeeper):
 
         The heartbeat does not name what other programs write.
         """
-        if self._keeps_foreign:
+        if self._limits.keeps_foreign:
             return self._own.owns_bag(path)
         unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)

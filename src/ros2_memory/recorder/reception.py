@@ -162,8 +162,8 @@ class Reception:
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
-        self._latched = tuple(latched)
-        self._volatile = tuple(volatile)
+        self._latched = latched
+        self._volatile = volatile
         self._background = background
         self._bag_dir = bag_dir
         self._losses = LossCounter()

@@ -18,7 +18,7 @@ them: `memory/thinned.json` states them.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from math import ceil, isnan, log2, nan
 from operator import itemgetter
@@ -192,30 +192,6 @@ class _Mover:
 
 
 @dataclass(slots=True)
-class _Changes:
-    """The changes of an integer in some minutes: the log times before each, and of each.
-
-    Attributes:
-        values: that it had, up to one more than are few.
-    """
-
-    values: set[int] = field(default_factory=set)
-    count: int = 0
-    _times: list[IntArray] = field(default_factory=list)
-
-    def add(self, numbers: Numbers, before: IntArray, after: IntArray) -> None:
-        """Adds those among some numbers."""
-        if len(self.values) <= _FEW:
-            self.values.update(np.unique(numbers)[: _FEW + 1].tolist())
-        self.count += after.size
-        self._times += [before, after]
-
-    def times(self, most: int) -> Sequence[IntArray]:
-        """Returns the log times, if the values are few or no more than `most` changes."""
-        return self._times if len(self.values) <= _FEW or self.count <= most else ()
-
-
-@dataclass(slots=True)
 class TopicThinning:
     """Chooses the messages of a topic that stay; its tables are added in order of time.
 
@@ -233,8 +209,11 @@ class TopicThinning:
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
     _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
     """The least and the greatest value of a column in some minutes."""
-    _changes: dict[tuple[str, int], _Changes] = field(default_factory=dict)
-    """Of integers, likewise."""
+    _changes: defaultdict[tuple[str, int], list[tuple[Numbers, IntArray, IntArray]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    """Of integers, likewise: their values, up to one more than are few, and the log times before
+    each change, and of each."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
@@ -308,9 +287,12 @@ class TopicThinning:
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
         extremes = [extreme[1] for both in self._extremes.values() for extreme in both]
-        most = EXTREMES_NS // self.numbers_ns * _OFTEN
-        changed = (time for changes in self._changes.values() for time in changes.times(most))
-        return np.unique(np.concatenate([*self._stays, *changed, np.array(extremes, np.int64)]))
+        stays, most = [*self._stays, np.array(extremes, np.int64)], EXTREMES_NS // self.numbers_ns
+        for parts in self._changes.values():
+            values, before, after = map(np.concatenate, zip(*parts, strict=True))
+            if np.unique(values).size <= _FEW or after.size <= most * _OFTEN:
+                stays += [before, after]
+        return np.unique(np.concatenate(stays))
 
     def _changed(
         self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
@@ -332,8 +314,8 @@ class TopicThinning:
         slots, slots_after = times // EXTREMES_NS, after // EXTREMES_NS
         for slot in np.unique(slots).tolist():
             inside = slots_after == slot
-            changes = self._changes.setdefault((path, slot), _Changes())
-            changes.add(column[slots == slot], before[inside], after[inside])
+            values = np.unique(column[slots == slot])[: _FEW + 1]
+            self._changes[path, slot].append((values, before[inside], after[inside]))
 
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         for slot in np.unique(times // EXTREMES_NS).tolist():

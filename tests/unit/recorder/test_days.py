@@ -7,7 +7,7 @@ import operator
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache
@@ -75,6 +75,11 @@ def split(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(content_of_split(start, None if labels is None else (*labels,)))
     return path
+
+
+def splits(bag_dir: Path, minutes: Iterable[int]) -> None:
+    for minute in minutes:
+        split(bag_dir, 60 * minute)
 
 
 @cache
@@ -183,8 +188,7 @@ def bag_dir(tmp_path: Path) -> Path:
 
 
 def test_a_day_has_what_changes_and_what_was_seen_and_no_text(bag_dir: Path) -> None:
-    for nth in range(3):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(3))
     keep_all(bag_dir)
     found = topics_in(bag_dir)
     assert "/chatter" not in found
@@ -535,8 +539,7 @@ def test_the_oldest_days_go_by_age_and_by_size_and_all_when_nothing_is_to_stay(
 
 
 def test_after_a_month_numbers_have_one_message_a_minute(bag_dir: Path) -> None:
-    for nth in range(10):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(10))
     own_all(bag_dir)
     days = days_of(bag_dir)
     keep_all(bag_dir, days=days)
@@ -596,8 +599,7 @@ def test_a_damaged_day_is_not_thinned_so_that_it_still_says_so(bag_dir: Path) ->
 
 def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
     """Splits of 13:20 to 14:40; at 14:10 plus a day the hour from 13:00 is too old."""
-    for nth in range(0, 80, 10):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(0, 80, 10))
     own_all(bag_dir)
     asked = {"timestamp": (T0 + 600 * S) / S}
     exact = reply_over(bag_dir, "get_position_at", **asked)
@@ -623,8 +625,7 @@ def test_age_deletes_whole_hours_and_what_stays_answers(bag_dir: Path) -> None:
 
 
 def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
-    for nth in range(3):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(3))
     keep_all(bag_dir, limits=MemoryLimits(texts=("/chat*",)))
     shutil.rmtree(bag_dir / "rec_A")
     wanted = {"topic": "/chatter", "condition_type": "contains"}
@@ -636,8 +637,7 @@ def test_never_is_said_with_what_did_not_stay(bag_dir: Path) -> None:
 
 
 def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_dir: Path) -> None:
-    for nth in range(0, 80, 10):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(0, 80, 10))
     split(bag_dir, 86_400 + 3000, name="rec_B")
     own_all(bag_dir)
     monotonic = SettableClock(0)
@@ -656,8 +656,7 @@ def test_age_waits_a_day_where_a_day_cannot_be_written_and_then_no_longer(bag_di
 
 
 def test_where_a_day_cannot_be_written_no_more_goes_than_the_budget_needs(bag_dir: Path) -> None:
-    for nth in range(10):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(10))
     split(bag_dir, 7200, name="rec_B")
     own_all(bag_dir)
     sizes = [path.stat().st_size for path in bag_dir.rglob("*.mcap")]
@@ -676,8 +675,7 @@ def test_a_full_disk_costs_no_more_of_what_stays_than_makes_room_for_the_rest(
                 raise OSError(errno.ENOSPC, "No space left on device")
             super().write(path, records, **how)
 
-    for nth in range(10):
-        split(bag_dir, 60 * nth)
+    splits(bag_dir, range(10))
     split(bag_dir, 7200, name="rec_B")
     own_all(bag_dir)
     memory = days_of(bag_dir, writer=FullAtFirst())
