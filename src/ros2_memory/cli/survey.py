@@ -13,6 +13,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final
 
+import yaml
+
 from ros2_memory.cli.proposal import INDEX_BYTES, MESSAGE_BYTES, Choice, Offered, chosen, judge
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
@@ -21,7 +23,7 @@ from ros2_memory.recorder.process.child import Child, end_all
 from ros2_memory.recorder.process.command import record_argv, storage_config
 from ros2_memory.recorder.process.output import LineKind, parse_line
 from ros2_memory.recorder.process.topics import TopicSelection
-from ros2_memory.recorder.reception import QueuePlan, qos_overrides
+from ros2_memory.recorder.reception import ALL_MESSAGES
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -70,7 +72,7 @@ def survey(ros: Installation, reader: BagReader, chunk_bytes: int, seconds: floa
     """
     with TemporaryDirectory(prefix="ros2-memory-up-") as name:
         folder = Path(name)
-        (folder / "qos.yaml").write_text(qos_overrides({}, QueuePlan({}), latched=["/tf_static"]))
+        (folder / "qos.yaml").write_text(yaml.safe_dump({"/tf_static": ALL_MESSAGES}))
         (folder / "storage.yaml").write_text(storage_config(chunk_bytes))
         unknown, empty = _record(
             ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",)

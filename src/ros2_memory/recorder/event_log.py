@@ -17,11 +17,7 @@ if TYPE_CHECKING:
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
-_INFORM = {
-    LineKind.READY: "recording",
-    LineKind.SUBSCRIBED: "subscribed",
-    LineKind.STOPPED: "recorder_stopped",
-}
+_INFORM = frozenset({LineKind.READY, LineKind.SUBSCRIBED, LineKind.STOPPED})
 _ADVICE = {
     LineKind.QOS_REFUSED: ("messages of this publisher are not recorded: its QoS does not fit"),
     LineKind.UNKNOWN_TYPE: (
@@ -35,7 +31,6 @@ _ADVICE = {
 
 _LASTING = frozenset({LineKind.UNKNOWN_TYPE, LineKind.SEVERAL_TYPES, LineKind.QOS_REFUSED})
 _MOST_TOPICS = 1000
-_HOUSEKEEPING = "housekeeping_failed"
 
 
 class EventLog:
@@ -114,16 +109,16 @@ class EventLog:
 
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each task of the housekeeper that fails, once for as long as it does."""
-        failed_before = [task for event, task in self._unresolved if event == _HOUSEKEEPING]
-        for task in (*failed_before, *faults):
-            self.lasting(_HOUSEKEEPING, task, faults.get(task), task=task)
+        failed = [task for event, task in self._unresolved if event == "housekeeping_failed"]
+        for task in (*failed, *faults):
+            self.lasting("housekeeping_failed", task, faults.get(task), task=task)
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:
         """Logs what the `ros2 bag record` of a recording printed."""
         for line in lines:
             if line.kind in _INFORM:
                 topic = {} if line.topic is None else {"topic": line.topic}
-                self.info(_INFORM[line.kind], recording=recording, **topic)
+                self.info(line.kind.value, recording=recording, **topic)
             elif line.kind in _ADVICE:
                 about = f"{line.topic}: " if line.topic else ""
                 sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
@@ -134,7 +129,7 @@ class EventLog:
                 report(line.kind.value, sentence, recording=recording)
                 if lasts and len(self._of_topics) < _MOST_TOPICS:
                     self._of_topics.add((line.kind, line.topic or ""))
-            elif line.kind in {LineKind.ERROR, LineKind.FOLDER_EXISTS}:
+            elif line.kind is LineKind.ERROR:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)

@@ -87,6 +87,8 @@ def _profile(depth: int | None, *, reliable: bool = False, latched: bool = False
     }
 
 
+ALL_MESSAGES: Final = _profile(None, reliable=True, latched=True)
+"""Asks for all messages, also for earlier ones."""
 DEEPEN_EVERY_S: Final = 60.0
 """At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""
 ASK_AGAIN_S: Final = 300.0
@@ -218,8 +220,7 @@ class Reception:
             # that it finds.
             return None
         if flow is None:
-            everything = _profile(None, reliable=True, latched=True)
-            return everything if asked is None else _profile(depth)
+            return ALL_MESSAGES if asked is None else _profile(depth)
         reliable, latched, publishers = flow.offered
         is_skipped = topic in self._skipped and publishers == 1
         latched &= asked is None and topic not in self._volatile and not is_skipped

@@ -128,8 +128,8 @@ class TopicWatch:
                 "topics in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and "
                 "topics.yaml with the robot's"
             )
-        values = {} if current is None else {"recording": current.name}
-        self._events.lasting("recording_waits", "", self.waiting_for, **values)
+        name = current and current.name
+        self._events.lasting("recording_waits", "", self.waiting_for, recording=name)
 
     def _hears(self, session: RecordingSession) -> bool:
         """Whether a session has recorded something that may be of the robot."""
