@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.recorder.memory.days import MemoryDays
+    from ros2_memory.recorder.days import MemoryDays
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.retention.topic_ages import TopicCutter
@@ -219,7 +219,7 @@ def _memory_days_of(
     memory = settings.memory
     if not memory.keep and not (bag_dir / MEMORY_FOLDER).is_dir():
         return None
-    from ros2_memory.recorder.memory.days import MemoryDays, MemoryLimits
+    from ros2_memory.recorder.days import MemoryDays, MemoryLimits
 
     limits = MemoryLimits(
         memory.texts,

@@ -18,7 +18,7 @@ from ros2_memory.bag_dir.handover_file import (
 )
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover.union import settle_handover
+from ros2_memory.recorder.handover import settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.faults.world import write_bag
 from tests.support.handovers import recover_handovers

@@ -41,9 +41,11 @@ LEVELS: Final = {
     "error": "error",
     "exception": "error",
     "fail": "error",
-    "fail_once": "error",
+    "lasting": "error",
+    "lasting_if_refused": "error",
     "remark": "warning",
 }
+EXPLAINED: Final = {"warn", "remark", "fail", "lasting", "lasting_if_refused"}
 OPTIONS: Final[Mapping[str, tuple[str, str, type]]] = {
     "lake/duckdb.yaml": ("lake", "engine", DuckdbNode),
     "recorder/ros2bag.yaml": ("recorder", "", Ros2BagNode),
@@ -330,8 +332,12 @@ def events() -> list[Event]:
         for each in _events_of(ast.parse(path.read_text(encoding="utf-8")))
     }
     found |= {
-        Event(name, "info", ("recording", *(("topic",) if kind is LineKind.SUBSCRIBED else ())))
-        for kind, name in event_log._INFORM.items()
+        Event(
+            kind.value,
+            "info",
+            ("recording", *(("topic",) if kind is LineKind.SUBSCRIBED else ())),
+        )
+        for kind in event_log._INFORM
     }
     found |= {Event(kind.value, "warning", ("reason", "recording")) for kind in event_log._ADVICE}
     return sorted(found)
@@ -348,7 +354,7 @@ def _events_of(tree: ast.AST) -> Iterator[Event]:
         loggers = [each for each in choices if each.attr in LEVELS and _is_log(each.value)]
         for method in loggers:
             own = [word.arg for word in node.keywords if word.arg]
-            given = ["reason"] if method.attr in {"warn", "remark", "fail", "fail_once"} else []
+            given = ["reason"] if method.attr in EXPLAINED else []
             traced = ["exception"] if method.attr == "exception" else []
             yield Event(first.value, LEVELS[method.attr], (*given, *own, *traced))
 

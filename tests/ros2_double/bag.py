@@ -3,45 +3,29 @@
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-import zstandard
-
 from tests.ros2_double.definitions import full_text
-from tests.ros2_double.mcap_file import DISK_FULL, Layout, McapFile
+from tests.ros2_double.mcap_file import DISK_FULL, McapFile
 from tests.ros2_double.metadata import Info, Span, Topic, metadata_text, whole_file
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
+    from tests.ros2_double.arguments import Options
 
 _FLUSHING: Final = "Writing remaining messages from cache to the bag. It may take a while"
-
-
-@dataclass(frozen=True)
-class Writing:
-    """How a recording is written."""
-
-    directory: Path
-    layout: Layout
-    split_after_ns: int | None
-    custom: dict[str, str]
-    compress_files: bool
-    cached: bool
 
 
 class Bag:
     """An open recording. Making it makes the directory; `say` logs as (level, logger, text)."""
 
-    def __init__(self, how: Writing, say: Callable[[str, str, str], None]) -> None:
-        self._how = how
+    def __init__(self, options: Options, say: Callable[[str, str, str], None]) -> None:
+        self._options = options
         self._say = say
         self._topics: dict[str, Topic] = {}
-        compression = ("zstd", "FILE") if how.compress_files else ("", "")
-        self._info = Info(how.custom, compression)
-        how.directory.mkdir(parents=True)
+        self._info = Info(options.custom)
+        options.output.mkdir(parents=True)
         self._file = self._opened()
         self._list()
         self._file.metadata(metadata_text(self._info))
@@ -57,8 +41,8 @@ class Bag:
     def write(self, topic: str, payload: bytes, log_time: int, publish_time: int) -> None:
         """Writes a message; one that comes too late for this split opens the next one."""
         span = self._info.files[-1][1]
-        limit = self._how.split_after_ns
-        if limit is not None and log_time - span.start > limit:
+        limit = self._options.duration_s * 10**9
+        if limit and log_time - span.start > limit:
             self._split()
             span = self._info.files[-1][1]
         span.take(log_time)
@@ -75,11 +59,9 @@ class Bag:
         # The copy in the last file differs from those before it: it knows the topics.
         self._file.metadata(metadata_text(closing, self._topics.values()))
         self._file.close()
-        self._compress()
-        closing.paths = self._info.paths
         text = whole_file(metadata_text(closing, self._topics.values()))
         try:
-            (self._how.directory / "metadata.yaml").write_text(text, "utf-8")
+            (self._options.output / "metadata.yaml").write_text(text, "utf-8")
         except OSError as error:
             if error.errno not in DISK_FULL:
                 raise
@@ -94,7 +76,6 @@ class Bag:
         self._file.metadata(metadata_text(self._info))
         closed, self._file = self._file, self._opened()
         closed.close()
-        self._compress()
         self._file.metadata(metadata_text(self._info))
         self._list()
         # The real recorder declares in the order of a hash table: ids differ between files.
@@ -102,25 +83,11 @@ class Bag:
             self._declare(topic)
 
     def _flush(self) -> None:
-        if self._how.cached:
-            self._say("info", "rosbag2_cpp", _FLUSHING)
+        self._say("info", "rosbag2_cpp", _FLUSHING)
 
     def _opened(self) -> McapFile:
-        self._name = f"{self._how.directory.name}_{len(self._info.files)}.mcap"
-        return McapFile(self._how.directory / self._name, self._how.layout)
+        self._name = f"{self._options.output.name}_{len(self._info.files)}.mcap"
+        return McapFile(self._options.output / self._name, self._options.layout)
 
     def _list(self) -> None:
         self._info.files.append((self._name, Span()))
-        self._info.paths.append(self._name)
-
-    def _compress(self) -> None:
-        """Whole files, once they are closed; `files` keeps their former names."""
-        if not self._how.compress_files:
-            return
-        name = self._info.paths[-1]
-        self._say("info", "rosbag2_compression", f"Compressing file: {name}")
-        file = self._how.directory / name
-        packed = file.with_name(f"{name}.zstd")
-        packed.write_bytes(zstandard.compress(file.read_bytes()))
-        file.unlink()
-        self._info.paths[-1] = packed.name

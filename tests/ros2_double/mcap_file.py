@@ -52,9 +52,8 @@ _LEAST_RATIO: Final = 1.02
 class Layout:
     """How a file is written: the options of the storage plugin that the double knows."""
 
-    chunk_bytes: int | None = 768 * 1024  # before compression; None: no chunks
-    zstd_level: int | None = None
-    summary_crc: bool = True
+    chunk_bytes: int = 768 * 1024  # before compression
+    is_compressed: bool = False
 
 
 class _BlockFile:
@@ -134,10 +133,7 @@ class McapFile:
         first, last = self._times or (log_time, log_time)
         self._times = min(first, log_time), max(last, log_time)
         Message(channel.id, log_time, payload, publish_time, 0).write(self._chunk)
-        if self._layout.chunk_bytes is None:
-            self._file.write(self._chunk.end())
-            self._index.clear()
-        elif self._chunk.count >= self._layout.chunk_bytes:
+        if self._chunk.count >= self._layout.chunk_bytes:
             self._end_chunk()
 
     def metadata(self, text: str) -> None:
@@ -152,9 +148,8 @@ class McapFile:
         summary, offsets = self._summary(start)
         offset_start = start + len(summary)
         footer = Footer(start, offset_start, 0)
-        if self._layout.summary_crc:
-            # The footer up to the checksum itself counts too.
-            footer.summary_crc = zlib.crc32(summary + offsets + _bytes_of(footer)[:-4])
+        # The footer up to the checksum itself counts too.
+        footer.summary_crc = zlib.crc32(summary + offsets + _bytes_of(footer)[:-4])
         self._file.write(summary + offsets + _bytes_of(footer) + _MAGIC)
         self._file.close()
 
@@ -169,10 +164,9 @@ class McapFile:
             return
         content = self._chunk.end()
         compression, data = "", content
-        if self._layout.zstd_level is not None:
-            packed = zstandard.ZstdCompressor(level=self._layout.zstd_level).compress(content)
-            is_worth_it = len(content) >= _WORTH_COMPRESSING
-            if is_worth_it and len(content) >= _LEAST_RATIO * len(packed):
+        if self._layout.is_compressed and len(content) >= _WORTH_COMPRESSING:
+            packed = zstandard.compress(content, 1)
+            if len(content) >= _LEAST_RATIO * len(packed):
                 compression, data = "zstd", packed
         times = [time for entries in self._index.values() for time, _ in entries]
         begin, end = min(times), max(times)

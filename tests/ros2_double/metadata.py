@@ -45,9 +45,7 @@ class Info:
     """What a recording is known to hold."""
 
     custom: dict[str, str]
-    compression: tuple[str, str] = ("", "")  # format and mode
     whole: Span = field(default_factory=Span)
-    paths: list[str] = field(default_factory=list)
     files: list[tuple[str, Span]] = field(default_factory=list)
 
 
@@ -59,14 +57,13 @@ def qos_text(profiles: Iterable[dict[str, str | int]]) -> str:
 def metadata_text(info: Info, topics: Iterable[Topic] = ()) -> str:
     """The text without its outermost key. The copies in the files name no topics."""
     listed = "\n".join(map(_topic_text, topics)) or "[]"
-    paths = "\n".join(f"- {path}" for path in info.paths)
+    paths = "\n".join(f"- {path}" for path, _ in info.files)
     files = "\n".join(
         f"- path: {path}\n  starting_time:\n    nanoseconds_since_epoch: {span.start}\n"
         f"  duration:\n    nanoseconds: {span.duration}\n  message_count: {span.count}"
         for path, span in info.files
     )
     custom = "\n".join(f"  {key}: {value}" for key, value in info.custom.items())
-    compression_format, compression_mode = (value or '""' for value in info.compression)
     return "\n".join(
         (
             "version: 9",
@@ -75,8 +72,8 @@ def metadata_text(info: Info, topics: Iterable[Topic] = ()) -> str:
             f"starting_time:\n  nanoseconds_since_epoch: {info.whole.start}",
             f"message_count: {info.whole.count}",
             f"topics_with_message_count:\n{indent(listed, '  ')}",
-            f"compression_format: {compression_format}",
-            f"compression_mode: {compression_mode}",
+            'compression_format: ""',
+            'compression_mode: ""',
             f"relative_file_paths:\n{indent(paths, '  ')}",
             f"files:\n{indent(files, '  ')}",
             f"custom_data:\n{custom}" if custom else "custom_data: ~",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Final
 
-from rclpy.duration import Duration
 from rclpy.qos import (
     DurabilityPolicy,
     HistoryPolicy,
@@ -26,6 +25,10 @@ _POLICIES: Final = {
     "liveliness": LivelinessPolicy,
 }
 _DURATIONS: Final = ("deadline", "lifespan", "liveliness_lease_duration")
+_PROMISES: Final = (
+    ("reliability", ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT),
+    ("durability", DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE),
+)
 _DEPTH: Final = 10
 
 
@@ -41,12 +44,8 @@ def offered(profile: Any) -> dict[str, str | int]:
 
 def adapted(topic: str, offers: Sequence[Any], warn: Callable[[str], None]) -> Any:
     """What every publisher can meet: a promise is asked for where all of them make it."""
-    promises = (
-        ("reliability", ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT),
-        ("durability", DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE),
-    )
     asked: dict[str, Any] = {}
-    for policy, promise, fallback in promises:
+    for policy, promise, fallback in _PROMISES:
         made = [getattr(offer, policy) == promise for offer in offers]
         asked[policy] = promise if all(made) else fallback
         if any(made) and not all(made):
@@ -61,12 +60,8 @@ def adapted(topic: str, offers: Sequence[Any], warn: Callable[[str], None]) -> A
 
 def refused(topic: str, offers: Sequence[Any], asked: Any) -> str | None:
     """The warning about a publisher that cannot meet what was asked of the first ones."""
-    promises = (
-        ("reliability", ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT),
-        ("durability", DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE),
-    )
     for offer in offers:
-        for policy, promise, less in promises:
+        for policy, promise, less in _PROMISES:
             if getattr(asked, policy) == promise and getattr(offer, policy) == less:
                 name = f"RMW_QOS_POLICY_{policy.upper()}"
                 itself = "rosbag" if policy == "reliability" else "rosbag2"
@@ -91,21 +86,12 @@ def overrides(text: dict[str, dict[str, Any]]) -> dict[str, Any]:
 def _override(topic: str, given: dict[str, Any]) -> Any:
     values: dict[str, Any] = {}
     for name, value in given.items():
-        if name in _POLICIES:
-            try:
-                values[name] = _POLICIES[name][str(value).upper()]
-            except KeyError:
-                raise RefusedError(f"{topic}: {name} cannot be {value!r}") from None
-        elif name == "depth":
-            if value < 0:
-                raise RefusedError("`depth` may not be a negative value.")
-            values[name] = value
-        elif name in _DURATIONS:
-            values[name] = Duration(seconds=value["sec"], nanoseconds=value["nsec"])
-        elif name == "avoid_ros_namespace_conventions":
-            values[name] = value
-        else:
+        if name not in {*_POLICIES, "depth"}:
             raise RefusedError(f"Unexpected key `{name}` for QoS profile.")
+        try:
+            values[name] = value if name == "depth" else _POLICIES[name][str(value).upper()]
+        except KeyError:
+            raise RefusedError(f"{topic}: {name} cannot be {value!r}") from None
     try:
         return QoSProfile(**values)
     except InvalidQoSProfileException as error:

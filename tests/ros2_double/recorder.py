@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
 
-from tests.ros2_double.bag import Bag, Writing
+from tests.ros2_double.bag import Bag
 from tests.ros2_double.definitions import package_is_known, type_hash
 from tests.ros2_double.metadata import Topic, qos_text
 from tests.ros2_double.qos import adapted, offered, overrides, refused
@@ -59,7 +59,6 @@ class _Recorder:
         self._asked: dict[str, Any] = {}  # what was asked for, by subscribed topic
         self._warned: set[str] = set()
         self._late_s = 0.0  # how long a message had to wait, at worst
-        self._seeking = True
         self._name = options.node_name
         self._node = rclpy.create_node(
             options.node_name,
@@ -76,7 +75,7 @@ class _Recorder:
     def run(self) -> None:
         self._greet()
         self._signals.take_over()
-        self._bag = Bag(self._writing(), _say)
+        self._bag = Bag(self._options, _say)
         self._log("Listening for topics...")
         self._log("Event publisher thread: Starting")
         self._log("Recording...")
@@ -85,7 +84,7 @@ class _Recorder:
             self._await_clock()
         due = 0.0
         while not self._signals.received:
-            if self._seeking and time.monotonic() >= due:
+            if time.monotonic() >= due:
                 self._discover()
                 due = time.monotonic() + _POLLING_S
             self._write_taken(_POLLING_S / 2)
@@ -96,17 +95,6 @@ class _Recorder:
         if self._receiver.is_alive():
             self._receiver.join()
         self._node.destroy_node()
-
-    def _writing(self) -> Writing:
-        options = self._options
-        return Writing(
-            directory=options.output,
-            layout=options.layout,
-            split_after_ns=options.duration_s * 10**9 or None,
-            custom=options.custom,
-            compress_files=options.compress_files,
-            cached=options.cached,
-        )
 
     def _greet(self) -> None:
         if not self._options.keyboard:
@@ -152,15 +140,9 @@ class _Recorder:
                 self._check(topic)
             elif self._wants(topic, types):
                 self._subscribe(topic, types[0])
-        if self._options.topics and len(self._asked) == len(self._options.topics):
-            self._log("All requested topics are subscribed. Stopping discovery...")
-            self._seeking = False
 
     def _wants(self, topic: str, types: list[str]) -> bool:
-        options = self._options
-        if options.topics and topic not in options.topics:
-            return False
-        if not options.topics and not self._regex.search(topic):
+        if not self._regex.search(topic):
             return False
         if len(types) > 1:
             self._warn_once(
@@ -177,7 +159,8 @@ class _Recorder:
                 f"supported. Reason: 'package '{package}' not found",
             )
             return False
-        if not options.include_hidden and any(part.startswith("_") for part in topic.split("/")):
+        is_hidden = any(part.startswith("_") for part in topic.split("/"))
+        if is_hidden and not self._options.include_hidden:
             self._warn_once(
                 topic, "Hidden topics are not recorded. Enable them with --include-hidden-topics"
             )

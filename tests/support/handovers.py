@@ -6,7 +6,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.recorder.handover.union import settle_handover, unsettled_handovers
+from ros2_memory.recorder.handover import settle_handover, unsettled_handovers
 
 if TYPE_CHECKING:
     from collections.abc import Collection

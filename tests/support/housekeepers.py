@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping
     from pathlib import Path
 
+    from ros2_memory.retention.collect import Outliving
     from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.screening import Screening
 
@@ -68,6 +69,7 @@ def keeper_of(
     keeps_foreign: bool = False,
     require_shipped: bool = False,
     screening: Screening | None = None,
+    memory: Outliving | None = None,
     background: Background | None = None,
 ) -> Housekeeping:
     """A housekeeper, mostly of all bags, its own or not (retention.foreign=delete).
@@ -93,6 +95,7 @@ def keeper_of(
         grace_s=grace_s,
         monotonic=monotonic,
         measure_free=measure_free,
+        memory=memory,
         background=background or Direct(),
     )
 

@@ -13,7 +13,7 @@ from mcap.exceptions import McapError
 from mcap.writer import Writer
 
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
-from ros2_memory.recorder.handover.union import settle_handover
+from ros2_memory.recorder.handover import settle_handover
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     McapLayout,

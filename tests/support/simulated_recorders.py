@@ -25,7 +25,7 @@ from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
-from ros2_memory.recorder.reception.reception import Reception
+from ros2_memory.recorder.reception import Reception
 from ros2_memory.recorder.sessions import Orders, Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.storage.mcap_reader import McapReader
@@ -200,7 +200,7 @@ class World:
             clock=WorldClock(self),
             topics=topics,
             own=OwnRecordings(bag_dir),
-            reception=Reception(self.reader, bag_dir=bag_dir, background=self.background),
+            reception=Reception(self.reader, 2**26, bag_dir=bag_dir, background=self.background),
             background=self.background,
             required=required,
             **(plan | orders),  # type: ignore[arg-type]

@@ -15,7 +15,7 @@ else every message counts.
             "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
 
 A cut alone would hide what only one of the two has on disk, because the other stalled. So once the
-files on both sides are closed the recorder compares them (`recorder.handover.union`), and lists the
+files on both sides are closed the recorder compares them (`recorder.handover`), and lists the
 messages for which the cut is not the answer: those that count here all the same (`also_counts`),
 and those that do not (`counts_elsewhere`), by file and topic. A message is the same in both
 recordings by topic, publish time and payload.

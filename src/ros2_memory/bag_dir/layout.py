@@ -11,7 +11,7 @@
         metadata.yaml                      written by rosbag2 at a clean end
         handover.json                      which messages count (see `handover_file`)
       latched/carried.mcap         latched messages of deleted bags (see `retention.latched_carry`)
-      memory/20261120.thinned.mcap what stays of the bags of a day (see `recorder.memory.days`)
+      memory/20261120.thinned.mcap what stays of the bags of a day (see `recorder.days`)
       moments/                     bags that were asked to be saved (see `moment_file`)
         20261120T043012Z-charging/         one saved moment
           moment.json                      its label and its time

@@ -28,7 +28,7 @@ import time
 import uuid
 from bisect import bisect_left
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
@@ -51,7 +51,13 @@ from ros2_memory.bag_dir.layout import (
     split_name,
     split_number,
 )
-from ros2_memory.core.directories import Identity, identity_of, known_identity
+from ros2_memory.core.directories import (
+    Identity,
+    identity_of,
+    is_folder,
+    known_identity,
+    mode_of,
+)
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import COMPRESSED
 
@@ -112,15 +118,12 @@ class ListRow:
 
     def holds(self, file: str) -> bool:
         """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
-        name = file.removesuffix(COMPRESSED)
         if self.adopted and self.bags is None:
             return True
-        bags = self.bags or ()
-        place = bisect_left(bags, name)
-        if bags[place : place + 1] == (name,):
-            return True
-        number = split_number(self.recording, name)
-        return number is not None and (self.splits is None or number < self.splits)
+        name, bags = file.removesuffix(COMPRESSED), self.bags or ()
+        place, number = bisect_left(bags, name), split_number(self.recording, name)
+        is_split = number is not None and (self.splits is None or number < self.splits)
+        return is_split or bags[place : place + 1] == (name,)
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
@@ -148,16 +151,8 @@ class ListRow:
 LIST: Final = JsonLog(LIST_FILE, ListRow, is_brief=True)
 
 
-@dataclass(slots=True)
-class _Content:
-    """The content of a list; `lines` counts all of the file."""
-
-    bag_dir_id: str = ""
-    entries: dict[str, ListRow] = field(default_factory=dict)
-    lines: int = 0
-
-    def add(self, rows: Iterable[ListRow]) -> None:
-        self.entries.update({row.recording: row for row in rows})
+def _by_recording(rows: Iterable[ListRow]) -> dict[str, ListRow]:
+    return {row.recording: row for row in rows}
 
 
 class OwnRecordings:
@@ -171,7 +166,9 @@ class OwnRecordings:
         self._bag_dir = bag_dir
         self._path = bag_dir / LIST_FILE
         self._lock = threading.RLock()
-        self._list = _Content()
+        self._id = ""
+        self._rows: dict[str, ListRow] = {}
+        self._lines = 0
         self._stamp: tuple[int, ...] | None = None
         self._unwritten: dict[str, ListRow] = {}
         self._max_lines = _SPARE_LINES
@@ -194,7 +191,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        return [name for name in [*self._current_rows()] if not is_kept_apart(name)]
+        return [name for name in self._current_rows() if not is_kept_apart(name)]
 
     def in_order(self) -> Sequence[str]:
         """Returns the listed recordings in the order in which they began; no adopted ones.
@@ -202,7 +199,7 @@ class OwnRecordings:
         Raises:
             OSError: the list cannot be read.
         """
-        return [name for name, row in [*self._current_rows().items()] if not row.adopted]
+        return [name for name, row in self._current_rows().items() if not row.adopted]
 
     def owns_bag(self, path: Path) -> bool:
         """Returns whether a bag file is the recorder's: see `judge`.
@@ -227,7 +224,7 @@ class OwnRecordings:
             folder: the directory's name in the list.
             identity: shows whether it is the one that was listed.
         """
-        row = self._list.entries.get(folder)
+        row = self._rows.get(folder)
         return row.holds if row and row.lists(identity) else lambda _: False
 
     def owns(self, directory: Path) -> bool:
@@ -255,7 +252,7 @@ class OwnRecordings:
 
     def lists(self, name: str, identity: Identity | None) -> bool:
         """Returns whether the list, as last read, has a directory of this name and identity."""
-        row = self._list.entries.get(name)
+        row = self._rows.get(name)
         return row is not None and row.lists(identity)
 
     def name_of(self, directory: Path | str) -> str:
@@ -271,7 +268,7 @@ class OwnRecordings:
     @property
     def bag_dir_id(self) -> str | None:
         """The random id of this bag directory, which recordings carry; None before there is one."""
-        return self._list.bag_dir_id or None
+        return self._id or None
 
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
@@ -291,27 +288,24 @@ class OwnRecordings:
         with self._lock:
             try:
                 exists = self._read_if_changed()
-                folders = () if exists else self._bag_dir.iterdir()
+                paths = () if exists else self._bag_dir.iterdir()
                 left = sorted(
-                    path.name
-                    for path in folders
-                    if has_own_name(path.name) and path.is_dir() and not path.is_symlink()
+                    path.name for path in paths if has_own_name(path.name) and is_folder(path)
                 )
             except OSError as error:
                 raise self._failure(error, "read") from error
             rows = self._find_completed(custom_data)
-            self._list.add(rows)
+            self._add(rows)
             rows += self._find_ended()
             if left:
                 names, count = left[:_MAX_NAMED], len(left)
                 _log.warning(
                     "recordings_not_adopted", recordings=count, names=names, advice=_ADVICE
                 )
-            for name, row in self._list.entries.items():
+            for name, row in self._rows.items():
                 if row.identity is None and (self._bag_dir / name).is_dir():
                     _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
-            gone = self._missing_on_disk(self._list.entries)
-            if exists and self.bag_dir_id and not (rows or gone):
+            if exists and self._id and not (rows or self._missing_on_disk(self._rows)):
                 return
             try:
                 self._rewrite(rows)
@@ -350,7 +344,7 @@ class OwnRecordings:
                 freed on a full disk, and is written with the next split.
         """
         with self._lock:
-            row = self._list.entries.get(name)
+            row = self._rows.get(name)
             if row is None or row.identity is None or row.splits is None:
                 return
             noted = replace(row, splits=row.counted(files), ended=ended)
@@ -381,11 +375,11 @@ class OwnRecordings:
 
     def _row_of(self, name: str, identity: Identity) -> ListRow:
         """Returns the line of a directory, one of the list or another."""
-        row = self._list.entries.get(name)
-        if row is None or not row.lists(identity):
-            row = ListRow("", name, *identity)
-            return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
-        return row
+        row = self._rows.get(name)
+        if row is not None and row.lists(identity):
+            return row
+        row = ListRow("", name, *identity)
+        return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
         """Lists bags that the recorder puts into a directory of a moment or of carried messages.
@@ -401,7 +395,7 @@ class OwnRecordings:
             if identity is None:
                 raise FileNotFoundError(f"{directory} is not there any more")
             row = self._row_of(name, identity).with_bags(bags)
-            if row == self._list.entries.get(name):
+            if row == self._rows.get(name):
                 return
             try:
                 self._append([row])
@@ -409,10 +403,14 @@ class OwnRecordings:
                 self._remember_unwritten([row])
                 _log.error("recordings_not_listed", reason=str(error))
 
-    def _remember_unwritten(self, rows: Iterable[ListRow]) -> None:
+    def _remember_unwritten(self, rows: Sequence[ListRow]) -> None:
         """Counts rows as listed that cannot be written; the next one that is written takes them."""
-        self._unwritten.update({row.recording: row for row in rows})
-        self._list.add(self._unwritten.values())
+        self._unwritten |= _by_recording(rows)
+        self._add(rows)
+
+    def _add(self, rows: Iterable[ListRow]) -> None:
+        # A new dictionary: another thread may iterate over this one.
+        self._rows = self._rows | _by_recording(rows)
 
     def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
         """Returns the entries without a directory whose directory our child made after all.
@@ -424,8 +422,8 @@ class OwnRecordings:
         ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
         named = read_heartbeat(self._bag_dir).recordings
         completed: list[ListRow] = []
-        for name, entry in self._list.entries.items():
-            if entry.identity is not None:
+        for name, row in self._rows.items():
+            if row.identity is not None:
                 continue
             with suppress(OSError):
                 identity = identity_of(self._bag_dir / name)
@@ -441,7 +439,7 @@ class OwnRecordings:
     def _find_ended(self) -> list[ListRow]:
         """Returns the recordings that a kill ended, with the splits that they have."""
         ended: list[ListRow] = []
-        for name, row in self._list.entries.items():
+        for name, row in self._rows.items():
             if row.identity is not None and row.splits is not None and not row.ended:
                 with suppress(OSError):
                     files = {path.name for path in bags_in(self._bag_dir / name)}
@@ -453,9 +451,7 @@ class OwnRecordings:
         gone = []
         for name in names:
             with suppress(OSError):  # a disk that fails hides what is there
-                try:
-                    os.lstat(self._bag_dir / name)
-                except (FileNotFoundError, NotADirectoryError):
+                if not mode_of(self._bag_dir / name):
                     gone.append(name)
         return gone
 
@@ -467,7 +463,7 @@ class OwnRecordings:
         """
         with self._lock:
             self._read_if_changed()
-            return self._list.entries
+            return self._rows
 
     def _read_if_changed(self) -> bool:
         """Reads the file if it has changed; returns whether there is one."""
@@ -483,11 +479,9 @@ class OwnRecordings:
         except ValueError as error:
             raise OSError(f"{self._path}: {error}") from error
         rows = [line.row or ListRow() for line in lines]
-        content = _Content(lines=len(lines))
-        content.add(row for row in rows if row.recording and not row.bag_dir_id)
-        content.add(self._unwritten.values())
-        content.bag_dir_id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
-        self._list, self._stamp = content, stamp
+        listed = _by_recording(row for row in rows if row.recording and not row.bag_dir_id)
+        self._rows, self._lines, self._stamp = listed | self._unwritten, len(lines), stamp
+        self._id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
         damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
         if damaged > self._reported_damaged:
             self._reported_damaged = damaged
@@ -500,53 +494,49 @@ class OwnRecordings:
         try:
             with self._lock:
                 exists = self._read_if_changed()
-                if not exists or self._list.lines > self._max_lines or self.bag_dir_id is None:
+                if not exists or self._lines > self._max_lines or not self._id:
                     self._rewrite(rows)
-                    self._unwritten.clear()
-                    return
-                with self._locked() as descriptor:
-                    if descriptor is None:
-                        raise FileNotFoundError("the list of recordings is missing")
-                    append_lines(descriptor, LIST.text(rows))
-                self._list.add(rows)
+                else:
+                    with self._locked() as descriptor:
+                        if descriptor is None:
+                            raise FileNotFoundError("the list of recordings is missing")
+                        append_lines(descriptor, LIST.text(rows))
+                    self._add(rows)
                 self._unwritten.clear()
         except OSError as error:
             raise self._failure(error) from error
 
     def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
-        before = self._list
+        before = self._rows, self._id
         try:
             with self._locked() as descriptor:
                 if descriptor is not None:
                     # Another program may have appended meanwhile.
                     self._stamp = None
                     self._read_if_changed()
-                content = self._merged_with(before)
-                content.add(rows)
+                # What was known and what is listed now, but for what has no directory yet.
+                merged = before[0] | {
+                    name: row
+                    for name, row in self._rows.items()
+                    if row.identity or name not in before[0]
+                }
+                gone = self._missing_on_disk(merged)
+                merged = {name: row for name, row in merged.items() if name not in gone}
+                merged |= _by_recording(rows)
+                header = ListRow(self._id or before[1] or uuid.uuid4().hex)
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
                     _give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
-                header = ListRow(bag_dir_id=content.bag_dir_id)
-                write_durably(self._path, LIST.text([header, *content.entries.values()]))
+                write_durably(self._path, LIST.text([header, *merged.values()]))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._list = before
+            self._rows, self._id = before
             raise
-        self._max_lines = 2 * len(content.entries) + _SPARE_LINES
-        self._list, self._stamp = content, None
-
-    def _merged_with(self, before: _Content) -> _Content:
-        """Returns the entries of the list, now and before, whose recordings have not gone."""
-        content = _Content(self.bag_dir_id or before.bag_dir_id or uuid.uuid4().hex)
-        for name, entry in (*before.entries.items(), *self._list.entries.items()):
-            if entry.identity or name not in content.entries:
-                content.entries[name] = entry
-        for name in self._missing_on_disk(content.entries):
-            del content.entries[name]
-        return content
+        self._max_lines = 2 * len(merged) + _SPARE_LINES
+        self._rows, self._id, self._stamp = merged, header.bag_dir_id, None
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:
@@ -615,10 +605,7 @@ def is_regular(path: Path) -> bool:
     Raises:
         OSError: it cannot be looked up.
     """
-    try:
-        return stat.S_ISREG(path.lstat().st_mode)
-    except FileNotFoundError:
-        return False
+    return stat.S_ISREG(mode_of(path))
 
 
 def bags_in(folder: Path) -> list[Path]:

@@ -338,16 +338,16 @@ class Thinned:
 
     def from_day(self, day: str) -> Thinned:
         """Returns what does not end before a day (UTC), as names have it."""
+
+        def stays(last: Ns) -> bool:
+            return utc_day(last) >= day
+
         return Thinned(
             self.since,
-            tuple(
-                (topic, first, last, on_ns, goes_on)
-                for topic, first, last, on_ns, goes_on in self.silences
-                if utc_day(last) >= day
-            ),
-            tuple((start, end) for start, end in self.pauses if utc_day(end) >= day),
-            tuple((time, by_ns) for time, by_ns in self.set_back if utc_day(time) >= day),
-            tuple(time for time in self.left_open if utc_day(time) >= day),
+            tuple(silence for silence in self.silences if stays(silence[2])),
+            tuple(pause for pause in self.pauses if stays(pause[1])),
+            tuple(step for step in self.set_back if stays(step[0])),
+            tuple(filter(stays, self.left_open)),
         )
 
 

@@ -64,7 +64,7 @@ from ros2_memory.recorder.process.installation import (
 )
 from ros2_memory.recorder.process.output import LineKind, parse_line
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.recorder.reception.reception import QueuePlan, qos_overrides
+from ros2_memory.recorder.reception import ALL_MESSAGES
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.policy import GB
 from ros2_memory.storage.base import BagReader
@@ -430,7 +430,7 @@ def survey(ros: Installation, reader: BagReader, chunk_bytes: int) -> Survey:
     """
     with TemporaryDirectory(prefix="ros2-memory-up-") as name:
         folder = Path(name)
-        (folder / "qos.yaml").write_text(qos_overrides({}, QueuePlan({}), latched=["/tf_static"]))
+        (folder / "qos.yaml").write_text(yaml.safe_dump({"/tf_static": ALL_MESSAGES}))
         (folder / "storage.yaml").write_text(storage_config(chunk_bytes))
         unknown, empty = _record(
             ros, folder / "look", _EVERYTHING, QUIET_S, options=("--start-paused",)

@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import structlog
 
+from ros2_memory.core.errors import RecorderError
 from ros2_memory.recorder.process.output import Line, LineKind
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from ros2_memory.core.timebase import Clock, Ns
 
 _log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
 
-_INFORM = {
-    LineKind.READY: "recording",
-    LineKind.SUBSCRIBED: "subscribed",
-    LineKind.STOPPED: "recorder_stopped",
-}
+_INFORM = frozenset({LineKind.READY, LineKind.SUBSCRIBED, LineKind.STOPPED})
 _ADVICE = {
     LineKind.QOS_REFUSED: ("messages of this publisher are not recorded: its QoS does not fit"),
     LineKind.UNKNOWN_TYPE: (
@@ -74,12 +72,24 @@ class EventLog:
         self._note_error(sentence)
         _log.error(event, reason=sentence, **values)
 
-    def fail_once(self, event: str, subject: str, sentence: str, **values: object) -> None:
-        """Logs as `fail` does, once for each subject until `resolve` is called for it."""
-        if (event, subject) not in self._unresolved:
+    def lasting(self, event: str, subject: str, fault: str | None, **values: object) -> None:
+        """Logs a fault as `fail` does, once for each subject until it is None."""
+        if fault is None:
+            self._unresolved.discard((event, subject))
+        elif (event, subject) not in self._unresolved:
             self._unresolved.add((event, subject))
-            self.fail(event, sentence, **values)
+            self.fail(event, fault, **values)
             self._lasting = (event, subject)
+
+    @contextmanager
+    def lasting_if_refused(self, event: str, subject: str, **values: object) -> Iterator[None]:
+        """Logs a `RecorderError` of the block as `lasting`; without one the fault is over."""
+        try:
+            yield
+        except RecorderError as error:
+            self.lasting(event, subject, str(error), **values)
+        else:
+            self.lasting(event, subject, None)
 
     def recorded(self) -> None:
         """Notes that recording goes on: the last fault is past, unless it lasts."""
@@ -97,26 +107,18 @@ class EventLog:
         self.last_error, self.last_error_at = sentence, self._clock.now()
         self.recovered, self._lasting = False, None
 
-    def resolve(self, event: str, subject: str) -> None:
-        """Has `fail_once` log the fault when it comes again."""
-        self._unresolved.discard((event, subject))
-
     def report_faults(self, faults: Mapping[str, str]) -> None:
         """Logs each task of the housekeeper that fails, once for as long as it does."""
-        self._unresolved = {
-            (event, task)
-            for event, task in self._unresolved
-            if event != "housekeeping_failed" or task in faults
-        }
-        for task, sentence in faults.items():
-            self.fail_once("housekeeping_failed", task, sentence, task=task)
+        failed = [task for event, task in self._unresolved if event == "housekeeping_failed"]
+        for task in (*failed, *faults):
+            self.lasting("housekeeping_failed", task, faults.get(task), task=task)
 
     def report_output(self, recording: str, lines: Iterable[Line]) -> None:
         """Logs what the `ros2 bag record` of a recording printed."""
         for line in lines:
             if line.kind in _INFORM:
                 topic = {} if line.topic is None else {"topic": line.topic}
-                self.info(_INFORM[line.kind], recording=recording, **topic)
+                self.info(line.kind.value, recording=recording, **topic)
             elif line.kind in _ADVICE:
                 about = f"{line.topic}: " if line.topic else ""
                 sentence = f"{about}{_ADVICE[line.kind]} ({line.text})"
@@ -127,7 +129,7 @@ class EventLog:
                 report(line.kind.value, sentence, recording=recording)
                 if lasts and len(self._of_topics) < _MOST_TOPICS:
                     self._of_topics.add((line.kind, line.topic or ""))
-            elif line.kind in {LineKind.ERROR, LineKind.FOLDER_EXISTS}:
+            elif line.kind is LineKind.ERROR:
                 self.fail("recorder_error", line.text, recording=recording)
             else:
                 self.warn("recorder_warning", line.text, recording=recording)

@@ -120,7 +120,7 @@ class Housekeeping(Housekeeper):
         self._background = background or Background()
         self._recorded = RecordedTime(bag_dir)
         self._own = own or OwnRecordings(bag_dir)
-        self._keeps_foreign = limits.keeps_foreign
+        self._limits = limits
         self._collector = GarbageCollector(
             bag_dir,
             limits,
@@ -150,8 +150,6 @@ class Housekeeping(Housekeeper):
         self._repairer = Repairer(reader, writer, bag_dir)
         self._links = HardLinks(bag_dir)
         self._clock = clock
-        self._max_bytes = limits.max_total_bytes
-        self._max_age_h = limits.max_age_ns / (3600 * NS_PER_S)
         self._unwritten_for = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._tried: set[tuple[Path, int, int]] = set()
         self._out_of_reach = False
@@ -181,7 +179,7 @@ class Housekeeping(Housekeeper):
         for directory in sorted(self._bag_dir.iterdir()):
             if directory.is_symlink() or not directory.is_dir():
                 continue
-            if self._keeps_foreign:
+            if self._limits.keeps_foreign:
                 is_own = self._own.owns(directory)
                 if not is_own and self._own.began(directory):
                     # Killed before it was listed as a directory: nothing shows whose it is.
@@ -358,7 +356,7 @@ class Housekeeping(Housekeeper):
         return collected
 
     def _describe_held(self, bags: int) -> str:
-        limit = f"{self._max_age_h:g} h"
+        limit = f"{self._limits.max_age_ns / (3600 * NS_PER_S):g} h"
         return (
             f"{counted(bags, 'bag is', 'bags are')} older than {limit} "
             "(retention.max_age_h) by date, but not deleted: the clock is not known to be right. "
@@ -405,14 +403,15 @@ class Housekeeping(Housekeeper):
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
-        if before.total_bytes <= self._max_bytes < collected.total_bytes:
+        most = self._limits.max_total_bytes
+        if before.total_bytes <= most < collected.total_bytes:
             state, saved = collected.state_bytes, collected.saved_bytes
             others = collected.total_bytes - state - saved
             _log.error(
                 "budget_not_held",
                 total_bytes=collected.total_bytes,
                 state_bytes=state,
-                reason=f"files that are never deleted exceed {self._max_bytes / _MB:.3g} MB: "
+                reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
                 f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
                 f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
                 "raise retention.max_total_gb",
@@ -454,7 +453,7 @@ class Housekeeping(Housekeeper):
             for name in names:
                 path = directory / name
                 is_bag = name.endswith(_MCAP) and not left_by_repair(name)
-                if is_bag and (not self._keeps_foreign or self._own.owns_bag(path)):
+                if is_bag and (not self._limits.keeps_foreign or self._own.owns_bag(path)):
                     self._repair_file(path)
             # In case all splits of the recording were empty.
             remove_emptied(self._bag_dir, directory)
@@ -466,35 +465,31 @@ class Housekeeping(Housekeeper):
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        candidates = [path for path in paths if path.suffix == _MCAP and self._may_repair(path)]
-        if not candidates:
-            return 0
-        named, opened = _named_in_heartbeat(self._bag_dir), open_files()
-        repaired = 0
-        for path in candidates:
-            with suppress(OSError):
+        named, repaired = _named_in_heartbeat(self._bag_dir), 0
+        opened: Collection[tuple[int, int]] | None = None
+        for path in paths:
+            try:
                 status = path.lstat()
-                if path.parent in named or (status.st_dev, status.st_ino) in opened:
-                    continue
-                self._tried.add((path, status.st_size, status.st_mtime_ns))
-                repaired += self._repair_file(path)
+            except OSError:
+                continue
+            state = path, status.st_size, status.st_mtime_ns
+            if path.suffix != _MCAP or state in self._tried or path.parent in named:
+                continue
+            if self._links.is_saved(str(path)) or not self._may_repair(path, status):
+                continue
+            opened = open_files() if opened is None else opened
+            if (status.st_dev, status.st_ino) not in opened:
+                self._tried.add(state)
+                with suppress(OSError):
+                    repaired += self._repair_file(path)
         return repaired
 
-    def _may_repair(self, path: Path) -> bool:
-        """Whether a file may be repaired and its repair was not tried before.
+    def _may_repair(self, path: Path, status: os.stat_result) -> bool:
+        """Whether a file is the recorder's, or of another program and unchanged for a while.
 
-        In a recording of another program it must not have changed for a while: the heartbeat does
-        not name what other programs write.
+        The heartbeat does not name what other programs write.
         """
-        try:
-            status = path.lstat()
-        except OSError:
-            return False
-        if (path, status.st_size, status.st_mtime_ns) in self._tried:
-            return False
-        if self._links.is_saved(str(path)):
-            return False
-        if self._keeps_foreign:
+        if self._limits.keeps_foreign:
             return self._own.owns_bag(path)
         unchanged_for = abs(self._clock.now() - status.st_mtime_ns)
         return unchanged_for > self._unwritten_for or has_own_name(path.parent.name)

@@ -12,6 +12,7 @@ import threading
 import time
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -80,19 +81,18 @@ class IndexManager:
         large: LargeReads | None = None,
     ) -> None:
         self._large = large or LargeReads()
-        self._setting = setting
         self._trusts_mtime = trusts_mtime
-        self._only = only
         self.bag_dir = bag_dir
-        self._known = known
         self._include_active = include_active
-        self._reader = reader
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
         self._log: FilteringBoundLogger = structlog.get_logger()
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
+        self._new_table = partial(
+            BagTable, bag_dir, reader, known=known, only=only, setting=setting
+        )
         self._table = self._new_table()
 
     def snapshot(self, reach: Ns | None = None) -> Snapshot:
@@ -148,15 +148,6 @@ class IndexManager:
         return reach is not None and (snapshot.latest is None or reach > snapshot.latest)
 
     # The methods below run under the lock.
-
-    def _new_table(self) -> BagTable:
-        return BagTable(
-            self.bag_dir,
-            self._reader,
-            known=self._known,
-            only=self._only,
-            setting=self._setting,
-        )
 
     def _scan(self, *, patrolling: bool = True) -> Snapshot:
         begun, before = time.perf_counter_ns(), self.published

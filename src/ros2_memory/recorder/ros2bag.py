@@ -27,7 +27,7 @@ from ros2_memory.recorder.process.installation import (
     find_installation,
 )
 from ros2_memory.recorder.process.topics import TopicsFile
-from ros2_memory.recorder.reception.reception import Reception, newest_splits
+from ros2_memory.recorder.reception import Reception, newest_splits
 from ros2_memory.recorder.sessions import Orders, Required
 from ros2_memory.recorder.supervisor import Supervisor
 from ros2_memory.retention.policy import GB

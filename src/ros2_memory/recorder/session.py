@@ -32,7 +32,6 @@ MAX_DISTINCT: Final = 200
 EMPTY_GRACE_S: Final = 5.0
 """A file that is still 0 bytes so long after a newer one appeared was lost to a full disk."""
 _LAST_LINES: Final = 6
-_REPORTED: Final = frozenset(LineKind) - {LineKind.OTHER, LineKind.FLUSHING}
 
 
 class SplitChanges(NamedTuple):
@@ -235,7 +234,7 @@ class RecordingSession:
                 if line.topic != MESSAGES_LOST:
                     self.subscribed.add(line.topic)
                     lines.append(line)
-            elif line.kind in _REPORTED and self._is_new(line):
+            elif line.kind is not LineKind.OTHER and self._is_new(line):
                 if line.kind is LineKind.UNKNOWN_TYPE and line.topic is not None:
                     self.of_unknown_type.add(line.topic)
                 lines.append(line)

@@ -14,13 +14,11 @@ from ros2_memory.bag_dir.durable_write import flush_bags
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
-from ros2_memory.recorder.handover.transfer import (
+from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
     SUBSCRIBE_TIMEOUT_S,
     HandoverTransfer,
     Step,
-)
-from ros2_memory.recorder.handover.union import (
     give_up,
     settle_handover,
     unsettled_handovers,
@@ -41,7 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.event_log import EventLog
     from ros2_memory.recorder.process.topics import TopicsFile
-    from ros2_memory.recorder.reception.reception import Reception
+    from ros2_memory.recorder.reception import Reception
     from ros2_memory.storage.base import BagReader
 
 
@@ -71,7 +69,7 @@ class Orders:
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
-        subscribe_timeout_s: how long a handover waits for topics (see `handover.transfer`).
+        subscribe_timeout_s: how long a handover waits for topics (see `handover`).
     """
 
     bag_dir: Path
@@ -288,16 +286,12 @@ class RecordingSessions:
 
     def _update_list(self, session: RecordingSession) -> None:
         """Lists the directory that the child made, and its splits; a fault is retried."""
-        try:
+        with self._events.lasting_if_refused("recording_not_listed", session.name):
             session.is_listed = session.is_listed or self._orders.own.complete(session.name)
             # Else another disk may lie there.
             if session.is_listed and session.splits.exists:
                 has_ended = session.state is SessionState.ENDED
                 self._orders.own.note(session.name, session.splits.seen, ended=has_ended)
-        except RecorderError as error:
-            self._events.fail_once("recording_not_listed", session.name, str(error))
-        else:
-            self._events.resolve("recording_not_listed", session.name)
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)
@@ -318,9 +312,9 @@ class RecordingSessions:
         for name in changes.empty:
             file = f"{session.name}/{name}"
             sentence = f"{file} is empty although a newer split was started"
-            self._events.fail_once("split_empty", file, sentence, recording=session.name)
+            self._events.lasting("split_empty", file, sentence, recording=session.name)
         for fault in changes.faults:
-            self._events.fail_once("unreadable", session.name, fault, recording=session.name)
+            self._events.lasting("unreadable", session.name, fault, recording=session.name)
         return changes
 
     def _report_output(self, session: RecordingSession) -> None:
@@ -405,14 +399,10 @@ class RecordingSessions:
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
-            try:
+            name = old.name
+            with self._events.lasting_if_refused("handover_not_settled", name, recording=name):
                 if settle_handover(old, new, self._orders.reader, running):
                     self._unsettled.remove((old, new))
-            except RecorderError as error:
-                name = old.name
-                self._events.fail_once("handover_not_settled", name, str(error), recording=name)
-            else:
-                self._events.resolve("handover_not_settled", old.name)
 
     def _report_death(self, session: RecordingSession, status: int, now: ClockReading) -> None:
         self._report_output(session)

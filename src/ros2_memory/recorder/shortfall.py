@@ -111,13 +111,12 @@ class TopicWatch:
             patience_s += self._orders.split_duration_s
         if current is None or since_s is None or now.monotonic_s - since_s < patience_s:
             self.waiting_for = None
-            self._events.resolve("recording_waits", "")
-            return
-        others = current.subscribed - OWN_TOPICS
-        if self._orders.simulated:
-            reason = "recording.use_sim_time is on, and nothing is written before /clock arrives"
-            self.waiting_for = f"nothing has been recorded: {reason}"
-        elif others:
+        elif self._orders.simulated:
+            self.waiting_for = (
+                "nothing has been recorded: recording.use_sim_time is on, and nothing is written "
+                "before /clock arrives"
+            )
+        elif others := current.subscribed - OWN_TOPICS:
             topics = counted(len(others), "topic is", "topics are")
             self.waiting_for = (
                 f"nothing has been recorded, although {topics} subscribed to; "
@@ -129,7 +128,8 @@ class TopicWatch:
                 "topics in this ROS_DOMAIN_ID; compare it, ROS_AUTOMATIC_DISCOVERY_RANGE and "
                 "topics.yaml with the robot's"
             )
-        self._events.fail_once("recording_waits", "", self.waiting_for, recording=current.name)
+        name = current and current.name
+        self._events.lasting("recording_waits", "", self.waiting_for, recording=name)
 
     def _hears(self, session: RecordingSession) -> bool:
         """Whether a session has recorded something that may be of the robot."""

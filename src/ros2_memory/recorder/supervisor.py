@@ -1,7 +1,7 @@
 """Keeps a recording going: begins, rotates, pauses and restarts it, and reports what happens.
 
 Everything happens in `tick`, which the main thread calls several times a second and which does not
-wait. `policies` and `handover.transfer` decide what to do, and `sessions` does it; here they meet.
+wait. `policies` and `handover` decide what to do, and `sessions` does it; here they meet.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, process_of, 
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.sd_notify import Watchdog
 from ros2_memory.recorder.event_log import EventLog
-from ros2_memory.recorder.handover.transfer import Step
+from ros2_memory.recorder.handover import Step
 from ros2_memory.recorder.policies import (
     OWN_TOPICS,
     RESUME_FACTOR,
@@ -194,7 +194,7 @@ class Supervisor:
             ("faults", 0.0, False, self._report_faults),
             ("house", 0.0, True, self._apply_retention),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
-            ("screen", SCREENING_S, True, self._screen),
+            ("screen", SCREENING_S, True, lambda _: self._housekeeper.screen(self._names())),
         )
         for name, every_s, needs_disk, task in tasks:
             if (needs_disk and self._disk.away) or not self._is_due(name, every_s, now):
@@ -246,30 +246,23 @@ class Supervisor:
 
     def _check_space(self, now: ClockReading) -> None:
         """Deletes more, pauses and resumes, by what the disk has left."""
-        free = self._free_bytes()
+        least, free = self._orders.min_free_bytes, self._free_bytes()
         # More than what it was paused for.
-        enough = round(self._orders.min_free_bytes * RESUME_FACTOR)
+        enough = round(least * RESUME_FACTOR)
+        if free is not None and self._paused:
+            if free >= enough:
+                self._paused = False
+                self._due_s["restart"] = now.monotonic_s
+                self._events.info("recording_resumed", free_bytes=free)
+            elif self._is_due("room", QUIET_RETENTION_S, now):
+                # Bags that were being written when recording was paused may be deleted by now.
+                self._housekeeper.make_room(enough)
+            return
+        if free is not None and free < least and not self._room_requested:
+            self._housekeeper.make_room(enough)
+            free = self._free_bytes()
         if free is None:
             return
-        if not self._paused:
-            self._make_room_or_pause(now, free, enough)
-        elif free >= enough:
-            self._paused = False
-            self._due_s["restart"] = now.monotonic_s
-            self._events.info("recording_resumed", free_bytes=free)
-        elif self._is_due("room", QUIET_RETENTION_S, now):
-            # Bags that were being written when recording was paused may be deleted by now.
-            self._housekeeper.make_room(enough)
-
-    def _make_room_or_pause(self, now: ClockReading, free: int, enough: int) -> None:
-        """Begins to make room where too little is free; pauses where that does not help."""
-        least = self._orders.min_free_bytes
-        if free < least and not self._room_requested:
-            self._housekeeper.make_room(enough)
-            left = self._free_bytes()
-            if left is None:
-                return
-            free = left
         self._room_requested = free < least
         # Room that is being made is waited for while half of it is free.
         is_waiting = self._housekeeper.is_making_room() and free >= least // 2
@@ -349,10 +342,7 @@ class Supervisor:
                 added=sorted({*listed_now} - {*before}),
                 dropped=sorted({*before} - {*listed_now}),
             )
-        if self._orders.topics.refused is None:
-            self._events.resolve("topics_refused", "")
-        else:
-            self._events.fail_once("topics_refused", "", self._orders.topics.refused)
+        self._events.lasting("topics_refused", "", self._orders.topics.refused)
 
     def _check_restart(self, now: ClockReading) -> None:
         if self._sessions.current is not None or self._paused:
@@ -393,9 +383,6 @@ class Supervisor:
             self._applied_s = now.monotonic_s
             self._splits_closed = False
             self._housekeeper.apply()
-
-    def _screen(self, _: ClockReading) -> None:
-        self._housekeeper.screen([session.name for session in self._sessions.running])
 
     def _announce(self, name: str) -> None:
         """Names a recording before anything of it exists.
@@ -438,21 +425,15 @@ class Supervisor:
         if only_changes and last is not None and _without_amounts(beat) == _without_amounts(last):
             return
         self._beat = beat
-        try:
+        with self._events.lasting_if_refused("heartbeat_not_written", ""):
             write_heartbeat(self._bag_dir, beat)
-        except RecorderError as error:
-            self._events.fail_once("heartbeat_not_written", "", str(error))
-        else:
-            self._events.resolve("heartbeat_not_written", "")
 
     def _make_heartbeat(
         self, now: Ns, state: RecorderState, since: Ns, announced: str | None
     ) -> Heartbeat:
         """Returns what `recorder.json` is to say now."""
         sessions, watch, events = self._sessions, self._topic_watch, self._events
-        names = dict.fromkeys(session.name for session in sessions.running)
-        if announced is not None:
-            names[announced] = None
+        names = dict.fromkeys(filter(None, (*self._names(), announced)))
         subscribed = set[str]().union(*(session.subscribed for session in sessions.running))
         silent = frozenset() if sessions.current is None else sessions.current.silent_topics()
         return Heartbeat(
@@ -491,14 +472,14 @@ class Supervisor:
         return RecorderState.WAITING if waits else RecorderState.RECORDING
 
     def _free_bytes(self) -> int | None:
+        fault = None
         try:
-            free = self._free_bytes_of(self._bag_dir)
+            return self._free_bytes_of(self._bag_dir)
         except OSError as error:
-            sentence = f"{self._bag_dir}: {error.strerror or error}"
-            self._events.fail_once("free_space_unknown", "", sentence)
+            fault = f"{self._bag_dir}: {error.strerror or error}"
             return None
-        self._events.resolve("free_space_unknown", "")
-        return free
+        finally:
+            self._events.lasting("free_space_unknown", "", fault)
 
     def _is_due(self, task: str, every_s: float, now: ClockReading) -> bool:
         """Whether a task is due; if so, it is not due again for `every_s` seconds."""
@@ -510,6 +491,9 @@ class Supervisor:
     def _put_off(self, task: str, now: ClockReading) -> None:
         """Has a task that failed wait before the next attempt."""
         self._due_s[task] = now.monotonic_s + self._backoff[task].failed()
+
+    def _names(self) -> list[str]:
+        return [session.name for session in self._sessions.running]
 
     def _now(self) -> ClockReading:
         return ClockReading(self._monotonic(), self._orders.clock.now())

@@ -1,15 +1,28 @@
+"""Saved moments, and the requests for them."""
+
 from __future__ import annotations
 
+import errno
 import json
+import os
 import re
+import stat
 from typing import TYPE_CHECKING
+from unittest.mock import Mock
 
 import pytest
+import structlog
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.bag_dir.layout import MOMENT_FILE, bag_kind
+from ros2_memory.bag_dir import moment_file
+from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER, bag_kind
 from ros2_memory.bag_dir.moment_file import (
+    MAX_AT_ONCE,
+    STALE_NS,
+    Outcome,
+    PendingRequest,
+    RequestQueue,
     SavedMoment,
     SaveRequest,
     fault_of_label,
@@ -107,3 +120,171 @@ class TestMomentFiles:
         (folder / MOMENT_FILE).write_text(text)
         assert read_saved_moment(folder) is None
         assert list(stored_moments_in(tmp_path)) == []
+
+
+def asked(bag_dir: Path, label: str = "here", at: int = T0) -> PendingRequest:
+    posted = PendingRequest(bag_dir, label, at - 30 * S, at, at)
+    posted.post()
+    return posted
+
+
+def names(bag_dir: Path) -> list[str]:
+    return sorted(path.name for path in (bag_dir / REQUESTS_FOLDER).iterdir())
+
+
+def test_a_request_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> None:
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    assert queue.has_requests()
+    [request] = queue.take(T0)
+    assert request == posted.request
+    assert posted.outcome() is None
+    outcome = Outcome("20261120T050000Z-here", 3, pending=True)
+    queue.answer(request, outcome)
+    assert posted.outcome() == outcome
+    posted.close()
+    assert names(tmp_path) == []
+    assert not queue.has_requests()
+
+
+def test_a_request_can_be_withdrawn_until_it_is_taken(tmp_path: Path) -> None:
+    first, second, queue = asked(tmp_path), asked(tmp_path), RequestQueue(tmp_path)
+    assert first.withdraw()
+    assert [request.number for request in queue.take(T0)] == [second.request.number]
+    assert not second.withdraw()
+
+
+def test_a_request_that_was_taken_and_not_answered_is_taken_again(tmp_path: Path) -> None:
+    posted = asked(tmp_path)
+    assert [request.number for request in RequestQueue(tmp_path).take(T0)] == [
+        posted.request.number
+    ]
+    again = RequestQueue(tmp_path)
+    assert again.has_requests()
+    assert [request.number for request in again.take(T0 + S)] == [posted.request.number]
+
+
+def test_a_request_whose_server_died_is_forgotten(tmp_path: Path) -> None:
+    posted = asked(tmp_path)
+    assert list(RequestQueue(tmp_path).take(T0 + STALE_NS + 1)) == []
+    assert names(tmp_path) == [f"{posted.request.number}.answer"]
+
+
+def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
+    for _ in range(MAX_AT_ONCE + 2):
+        asked(tmp_path)
+    queue = RequestQueue(tmp_path)
+    first = list(queue.take(T0))
+    assert len(first) == MAX_AT_ONCE
+    for request in first:
+        queue.answer(request, Outcome(refused="no"))
+    assert len(list(queue.take(T0))) == 2
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "[" * 4000,
+        "x" * 5000,
+        "{}",
+        json.dumps({"format": 1, "request": "../../etc", "label": "x"}),
+        json.dumps(
+            {
+                "format": 1,
+                "request": "f" * 32,  # another's
+                "label": "x",
+                "start_ns": T0,
+                "end_ns": T0,
+                "requested_ns": T0,
+            }
+        ),
+        json.dumps(
+            {
+                "format": 1,
+                "request": NUMBER,
+                "label": "two\nlines",
+                "start_ns": T0,
+                "end_ns": T0,
+                "requested_ns": T0,
+            }
+        ),
+    ],
+)
+def test_what_is_no_request_is_told_and_dropped(tmp_path: Path, text: str) -> None:
+    queue = RequestQueue(tmp_path)
+    (tmp_path / REQUESTS_FOLDER).mkdir(parents=True)
+    (tmp_path / REQUESTS_FOLDER / f"{NUMBER}.json").write_text(text)
+    with structlog.testing.capture_logs() as captured:
+        assert list(queue.take(T0)) == []
+    assert [event["event"] for event in captured] == ["request_ignored"]
+    assert names(tmp_path) == [f"{NUMBER}.answer"]
+
+
+def test_who_asked_is_told_that_the_disk_did_not_give_the_request(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    unreadable = Mock(side_effect=OSError(errno.EIO, "Input/output error"))
+    with monkeypatch.context() as patch:
+        patch.setattr(moment_file, "_read_request", unreadable)
+        assert list(queue.take(T0)) == []
+    outcome = posted.outcome()
+    assert outcome is not None
+    assert "Input/output error" in (outcome.refused or "")
+    posted.close()
+    assert names(tmp_path) == []
+
+
+def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path) -> None:
+    folder = tmp_path / REQUESTS_FOLDER
+    (folder / f"{NUMBER}.json").mkdir(parents=True)
+    (folder / f"{'a' * 32}.json").symlink_to("/etc/hostname")
+    os.mkfifo(folder / f"{'b' * 32}.json")
+    posted, queue = asked(tmp_path), RequestQueue(tmp_path)
+    with structlog.testing.capture_logs() as captured:
+        [request] = queue.take(T0)
+        queue.answer(request, Outcome(refused="no"))
+    assert [event["event"] for event in captured] == ["request_ignored"] * 3
+    assert posted.outcome() is not None
+    assert not queue.has_requests()
+
+
+def test_other_files_are_left_alone_and_counted(tmp_path: Path) -> None:
+    posted = asked(tmp_path)
+    (tmp_path / REQUESTS_FOLDER / "notes.txt").write_text("mine")
+    queue = RequestQueue(tmp_path)
+    with structlog.testing.capture_logs() as captured:
+        for request in queue.take(T0):
+            queue.answer(request, Outcome(refused="no"))
+        assert list(queue.take(T0)) == []
+    assert [(event["event"], event["files"]) for event in captured] == [("requests_foreign", 1)]
+    posted.close()
+    assert names(tmp_path) == ["notes.txt"]
+
+
+def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:
+    asked(tmp_path)
+    queue = RequestQueue(tmp_path)
+    [request] = queue.take(T0)
+    queue.answer(request, Outcome(refused="no"))
+    path = tmp_path / REQUESTS_FOLDER / f"{request.number}.answer"
+    os.utime(path, ns=(T0, T0))
+    assert list(queue.take(T0 + 500 * S)) == []
+    assert path.exists()
+    assert list(queue.take(T0 + 700 * S)) == []
+    assert names(tmp_path) == []
+
+
+def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:
+    before = os.umask(0o077)
+    try:
+        asked(tmp_path)
+        queue = RequestQueue(tmp_path)
+        [request] = queue.take(T0)
+        taken = tmp_path / REQUESTS_FOLDER / f"{request.number}.taken"
+        assert stat.S_IMODE(taken.stat().st_mode) == 0o644
+        queue.answer(request, Outcome(refused="no"))
+        answer = taken.with_suffix(".answer")
+        assert stat.S_IMODE(answer.stat().st_mode) == 0o644
+    finally:
+        os.umask(before)

@@ -12,7 +12,6 @@ import pytest
 import structlog
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from mcap.writer import Writer
 
 from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
@@ -197,17 +196,6 @@ class TestWhatAKillLeaves:
         assert not again.owns(bag_dir / B)
         assert again.exists()
         assert again.bag_dir_id == own.bag_dir_id
-
-    @settings(max_examples=examples(100), deadline=None)
-    @given(data=st.binary(max_size=300))
-    def test_whatever_stands_in_the_list_no_directory_is_made_up(
-        self, tmp_path_factory: pytest.TempPathFactory, data: bytes
-    ) -> None:
-        bag_dir = tmp_path_factory.mktemp("bags")
-        (bag_dir / ".episodic").mkdir()
-        (bag_dir / A).mkdir()
-        (bag_dir / LIST_FILE).write_bytes(data)
-        assert not OwnRecordings(bag_dir).owns(bag_dir / A)
 
     @pytest.mark.parametrize(
         "line",
@@ -423,15 +411,6 @@ class TestBags:
 class TestEmbedded:
     """None where it cannot be known, which is not the same as nothing."""
 
-    def test_nothing_in_a_file_of_humble(self, tmp_path: Path) -> None:
-        path = tmp_path / "a_0.mcap"
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start("ros2", "libmcap 0.8.0")
-            writer.add_metadata("rosbag2", {"ROS_DISTRO": "humble"})
-            writer.finish()
-        assert custom_data(path) == {}
-
     def test_wherever_a_file_was_cut_it_is_what_was_embedded_or_unknown(
         self, tmp_path: Path
     ) -> None:
@@ -443,14 +422,3 @@ class TestEmbedded:
         known = found.index(OURS)
         assert found == [None] * known + [OURS] * (len(data) - known)
         assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
-
-    @settings(max_examples=examples(100), deadline=None)
-    @given(at=st.integers(0, 400), value=st.integers(0, 255))
-    def test_a_damaged_file_never_raises_more_than_an_oserror(
-        self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int
-    ) -> None:
-        path = embedding(tmp_path_factory.mktemp("bag") / "a_0.mcap", OURS, size=2)
-        data = bytearray(path.read_bytes())
-        data[at % len(data)] = value
-        path.write_bytes(data)
-        assert custom_data(path) in (None, OURS) or isinstance(custom_data(path), dict)

@@ -4,7 +4,7 @@ import errno
 import os
 import threading
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 import structlog
@@ -38,7 +38,7 @@ from tests.support.memories import extractor
 from tests.support.simulated_recorders import events
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, MutableMapping
     from pathlib import Path
 from unittest.mock import Mock
 
@@ -68,6 +68,14 @@ def receipt(path: Path, bag_dir: Path, more: int = 0) -> Receipt:
 
 def left_open(path: Path, start: int = 0, count: int = 20) -> Path:
     return bag(path, start, count, McapLayout(chunk_size=400, finish=False))
+
+
+def said(keeper: Housekeeping, event: str) -> list[MutableMapping[str, Any]]:
+    """What two passes log under a name."""
+    with structlog.testing.capture_logs() as captured:
+        keeper.apply()
+        keeper.apply()
+    return events(captured, event)
 
 
 class TestRetention:
@@ -166,10 +174,7 @@ class TestRetention:
     def test_it_is_reported_once_for_each_pass_what_was_deleted(self, tmp_path: Path) -> None:
         recording(tmp_path, "a", 0), recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
-        with structlog.testing.capture_logs() as captured:
-            keeper.apply()
-            keeper.apply()
-        first, second = events(captured, "retention_applied")
+        first, second = said(keeper, "retention_applied")
         assert (first["log_level"], first["bags"], first["recordings"]) == ("info", 4, 1)
         assert first["bytes"] > 45_000
         assert first["duration_ms"] > 0
@@ -266,10 +271,7 @@ class TestDeletionsThatFail:
     def test_are_reported_once_and_do_not_stop_the_rest(self, tmp_path: Path, stuck: Path) -> None:
         recording(tmp_path, "b", 100)
         keeper = keeper_of(tmp_path, max_bytes=45_000)
-        with structlog.testing.capture_logs() as captured:
-            keeper.apply()
-            keeper.apply()
-        (reported,) = events(captured, "not_deleted")
+        (reported,) = said(keeper, "not_deleted")
         assert reported["path"] == str(stuck)
         assert reported["reason"]
         assert "b/b_0.mcap" not in files_in(tmp_path)
@@ -283,10 +285,7 @@ class TestDeletionsThatFail:
         (tmp_path / ".episodic/catalogue.sqlite-wal").write_bytes(bytes(4_200_000))
         keeper = keeper_of(tmp_path, max_bytes=1_000_000)
         assert keeper.status().counted_bytes is None
-        with structlog.testing.capture_logs() as captured:
-            keeper.apply()
-            keeper.apply()
-        (reported,) = events(captured, "budget_not_held")
+        (reported,) = said(keeper, "budget_not_held")
         assert "(.episodic, .ros_log) 4.2 MB, saved moments 0 MB" in reported["reason"]
         status = keeper.status()
         assert (status.counted_bytes, status.state_bytes) == (size_of(tmp_path), 4_200_000)
@@ -332,8 +331,8 @@ class TestMakingRoom:
             keeper.make_room(PLENTY)
             keeper.make_room(PLENTY)
         assert files_in(tmp_path) == before
-        (said,) = (each for each in logs if each["event"] == "room_out_of_reach")
-        assert 0 < said["most_free_bytes"] < said["free_bytes_wanted"] == PLENTY
+        (told,) = events(logs, "room_out_of_reach")
+        assert 0 < told["most_free_bytes"] < told["free_bytes_wanted"] == PLENTY
         assert not events(logs, "budget_not_held")
 
     def test_what_another_pass_finds_meanwhile_is_not_taken_for_its_own(
@@ -503,10 +502,7 @@ def test_what_cannot_be_repaired_is_reported_once_and_stays(tmp_path: Path) -> N
     damaged.parent.mkdir()
     damaged.write_bytes(b"\x89MCAP")
     keeper = keeper_of(tmp_path)
-    with structlog.testing.capture_logs() as captured:
-        keeper.apply()
-        keeper.apply()
-    (reported,) = events(captured, "bag_not_repaired")
+    (reported,) = said(keeper, "bag_not_repaired")
     assert reported["path"] == str(damaged)
     assert "first 5 bytes" in reported["reason"]
     assert damaged.read_bytes() == b"\x89MCAP"

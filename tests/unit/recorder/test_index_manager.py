@@ -14,7 +14,6 @@ from structlog.testing import capture_logs
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
 from tests.support.clocks import SettableClock
-from tests.support.housekeepers import recording_now
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 
 if TYPE_CHECKING:
@@ -91,19 +90,6 @@ def test_the_active_bag_stays_out_until_it_is_closed_in_place(yard: Yard) -> Non
     snapshot = yard.scan_after(1)
     assert snapshot.active == ()
     assert [(bag.start, bag.end) for bag in snapshot.bags] == [(1, 3)]
-
-
-def test_at_a_rotation_two_bags_are_active_until_the_heartbeat_dies(yard: Yard) -> None:
-    for name in ("rec_1", "rec_2", "rec_0"):
-        plain(yard.bag_dir / name / f"{name}_0.mcap", [1], closed=False)
-    yard.age()
-    recording_now(yard.bag_dir, "rec_1", "rec_2", clock=yard.clock)
-    for seconds in (0, 15):
-        snapshot = yard.scan_after(seconds)
-        assert _names(snapshot.active) == ["rec_1_0.mcap", "rec_2_0.mcap"]
-        assert _names(snapshot.bags) == ["rec_0_0.mcap"]
-    assert {bag.state for bag in yard.scan_after(1).bags} == {BagState.INCOMPLETE}
-    assert len(yard.index.snapshot().bags) == 3
 
 
 def test_a_rescan_reads_what_is_new_and_nothing_else(yard: Yard) -> None:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from ros2_memory.recorder.policies import (
-    Backoff,
-    SilenceWatch,
-)
+import pytest
+
+from ros2_memory.core.timebase import NS_PER_S
+from ros2_memory.recorder.policies import Backoff, ClockReading, SilenceWatch, set_back
 
 
 class TestBackoff:
@@ -51,3 +51,11 @@ class TestSilence:
         watch.rotated(for_silence=False)
         watch.began(0, 5)
         assert silent_at(watch, {0: 0, 10: 100}, 300) == 40
+
+
+@pytest.mark.parametrize(
+    ("wall_s", "expected"), [(1.0, False), (0.95, False), (0.85, True), (-5.0, True), (9.0, False)]
+)
+def test_only_a_clock_that_falls_behind_at_once_was_set_back(wall_s: float, expected: bool) -> None:
+    later = ClockReading(11.0, round(wall_s * NS_PER_S))
+    assert set_back(ClockReading(10.0, 0), later) is expected

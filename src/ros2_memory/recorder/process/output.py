@@ -13,13 +13,11 @@ from typing import Final
 
 
 class LineKind(StrEnum):
-    """What a line reports."""
+    """What a line reports, mostly by the log event that tells it."""
 
-    READY = "ready"
+    READY = "recording"
     SUBSCRIBED = "subscribed"
-    FLUSHING = "flushing"  # a split is being closed, or the whole recording
-    STOPPED = "stopped"
-    FOLDER_EXISTS = "folder_exists"
+    STOPPED = "recorder_stopped"
     QOS_REFUSED = "qos_refused"
     UNKNOWN_TYPE = "unknown_type"
     SEVERAL_TYPES = "several_types"
@@ -48,9 +46,7 @@ _LOGGED: Final = re.compile(
 _MEANINGS: Final = (
     (LineKind.READY, re.compile(r"(?:Recording\.\.\.|Listening for topics\.\.\.)$")),
     (LineKind.SUBSCRIBED, re.compile(r"Subscribed to topic '(?P<topic>[^']+)'")),
-    (LineKind.FLUSHING, re.compile(r"Writing remaining messages from cache")),
     (LineKind.STOPPED, re.compile(r"Recording stopped")),
-    (LineKind.FOLDER_EXISTS, re.compile(r"Output folder '.*' already exists")),
     (
         LineKind.QOS_REFUSED,
         re.compile(r"A new publisher for subscribed topic (?P<topic>\S+) was found offering"),

@@ -24,22 +24,21 @@ ROBOTS_TOPICS = {
 
 @needs_recorded
 @pytest.mark.parametrize(
-    ("name", "splits", "ended"),
+    ("name", "ended"),
     [
-        ("session_mcap", 7, True),
-        ("session_sqlite3", 2, True),
-        ("session_zstd", 2, True),
-        ("session_zstd_file", 2, True),
-        ("session_killed", 2, False),
-        ("session_killed_chunk64k", 2, False),
+        ("session_mcap", True),
+        ("session_sqlite3", True),
+        ("session_zstd", True),
+        ("session_zstd_file", True),
+        ("session_killed", False),
+        ("session_killed_chunk64k", False),
     ],
 )
-def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended: bool) -> None:
+def test_the_logs_of_real_recorders_are_understood(name: str, ended: bool) -> None:
     lines = [parse_line(raw) for raw in (RECORDED / f"logs/{name}.log").read_text().splitlines()]
     said = [line.kind for line in lines]
     subscribed = {line.topic for line in lines if line.kind is LineKind.SUBSCRIBED}
     assert subscribed == ROBOTS_TOPICS
-    assert said.count(LineKind.FLUSHING) == splits
     assert said.count(LineKind.STOPPED) == ended
     assert said.index(LineKind.READY) < said.index(LineKind.SUBSCRIBED)
     assert {
@@ -71,7 +70,7 @@ def test_the_logs_of_real_recorders_are_understood(name: str, splits: int, ended
         ("\x1b[32m[INFO] [1.5] [n]: Recording...\x1b[0m", LineKind.READY, None),
         (
             "[ERROR] [ros2bag]: Output folder '/bags/rec_1' already exists.",
-            LineKind.FOLDER_EXISTS,
+            LineKind.ERROR,
             None,
         ),
         (

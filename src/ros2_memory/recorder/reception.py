@@ -7,10 +7,10 @@ that came later, takes a rotation. What the splits show is measured beside the r
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from contextlib import suppress
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import structlog
 import yaml
@@ -21,8 +21,7 @@ from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.recorder.background import Background
-from ros2_memory.recorder.reception.measure import (
+from ros2_memory.recorder.measure import (
     Arrivals,
     LossCounter,
     TopicFlow,
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.recorder.background import Background
     from ros2_memory.storage.base import BagReader
 
 DEFAULT_DEPTH: Final = 10
@@ -59,68 +59,26 @@ def plan_queues(flows: Mapping[str, TopicFlow], queue_bytes: int) -> QueuePlan:
     Where that is not enough, no topic takes more than an equal share of what the smaller ones
     leave. At least one message of each is held, however large.
     """
-    depths: dict[str, int] = {}
+    sizes = {topic: flow.message_bytes for topic, flow in flows.items()}
     for factor in (HEADROOM, 1):
         depths = {topic: max(DEFAULT_DEPTH, factor * flow.burst) for topic, flow in flows.items()}
-        if (
-            sum(depth * flows[topic].message_bytes for topic, depth in depths.items())
-            <= queue_bytes
-        ):
+        if sum(depth * sizes[topic] for topic, depth in depths.items()) <= queue_bytes:
             return QueuePlan(depths)
-    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
     # One message of each, and shares of what is then left.
-    left, topics = queue_bytes - sum(flow.message_bytes for flow in flows.values()), len(wanted)
-    for topic in sorted(wanted, key=lambda name: wanted[name] * flows[name].message_bytes):
-        size = flows[topic].message_bytes
-        more = min(wanted[topic] - 1, max(0, left) // topics // size)
+    wanted = {topic: max(1, flow.burst) for topic, flow in flows.items()}
+    left, depths = max(0, queue_bytes - sum(sizes.values())), {}
+    for nth, topic in enumerate(sorted(wanted, key=lambda name: wanted[name] * sizes[name])):
+        more = min(wanted[topic] - 1, left // (len(wanted) - nth) // sizes[topic])
         depths[topic] = 1 + more
-        left -= more * size
-        topics -= 1
+        left -= more * sizes[topic]
     short = frozenset(topic for topic, depth in depths.items() if depth < flows[topic].burst)
     return QueuePlan(depths, short)
 
 
-def qos_overrides(
-    flows: Mapping[str, TopicFlow],
-    plan: QueuePlan,
-    *,
-    latched: Collection[str],
-    best_effort: Collection[str] = (),
-    volatile: Collection[str] = (),
-) -> str:
-    """Returns YAML for `--qos-profile-overrides-path`.
-
-    Args:
-        flows: the topics whose QoS is known.
-        plan: the depths of their queues.
-        latched: the topics that count as latched and may have many publishers. All of their
-            messages are asked for, unless their publishers are known to be volatile, or it is one
-            of `best_effort` or `volatile`.
-        best_effort: topics with a publisher that was refused, or is best effort. They are asked for
-            with what fits every publisher: rosbag2 itself asks for more where it has not discovered
-            all of them, and a split names only those that it had. Who subscribes with best effort
-            is sent no earlier messages, so they are volatile as well.
-        volatile: topics whose earlier messages are not asked for again, though they are latched.
-    """
-    volatile = {*volatile, *best_effort}
-    profiles = {topic: _profile(plan.depth(topic)) for topic in best_effort}
-    for topic, flow in flows.items():
-        profiles[topic] = _profile(
-            plan.depth(topic),
-            reliable=flow.offered.reliable and topic not in best_effort,
-            latched=flow.offered.latched and topic not in volatile,
-        )
-    for topic in {*latched}.difference(best_effort):
-        offered = flows[topic].offered if topic in flows else None
-        if offered is None or (offered.latched and topic not in volatile):
-            reliable = offered is None or offered.reliable
-            profiles[topic] = _profile(None, reliable=reliable, latched=True)
-    return yaml.safe_dump(profiles, sort_keys=True)
+_Profile: TypeAlias = dict[str, str | int]
 
 
-def _profile(
-    depth: int | None, *, reliable: bool = False, latched: bool = False
-) -> dict[str, str | int]:
+def _profile(depth: int | None, *, reliable: bool = False, latched: bool = False) -> _Profile:
     """Returns a QoS profile; with None in place of a depth all messages are kept."""
     return {
         **({"history": "keep_all"} if depth is None else {"history": "keep_last", "depth": depth}),
@@ -129,6 +87,8 @@ def _profile(
     }
 
 
+ALL_MESSAGES: Final = _profile(None, reliable=True, latched=True)
+"""Asks for all messages, also for earlier ones."""
 DEEPEN_EVERY_S: Final = 60.0
 """At most so often a recording is rotated for deeper queues: a robot's nodes start one by one."""
 ASK_AGAIN_S: Final = 300.0
@@ -137,7 +97,6 @@ ASKED_FOR: Final = 8
 """So many recordings ask for what fits the publisher that was last refused, or best effort. What
 splits name are the publishers that were discovered in time, often not all: they do not show that it
 has gone."""
-QUEUE_BYTES: Final = 64 * 2**20
 _UNNOTICED_NS: Final[Ns] = 5 * NS_PER_S
 """So long a publisher may have sent before rosbag2 says that it was refused."""
 _PLANS_KEPT: Final = 8
@@ -184,8 +143,8 @@ class Reception:
     Args:
         reader: reads splits that are closed.
         queue_bytes: what the queues of all topics together may take.
-        bag_dir: where losses are written; nowhere where None.
-        latched: topics that count as latched, see `qos_overrides`.
+        bag_dir: where losses are written.
+        latched: topics that count as latched.
         volatile: topics that are not asked for their earlier messages once a split has shown them.
         background: measures splits and writes losses beside the recorder's loop.
 
@@ -196,18 +155,18 @@ class Reception:
     def __init__(
         self,
         reader: BagReader,
-        queue_bytes: int = QUEUE_BYTES,
+        queue_bytes: int,
         *,
-        bag_dir: Path | None = None,
+        bag_dir: Path,
         latched: Collection[str] = (),
         volatile: Collection[str] = (),
-        background: Background | None = None,
+        background: Background,
     ) -> None:
         self._reader = reader
         self._queue_bytes = queue_bytes
-        self._latched = tuple(latched)
-        self._volatile = tuple(volatile)
-        self._background = background or Background()
+        self._latched = latched
+        self._volatile = volatile
+        self._background = background
         self._bag_dir = bag_dir
         self._losses = LossCounter()
         self._unwritten: deque[Loss] = deque(maxlen=_MOST_UNWRITTEN)
@@ -228,36 +187,48 @@ class Reception:
             return self._plan_queues().cut_short
 
     def overrides(self, recording: str) -> str:
-        """Returns the QoS overrides for a recording that is about to start."""
+        """Returns the QoS overrides (YAML) for a recording that is about to start."""
         with self._lock:
-            plan = self._plan_queues()
-            anew = self._asked_anew
+            plan, anew = self._plan_queues(), self._asked_anew
+            topics = {*self._flows, *anew, *self._latched}
+            profiles = {topic: self._profile_of(topic, plan) for topic in topics}
             self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
             self._losses.begun(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
-            # A latched topic that is asked for as volatile would lose what was published before:
-            # rosbag2 decides by the publishers that it finds.
-            adapting = {
-                topic for topic in self._latched if topic in anew and not anew[topic].best_effort
-            }
-            flows = {topic: flow for topic, flow in self._flows.items() if topic not in adapting}
-            best_effort = {
-                topic
-                for topic, asked in anew.items()
-                if asked.best_effort or topic not in {*flows, *adapting}
-            }
-            alone = (name for name, flow in flows.items() if flow.offered.publishers == 1)
-            volatile = {*self._volatile, *self._skipped.intersection(alone), *anew}
-            latched = [topic for topic in self._latched if topic not in adapting]
             self._asked_anew = {
                 topic: asked._replace(recordings=asked.recordings - 1)
                 for topic, asked in anew.items()
                 if asked.recordings > 1
             }
-            return qos_overrides(
-                flows, plan, latched=latched, best_effort=best_effort, volatile=volatile
-            )
+        chosen = {topic: profile for topic, profile in profiles.items() if profile is not None}
+        return yaml.safe_dump(chosen, sort_keys=True)
+
+    def _profile_of(self, topic: str, plan: QueuePlan) -> _Profile | None:
+        """Returns the QoS with which a topic is asked for; None where rosbag2 chooses it.
+
+        One with a publisher that was refused, or is best effort, is asked for with what fits every
+        publisher: rosbag2 itself asks for more where it has not discovered all of them, and a split
+        names only those that it had. Who subscribes with best effort is sent no earlier messages,
+        so it is volatile as well. Of a topic that counts as latched, and may have many publishers,
+        all messages are asked for, unless its publishers are known to be volatile.
+        """
+        flow, asked = self._flows.get(topic), self._asked_anew.get(topic)
+        counts_as_latched, depth = topic in self._latched, plan.depth(topic)
+        if asked is not None and counts_as_latched and not asked.best_effort:
+            # As volatile it would lose what was published before: rosbag2 decides by the publishers
+            # that it finds.
+            return None
+        if flow is None:
+            return ALL_MESSAGES if asked is None else _profile(depth)
+        reliable, latched, publishers = flow.offered
+        is_skipped = topic in self._skipped and publishers == 1
+        latched &= asked is None and topic not in self._volatile and not is_skipped
+        return _profile(
+            None if latched and counts_as_latched else depth,
+            reliable=reliable and not (asked is not None and asked.best_effort),
+            latched=latched,
+        )
 
     def skip_latched(self, topics: Collection[str]) -> None:
         """Sets the topics whose latched message the next recordings are not to ask for.
@@ -306,9 +277,9 @@ class Reception:
     def _report_losses(self, take: Callable[[], list[Loss]]) -> None:
         with self._lock:
             losses = take()
-        by_topic: dict[str, int] = {}
+        by_topic = Counter[str]()
         for loss in losses:
-            by_topic[loss.topic] = by_topic.get(loss.topic, 0) + loss.lost
+            by_topic[loss.topic] += loss.lost
         for topic, lost in by_topic.items():
             _log.warning(
                 "messages_missing",
@@ -318,7 +289,7 @@ class Reception:
                 "or rosbag2's count: lost on the way to the disk, or never published",
             )
         self._unwritten += losses
-        if self._bag_dir is not None and self.may_write and self._unwritten:
+        if self.may_write and self._unwritten:
             try:
                 append_losses(self._bag_dir, self._unwritten)
             except OSError as error:
@@ -409,8 +380,7 @@ class Reception:
             for topic, flow in split.flows.items():
                 # A recording that refused a publisher does not state what that one offers.
                 if state is None or topic not in state.refused:
-                    old_flow = self._flows.get(topic)
-                    self._flows[topic] = flow if old_flow is None else old_flow.joined(flow)
+                    self._flows[topic] = self._flows.get(topic, flow).joined(flow)
                     if not flow.offered.reliable:
                         self._asked_anew[topic] = _Anew(best_effort=True)
             short = self._plan_queues().cut_short - before

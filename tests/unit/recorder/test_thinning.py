@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
-from ros2_memory.recorder.memory.thinning import (
+from ros2_memory.recorder.thinning import (
     EXTREMES_NS,
     MINUTE_NS,
     STANDING_NS,

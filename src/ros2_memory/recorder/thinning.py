@@ -18,7 +18,7 @@ them: `memory/thinned.json` states them.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from math import ceil, isnan, log2, nan
 from operator import itemgetter
@@ -76,18 +76,20 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
     if not is_dataclass(message) or isinstance(message, type):
         return message
     values = {
-        member.name: rounded(
-            getattr(message, member.name), definition, f"{path}.{member.name}".lstrip(".")
-        )
-        for member in fields(message)
-        if not member.name.startswith("__")
+        name: rounded(value, definition, f"{path}.{name}".lstrip("."))
+        for name, value in fields_in(message)
     }
     return replace(message, **values)
 
 
-def _rounded(
-    numbers: np.ndarray[tuple[int, ...], np.dtype[np.float64]], step: Step
-) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
+def fields_in(node: object) -> Iterator[tuple[str, object]]:
+    """Yields the fields of a decoded message, by name; none of what is no message."""
+    if is_dataclass(node) and not isinstance(node, type):
+        for member in fields(node):
+            yield member.name, getattr(node, member.name)
+
+
+def _rounded(numbers: Points, step: Step) -> Points:
     with np.errstate(invalid="ignore", over="ignore"):
         if step.per_unit:
             units = 2.0 ** ceil(log2(step.per_unit))
@@ -121,8 +123,7 @@ _LONG: Final = 64
 _DEGREE_M: Final = 111_320.0
 """Metres of a degree of latitude."""
 _FRAME: Final = "child_frame_id"
-_POINTS: Final = ("position", "translation")
-_TURNS: Final = ("orientation", "rotation")
+_TURNS: Final = {"position": "orientation", "translation": "rotation"}
 _MORE_NAMES: Final = frozenset({"location", "serial_number"})
 
 
@@ -191,30 +192,6 @@ class _Mover:
 
 
 @dataclass(slots=True)
-class _Changes:
-    """The changes of an integer in some minutes: the log times before each, and of each.
-
-    Attributes:
-        values: that it had, up to one more than are few.
-    """
-
-    values: set[int] = field(default_factory=set)
-    count: int = 0
-    _times: list[IntArray] = field(default_factory=list)
-
-    def add(self, numbers: Numbers, before: IntArray, after: IntArray) -> None:
-        """Adds those among some numbers."""
-        if len(self.values) <= _FEW:
-            self.values.update(np.unique(numbers)[: _FEW + 1].tolist())
-        self.count += after.size
-        self._times += [before, after]
-
-    def times(self, most: int) -> Sequence[IntArray]:
-        """Returns the log times, if the values are few or no more than `most` changes."""
-        return self._times if len(self.values) <= _FEW or self.count <= most else ()
-
-
-@dataclass(slots=True)
 class TopicThinning:
     """Chooses the messages of a topic that stay; its tables are added in order of time.
 
@@ -232,8 +209,11 @@ class TopicThinning:
     _movers: dict[tuple[str, str], _Mover] = field(default_factory=dict)
     _extremes: dict[tuple[str, int], tuple[_Value, _Value]] = field(default_factory=dict)
     """The least and the greatest value of a column in some minutes."""
-    _changes: dict[tuple[str, int], _Changes] = field(default_factory=dict)
-    """Of integers, likewise."""
+    _changes: defaultdict[tuple[str, int], list[tuple[Numbers, IntArray, IntArray]]] = field(
+        default_factory=lambda: defaultdict(list)
+    )
+    """Of integers, likewise: their values, up to one more than are few, and the log times before
+    each change, and of each."""
 
     def add(self, table: Table) -> None:
         """Adds the messages of a bag, at least one."""
@@ -307,9 +287,12 @@ class TopicThinning:
     def times(self) -> IntArray:
         """Returns the log times (ns) of the messages that stay, ascending."""
         extremes = [extreme[1] for both in self._extremes.values() for extreme in both]
-        most = EXTREMES_NS // self.numbers_ns * _OFTEN
-        changed = (time for changes in self._changes.values() for time in changes.times(most))
-        return np.unique(np.concatenate([*self._stays, *changed, np.array(extremes, np.int64)]))
+        stays, most = [*self._stays, np.array(extremes, np.int64)], EXTREMES_NS // self.numbers_ns
+        for parts in self._changes.values():
+            values, before, after = map(np.concatenate, zip(*parts, strict=True))
+            if np.unique(values).size <= _FEW or after.size <= most * _OFTEN:
+                stays += [before, after]
+        return np.unique(np.concatenate(stays))
 
     def _changed(
         self, path: str, codes: Numbers, values: Sequence[object], times: IntArray
@@ -331,20 +314,20 @@ class TopicThinning:
         slots, slots_after = times // EXTREMES_NS, after // EXTREMES_NS
         for slot in np.unique(slots).tolist():
             inside = slots_after == slot
-            changes = self._changes.setdefault((path, slot), _Changes())
-            changes.add(column[slots == slot], before[inside], after[inside])
+            values = np.unique(column[slots == slot])[: _FEW + 1]
+            self._changes[path, slot].append((values, before[inside], after[inside]))
 
     def _add_extremes(self, path: str, numbers: Numbers, times: IntArray) -> None:
         for slot in np.unique(times // EXTREMES_NS).tolist():
             rows = np.flatnonzero((times // EXTREMES_NS == slot) & np.isfinite(numbers))
-            if not rows.size:
-                continue
-            samples = [*zip(numbers[rows].tolist(), times[rows].tolist(), strict=True)]
-            least, greatest = min(samples), max(samples, key=itemgetter(0))
-            least_before, most_before = self._extremes.get((path, slot), (least, greatest))
-            # Of equal ones the earliest.
-            most = max(most_before, greatest, key=itemgetter(0))
-            self._extremes[path, slot] = min(least_before, least), most
+            samples = [
+                *self._extremes.get((path, slot), ()),
+                *zip(numbers[rows].tolist(), times[rows].tolist(), strict=True),
+            ]
+            if samples:
+                # Of equal ones the earliest.
+                greatest = max(samples, key=itemgetter(0))
+                self._extremes[path, slot] = min(samples), greatest
 
     def _add_moves(self, name: str, times: IntArray, poses: Mapping[str, Points]) -> None:
         for path, rows in poses.items():
@@ -354,7 +337,7 @@ class TopicThinning:
     def _add_states(self, path: str, inner: Elements, times: IntArray) -> None:
         """Adds the messages in which the states of a list change, as those of goals."""
         states = [
-            column
+            column.tolist()
             for column in inner.columns.values()
             if not isinstance(column, Texts)
             if column.dtype.itemsize == 1 and np.unique(column).size <= _FEW
@@ -362,9 +345,7 @@ class TopicThinning:
         if not states:
             return
         rows: list[tuple[object, ...]] = [()] * times.size
-        for owner, *values in zip(
-            inner.owners.tolist(), *(column.tolist() for column in states), strict=True
-        ):
+        for owner, *values in zip(inner.owners.tolist(), *states, strict=True):
             rows[owner] = (*rows[owner], *values)
         codes = {value: code for code, value in enumerate(dict.fromkeys(rows))}
         numbered = np.array([codes[value] for value in rows])
@@ -416,9 +397,9 @@ def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) 
     seen |= missing
     shown = [
         {
-            name: score[1]
-            for name, score in names.items()
-            if name in missing and missing[name][0] == score[0]
+            name: score
+            for name, (step, score) in names.items()
+            if name in missing and missing[name][0] == step
         }
         for names in named
     ]
@@ -444,16 +425,12 @@ def _poses(columns: Mapping[str, Column]) -> dict[str, Points]:
     """Returns the poses in columns by the path of their point: its numbers, and the turn's."""
     poses: dict[str, Points] = {}
     for path in columns:
-        around, _, name = path.removesuffix(".x").rpartition(".")
-        if not path.endswith(".x") or name not in _POINTS:
-            continue
-        turn = _TURNS[_POINTS.index(name)]
-        names = [f"{path[:-2]}.{axis}" for axis in "xyz"]
-        names += [f"{around}.{turn}.{axis}".lstrip(".") for axis in "xyzw"]
-        poses |= _stacked(
-            path[:-2],
-            [columns[name_of_column] for name_of_column in names if name_of_column in columns],
-        )
+        point = path.removesuffix(".x")
+        around, _, name = point.rpartition(".")
+        if point != path and name in _TURNS:
+            names = [f"{point}.{axis}" for axis in "xyz"]
+            names += [f"{around}.{_TURNS[name]}.{axis}".lstrip(".") for axis in "xyzw"]
+            poses |= _stacked(point, [columns[one] for one in names if one in columns])
     if {"x", "y", "theta"} <= columns.keys():  # geometry_msgs/msg/Pose2D, turtlesim/msg/Pose
         poses |= _stacked("", [columns[name] for name in ("x", "y", "theta")])
     if {"latitude", "longitude"} <= columns.keys():

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import struct
-from collections import deque
+from bisect import bisect_right
+from collections import Counter, deque
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -33,6 +35,8 @@ LONGEST_NS: Final[Ns] = 5 * NS_PER_S
 """A longer hole is a publisher that was silent, and reported as that."""
 MOST_MISSING: Final = 10_000
 _TOLERANCE: Final = 0.25
+_FIELD: Final = re.compile(r"^[ \t]*(\w\S*)[ \t]+(\w+)\b(?![ \t]*=)", re.MULTILINE)
+"""Type and name of each field; a constant has a value behind a `=`."""
 _HEADERS: Final = frozenset({"std_msgs/Header", "std_msgs/msg/Header", "Header"})
 _TIMES: Final = frozenset(
     f"builtin_interfaces/{middle}{name}" for middle in ("", "msg/") for name in ("Time", "Duration")
@@ -114,17 +118,16 @@ class LossCounter:
 
     def __init__(self) -> None:
         self._measured = 0
-        # Of each recording, how many splits had been measured when it was last heard of.
-        self._heard: dict[str, int] = {}
-        # Up to which log time each recording has been measured.
-        self._reached: dict[str, Ns] = {}
+        # Of each recording, how many splits had been measured when it was last heard of, and up to
+        # which log time it has been.
+        self._recordings: dict[str, tuple[int, Ns]] = {}
         self._series: dict[str, _Series] = {}
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self._counted: set[str] = set()
 
     def begun(self, recording: str) -> None:
         """Notes that a recording begins, which may have what another one misses."""
-        self._heard[recording] = self._measured
+        self._recordings[recording] = self._measured, 0
 
     def unclear(self, topics: Collection[str] | None = None) -> None:
         """Notes that a split does not show what it has of these topics; None: of any."""
@@ -134,16 +137,17 @@ class LossCounter:
     def measured(self, recording: str, split: Mapping[str, Progress]) -> list[Loss]:
         """Takes the next split of a recording; returns the losses that are certain by now."""
         self._measured += 1
-        self._heard[recording] = self._measured
+        _, reached = self._recordings.get(recording, (0, 0))
+        ends = (progress.positions[-1].log_time for progress in split.values())
+        self._recordings[recording] = self._measured, max(reached, *ends, 0)
         for topic, progress in split.items():
-            reached = max(self._reached.get(recording, 0), progress.positions[-1].log_time)
-            self._reached[recording] = reached
             self._add(topic, progress)
-        for name, heard in [*self._heard.items()]:
-            if self._measured - heard >= RECENT:
-                del self._heard[name]
-                self._reached.pop(name, None)
-        return self._settle(min(self._reached.get(name, 0) for name in self._heard))
+        self._recordings = {
+            name: (heard, reached)
+            for name, (heard, reached) in self._recordings.items()
+            if self._measured - heard < RECENT
+        }
+        return self._settle(min(reached for _, reached in self._recordings.values()))
 
     def flush(self) -> list[Loss]:
         """Returns what no further split will fill."""
@@ -159,11 +163,11 @@ class LossCounter:
 
     def in_last_hour(self, now: Ns) -> dict[str, int]:
         """Returns how many messages of each topic are missing of the last hour."""
-        lost: dict[str, int] = {}
+        lost = Counter[str]()
         for loss in self._lately:
             if loss.stop > now - HOUR_NS:
-                lost[loss.topic] = lost.get(loss.topic, 0) + loss.lost
-        return lost
+                lost[loss.topic] += loss.lost
+        return dict(lost)
 
     def _add(self, topic: str, progress: Progress) -> None:
         """Puts what a split has of a topic together with what is known of it."""
@@ -179,12 +183,13 @@ class LossCounter:
             series, positions = None, positions[back[0] :]
         elif series is not None and last.value < series.positions[0].value:
             series = None  # likewise, or the clock was set back
-        known_positions = [] if series is None else series.positions
-        by_value = dict(sorted((*known_positions, *positions), reverse=True))
-        merged = [Position(*item) for item in sorted(by_value.items())]
-        if series is not None:
-            settled = series.positions[0]
-            merged = [position for position in merged if position.value >= settled.value]
+        known = [] if series is None else series.positions
+        by_value = dict(sorted((*known, *positions), reverse=True))
+        merged = [
+            Position(value, log_time)
+            for value, log_time in sorted(by_value.items())
+            if not known or value >= known[0].value
+        ]
         self._series[topic] = _Series(progress.kind, merged, self._measured)
 
     def _settle(self, until: Ns) -> list[Loss]:
@@ -230,7 +235,7 @@ def reader_of(schema: Schema) -> ValueReader | None:
     """Returns what shows holes in messages of this type; None where nothing does."""
     if schema.encoding != "ros2msg":
         return None
-    fields = _fields(schema.text.decode(errors="replace"))
+    fields = _FIELD.findall(schema.text.decode(errors="replace").partition("\n===")[0])
     before: list[str] = []
     for kind, name in fields:
         if name in _COUNTERS and (form := _FORMS.get(kind)) in _COUNTED:
@@ -252,16 +257,14 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
     A message that was stamped late leaves a wide step, too, but then the next ones follow in a
     burst. So what counts is how far behind the cadence the messages after the step remain.
     """
-    if len(positions) < FEWEST:
-        return None
-    if sum(before.value >= after.value for before, after in pairwise(positions)) > 1:
-        return None
     steps = [(before, after, after.value - before.value) for before, after in pairwise(positions)]
     lengths = [length for _, _, length in steps if length > 0]
-    usual = 1 if kind == "counter" else median_low(lengths or [0])
+    if len(positions) < FEWEST or len(steps) - len(lengths) > 1:
+        return None
+    usual = 1 if kind == "counter" else median_low(lengths)
     allowed = 0.0 if kind == "counter" else _TOLERANCE * usual
     regular = [length for length in lengths if abs(length - usual) <= allowed]
-    if usual <= 0 or len(regular) < REGULAR * len(steps):
+    if len(regular) < REGULAR * len(steps):
         return None
     period = fmean(regular)  # Jitter cancels out in it, and does not in a median.
     holes_found: list[Hole] = []
@@ -280,19 +283,6 @@ def holes(positions: Sequence[Position], kind: Kind) -> list[Hole] | None:
         if (missing := round(behind / period)) > 0:
             holes_found.append(Hole(before, after, missing, len(later) < enough))
     return holes_found
-
-
-def _fields(text: str) -> list[tuple[str, str]]:
-    """Returns type and name of each field of the message itself."""
-    fields: list[tuple[str, str]] = []
-    for raw in text.splitlines():
-        line = raw.partition("#")[0].strip()
-        if line.startswith("==="):
-            break
-        words = line.split()
-        if len(words) >= 2 and "=" not in "".join(words[1:3]):
-            fields.append((words[0], words[1]))
-    return fields
 
 
 def _stamp(payload: bytes) -> int:
@@ -505,17 +495,13 @@ def measure_split(reader: BagReader, path: Path, *, end_only: bool = False) -> S
 
 
 def burst_of(published: Sequence[Ns]) -> int:
-    """Returns the most messages within `HOLD_S`.
+    """Returns the most messages within `HOLD_S`, of times of one or more.
 
     A shorter topic is assumed to continue at its rate: it may have just started.
     """
     ordered = sorted(published)
-    most, first = 0, 0
-    for last, at in enumerate(ordered):
-        while at - ordered[first] >= _HOLD_NS:
-            first += 1
-        most = max(most, last - first + 1)
-    lasted = ordered[-1] - ordered[0] if ordered else 0
+    counts = (nth - bisect_right(ordered, at - _HOLD_NS) for nth, at in enumerate(ordered, 1))
+    most, lasted = max(counts), ordered[-1] - ordered[0]
     if len(ordered) >= _FEWEST and 0 < lasted < _HOLD_NS:
         return max(most, -(-(len(ordered) - 1) * _HOLD_NS // lasted))
     return most
@@ -592,8 +578,8 @@ class Arrivals:
             return {}
         start = min(split.start for split in self._splits)
         duration_s = max(self._newest + idle - start, 1) / NS_PER_S
-        counts: dict[str, int] = {}
+        counts = Counter[str]()
         for split in self._splits:
             for name, arrival in split.arrivals.items():
-                counts[name] = counts.get(name, 0) + arrival.messages
+                counts[name] += arrival.messages
         return {name: count / duration_s for name, count in counts.items()}

@@ -3,21 +3,30 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.state_files import Loss, read_losses
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
-from ros2_memory.recorder.reception import measure
-from ros2_memory.recorder.reception import reception as reception_module
-from ros2_memory.recorder.reception.measure import OfferedQos, TopicFlow, measure_split
-from ros2_memory.recorder.reception.reception import (
+from ros2_memory.recorder import measure
+from ros2_memory.recorder import reception as reception_module
+from ros2_memory.recorder.measure import (
+    OfferedQos,
+    TopicFlow,
+    measure_split,
+    offered_by_all,
+)
+from ros2_memory.recorder.reception import (
     ASK_AGAIN_S,
     ASKED_FOR,
     DEEPEN_EVERY_S,
     Reception,
     newest_splits,
+    plan_queues,
 )
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -32,8 +41,15 @@ def split(path: Path, hz: int, seconds: int, topic: str = "/odom") -> Path:
     return write_mcap(path, [odom(T0 + tick * NS // hz, 1.0, 2.0, topic=topic) for tick in ticks])
 
 
-def reception(queue_bytes: int = 2**26) -> Reception:
-    return Reception(McapReader(), queue_bytes, latched=["/tf_static"], background=Inline())
+def reception(bag_dir: Path, **how: Any) -> Reception:
+    given = {"latched": ["/tf_static"], **how}
+    return Reception(McapReader(), 2**26, bag_dir=bag_dir, background=Inline(), **given)
+
+
+def latched_split(path: Path, *topics: str) -> Path:
+    """Nine messages of each topic, whose publishers are transient local."""
+    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
+    return write_mcap(path, messages, McapLayout(latched=frozenset(topics)))
 
 
 def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
@@ -42,7 +58,7 @@ def profiles(of: Reception, recording: str) -> dict[str, dict[str, object]]:
 
 
 def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     assert profiles(made, "a").keys() == {"/tf_static"}
     assert made.rotation_due("a", 0.0) is None
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
@@ -57,7 +73,7 @@ def test_a_topic_gets_its_depth_by_one_rotation_after_its_first_split(tmp_path: 
 
 
 def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 50, 4))
     rotation = made.rotation_due("a", 10.0)
@@ -72,7 +88,7 @@ def test_topics_that_come_one_by_one_do_not_rotate_one_by_one(tmp_path: Path) ->
 
 
 def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_path: Path) -> None:
-    made = reception()
+    made = reception(tmp_path)
     made.recall([split(tmp_path / "old.mcap", 50, 4)])
     assert "/odom" in profiles(made, "a")
     made.refused("a", "/odom")
@@ -90,8 +106,8 @@ def test_a_refused_publisher_is_asked_again_at_most_once_in_five_minutes(tmp_pat
     assert made.rotation_due("b", 50.0 + ASK_AGAIN_S) is not None
 
 
-def test_a_topic_taken_for_latched_that_is_not_adapts_too() -> None:
-    made = reception()
+def test_a_topic_taken_for_latched_that_is_not_adapts_too(tmp_path: Path) -> None:
+    made = reception(tmp_path)
     made.overrides("a")
     made.refused("a", "/tf_static", best_effort=False)
     assert profiles(made, "b") == {}
@@ -101,9 +117,8 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
     tmp_path: Path,
 ) -> None:
     """A split names the publishers that its recording had discovered, often not all."""
-    made, topics = reception(), ("/map", "/tf_static")
-    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
-    latched = write_mcap(tmp_path / "a.mcap", messages, McapLayout(latched=frozenset(topics)))
+    made, topics = reception(tmp_path), ("/map", "/tf_static")
+    latched = latched_split(tmp_path / "a.mcap", *topics)
     made.overrides("a")
     made.learn("a", latched)
     for topic in topics:
@@ -131,7 +146,7 @@ def test_a_best_effort_publisher_of_a_latched_topic_is_asked_for_until_it_was_he
 def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_has_gone(
     tmp_path: Path,
 ) -> None:
-    made = reception()
+    made = reception(tmp_path)
     splits = [split(tmp_path / f"a_{nth}.mcap", 5, 4) for nth in range(2)]
     made.overrides("a")
     made.learn("a", splits[0])
@@ -145,18 +160,16 @@ def test_a_split_that_does_not_name_the_weaker_publisher_does_not_show_that_it_h
 
 
 def test_what_a_volatile_publisher_needs_is_asked_for_reliably(tmp_path: Path) -> None:
-    made = reception()
-    messages = [odom(T0 + at * NS, 1.0, 2.0, topic="/map") for at in range(9)]
-    layout = McapLayout(latched=frozenset(["/map"]))
+    made = reception(tmp_path)
     made.overrides("a")
-    made.learn("a", write_mcap(tmp_path / "a.mcap", messages, layout))
+    made.learn("a", latched_split(tmp_path / "a.mcap", "/map"))
     made.refused("a", "/map", best_effort=False)
     asked = profiles(made, "b")["/map"]
     assert (asked["reliability"], asked["durability"]) == ("reliable", "volatile")
 
 
 def test_what_a_refused_publisher_sent_is_missing_until_its_recording_ends(tmp_path: Path) -> None:
-    made = Reception(McapReader(), bag_dir=tmp_path, background=Inline())
+    made = reception(tmp_path)
     made.overrides("a")
     made.learn("a", split(tmp_path / "a_0.mcap", 5, 4))
     made.refused("a", "/odom")
@@ -201,7 +214,7 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
     split(folder / "x_0.mcap", 100, 20)
     (folder / "x_1.mcap").write_bytes(b"nothing")
     split(folder / "x_2.mcap", 50, 1, topic="/scan")
-    made = reception()
+    made = reception(tmp_path)
     made.recall(newest_splits(tmp_path))
     asked = profiles(made, "a")
     assert (asked["/odom"]["depth"], asked["/scan"]["depth"]) == (400, 200)
@@ -209,22 +222,17 @@ def test_an_earlier_run_shows_the_depth_of_each_topic_also_of_one_that_had_ended
 
 
 def test_a_log_is_not_asked_for_what_a_rule_may_have_excluded(tmp_path: Path) -> None:
-    made = Reception(McapReader(), volatile=["/rosout"], background=Inline())
-    topics = ("/rosout", "/map")
-    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
-    layout = McapLayout(latched=frozenset(topics))
-    made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
+    made = reception(tmp_path, latched=(), volatile=["/rosout"])
+    made.learn("a", latched_split(tmp_path / "a_0.mcap", "/rosout", "/map"))
     asked = {topic: each["durability"] for topic, each in profiles(made, "b").items()}
     assert asked == {"/rosout": "volatile", "/map": "transient_local"}
 
 
 def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> None:
     """Unless another publisher of the topic may have one, or it is not known who publishes it."""
-    made = reception()
+    made = reception(tmp_path)
     topics = ("/map", "/tf_static", "/shared", "/plan")
-    messages = [odom(T0 + at * NS, 1.0, 2.0, topic=topic) for at in range(9) for topic in topics]
-    layout = McapLayout(latched=frozenset(topics))
-    made.learn("a", write_mcap(tmp_path / "a_0.mcap", messages, layout))
+    made.learn("a", latched_split(tmp_path / "a_0.mcap", *topics))
     made._flows["/shared"] = made._flows["/shared"]._replace(
         offered=OfferedQos(reliable=True, latched=True, publishers=2)
     )
@@ -238,3 +246,79 @@ def test_a_latched_message_that_is_excluded_is_not_asked_for(tmp_path: Path) -> 
     }
     made.skip_latched([])
     assert {each["durability"] for each in profiles(made, "c").values()} == {"transient_local"}
+
+
+MIB = 2**20
+RELIABLE = OfferedQos(reliable=True, latched=False)
+
+
+def offer(reliability: str, durability: str) -> str:
+    """One publisher, as rosbag2 0.26 writes it."""
+    return (
+        f"- history: unknown\n  depth: 0\n  reliability: {reliability}\n"
+        f"  durability: {durability}\n  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
+    )
+
+
+@pytest.mark.parametrize(
+    ("offers", "reliable", "latched"),
+    [
+        ([("reliable", "volatile")], True, False),
+        ([("reliable", "transient_local")], True, True),
+        ([("reliable", "transient_local"), ("best_effort", "transient_local")], False, True),
+        ([("reliable", "transient_local"), ("reliable", "volatile")], True, False),
+        ([("1", "1")], True, True),
+        ([("2", "2")], False, False),
+        ([("unknown", "unknown")], False, False),
+    ],
+)
+def test_no_more_is_asked_for_than_all_publishers_offer(
+    offers: list[tuple[str, str]], reliable: bool, latched: bool
+) -> None:
+    text = "".join(offer(*each) for each in offers)
+    assert offered_by_all([text]) == OfferedQos(reliable, latched, len(offers))
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{a: 1}", "- 1", "- [", "text"])
+def test_a_topic_whose_publishers_are_not_stated_gets_no_override(text: str) -> None:
+    assert offered_by_all([text]) is None
+    assert offered_by_all([]) is None
+
+
+@given(
+    flows=st.dictionaries(
+        st.sampled_from("abcdef"),
+        st.builds(TopicFlow, st.just(RELIABLE), st.integers(1, 2000), st.integers(0, 8 * MIB)),
+    ),
+    queue_mb=st.integers(1, 256),
+)
+def test_queues_hold_two_seconds_or_are_named_and_fit_in_their_memory(
+    flows: dict[str, TopicFlow], queue_mb: int
+) -> None:
+    plan = plan_queues(flows, queue_mb * MIB)
+    assert plan.depths.keys() == flows.keys()
+    taken = sum(plan.depths[topic] * flow.message_bytes for topic, flow in flows.items())
+    single = sum(flow.message_bytes for flow in flows.values())  # one message of each is held
+    assert taken <= max(queue_mb * MIB, single)
+    for topic, flow in flows.items():
+        assert (plan.depths[topic] < flow.burst) == (topic in plan.cut_short)
+        assert plan.depths[topic] >= 1
+
+
+def test_an_override_names_the_whole_profile_but_no_deadline(tmp_path: Path) -> None:
+    made = reception(tmp_path, latched=["/tf_static", "/unseen"])
+    made._flows = {
+        "/odom": TopicFlow(RELIABLE, 100, 700),
+        "/scan": TopicFlow(OfferedQos(reliable=False, latched=False), 20, 700),
+        "/map": TopicFlow(OfferedQos(reliable=True, latched=True), 1, 700),
+        "/tf_static": TopicFlow(OfferedQos(reliable=True, latched=True), 1, 700),
+    }
+    every = {"history": "keep_all", "reliability": "reliable", "durability": "transient_local"}
+    last = {"history": "keep_last", "reliability": "reliable", "durability": "volatile"}
+    assert profiles(made, "a") == {
+        "/odom": {**last, "depth": 200},
+        "/scan": {**last, "depth": 40, "reliability": "best_effort"},
+        "/map": {**last, "depth": 10, "durability": "transient_local"},
+        "/tf_static": every,
+        "/unseen": every,
+    }

@@ -15,7 +15,7 @@ from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import own_all
 from tests.support.memories import reply_over
 from tests.support.program import exits
-from tests.unit.recorder.memory.test_days import (
+from tests.unit.recorder.test_days import (
     DAY_FILE,
     T0,
     days_of,

@@ -1,4 +1,4 @@
-"""Holes in what was recorded, from counters and stamps, across splits and recordings."""
+"""How topics arrive: holes, from counters and stamps, across splits; which have stopped."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.state_files import Loss
-from ros2_memory.recorder.reception.measure import (
+from ros2_memory.recorder.measure import (
     HOUR_NS,
+    Arrival,
+    Arrivals,
     LossCounter,
     Position,
     Progress,
+    SplitMeasure,
     holes,
     reader_of,
 )
@@ -234,3 +237,31 @@ def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
     losses = counter.measured("new", {"/odom": Progress("stamps", new)})
     losses += counter.measured("old", old)
     assert [loss.lost for loss in [*losses, *counter.flush()]] == [10]
+
+
+def arriving(start: int, stop: int, **hz: int) -> SplitMeasure:
+    """A split of so many seconds, with topics of so many messages a second."""
+    arrivals = {
+        topic: Arrival(start * NS, stop * NS, (stop - start) * rate, NS // rate)
+        for topic, rate in hz.items()
+    }
+    return SplitMeasure({}, {}, arrivals)
+
+
+def test_who_was_silent_once_is_not_regular_for_an_hour() -> None:
+    arrivals = Arrivals()
+    for start in (*range(0, 60, 10), *range(100, 160, 10)):
+        arrivals.measured(arriving(start, start + 10, teleop=10, odom=50))
+    arrivals.measured(arriving(160, 190, odom=50))
+    assert arrivals.silent(0) == frozenset()
+    for start in range(190, 4000, 10):
+        arrivals.measured(arriving(start, start + 10, teleop=10, odom=50))
+    assert arrivals.silent(20 * NS) == {"odom", "teleop"}
+
+
+def test_a_clock_that_was_set_back_begins_anew() -> None:
+    arrivals = Arrivals()
+    for start in (*range(7000, 7060, 10), *range(0, 60, 10)):
+        arrivals.measured(arriving(start, start + 10, odom=50))
+    assert (arrivals.silent(0), arrivals.rates_hz(0)) == (frozenset(), {"odom": 50.0})
+    assert arrivals.silent(11 * NS) == {"odom"}

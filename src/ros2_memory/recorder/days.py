@@ -11,7 +11,7 @@ import re
 import time
 from collections import defaultdict
 from contextlib import suppress
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from itertools import chain, repeat, starmap
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -43,10 +43,11 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
 from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
 from ros2_memory.messages.detections import detections_of
-from ros2_memory.recorder.memory.thinning import (
+from ros2_memory.recorder.thinning import (
     MINUTE_NS,
     TopicThinning,
     beside_pauses,
+    fields_in,
     has_numbers,
     is_said,
     is_sampled,
@@ -436,7 +437,7 @@ class MemoryDays:
 
     def _names_people(self, message: object, type_name: str) -> bool:
         extracted = self._extractor.exact(message, type_name)
-        texts = [value for _, value in _fields(message) if isinstance(value, str)]
+        texts = [value for _, value in fields_in(message) if isinstance(value, str)]
         labels = [
             detection.label for value in (extracted, *texts) for detection in detections_of(value)
         ]
@@ -557,7 +558,7 @@ def _labels(node: object, field: str = "") -> Iterator[tuple[str, str]]:
     """
     if isinstance(node, str):
         yield field, node
-    for name, value in _fields(node):
+    for name, value in fields_in(node):
         for item in value if isinstance(value, list) else [value]:
             if name in _NAMES or not isinstance(item, str):
                 yield from _labels(item, name)
@@ -571,7 +572,7 @@ def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> o
     if not is_dataclass(message) or isinstance(message, type):
         return message
     lists = {
-        name: value for name, value in _fields(message) if isinstance(value, list | np.ndarray)
+        name: value for name, value in fields_in(message) if isinstance(value, list | np.ndarray)
     }
     hidden = {
         name: {
@@ -593,9 +594,3 @@ def _without_hidden(message: object, is_hidden: Callable[[str, str], bool]) -> o
                 items[left] if isinstance(items, np.ndarray) else [items[row] for row in left]
             )
     return replace(message, **changed) if changed else message
-
-
-def _fields(node: object) -> Iterator[tuple[str, object]]:
-    if is_dataclass(node) and not isinstance(node, type):
-        for field_of_node in fields(node):
-            yield field_of_node.name, getattr(node, field_of_node.name)

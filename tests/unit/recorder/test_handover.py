@@ -1,34 +1,47 @@
-"""Two recordings of one robot, each with stalls: what either of them holds counts, and once."""
+"""One recording takes over from another: the cut, the union of both, and what a crash cut short.
+
+What either of them holds counts, and once.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from structlog.testing import capture_logs
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
     CutClock,
     Handover,
+    Overlap,
     read_handover,
     write_handover,
     write_handovers,
 )
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.handover import union
-from ros2_memory.recorder.handover.transfer import Bounds, complete_sidecars, pending
-from ros2_memory.recorder.handover.union import intended, settle_handover, void
+from ros2_memory.recorder import handover
+from ros2_memory.recorder.handover import (
+    complete_sidecars,
+    intended,
+    pending,
+    settle_handover,
+    void,
+)
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, Msg, text, write_mcap
+from tests.support.bags import McapLayout, Msg, boolean, text, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.handovers import recover_handovers
+from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -38,6 +51,7 @@ T0 = 1_795_150_800 * S
 READER = McapReader()
 TOPICS = ("/fast", "/slow", "/latched")
 LAYOUT = McapLayout(latched=frozenset({"/latched"}))
+TRUNCATED = McapLayout(chunk_size=None, finish=False)
 
 
 class Published(NamedTuple):
@@ -140,7 +154,7 @@ def hand_over(
     clock: CutClock = CutClock.PUBLISH,
 ) -> None:
     """Writes the sidecars of a handover that was complete two seconds after both recorded."""
-    at = [T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 1, both_s + 2)]
+    began, both, ended = (T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 2))
     before, after = (bag_dir / name for name in names)
 
     def files(folder: Path) -> list[str]:
@@ -148,20 +162,31 @@ def hand_over(
         return [
             file
             for file, each in spans.items()
-            if each.empty or (each.end >= at[1] if folder == before else each.start <= at[3])
+            if each.empty or (each.end >= both if folder == before else each.start <= ended)
         ]
 
     old, new = complete_sidecars(
         read_handover(before).handover,
         before.name,
         after.name,
-        Bounds(*at),
+        began=began,
+        both=both,
+        ended=ended,
         old_files=files(before),
         new_files=files(after),
         simulated=False,
         clock=clock,
     )
     write_handovers({after: new, before: old})
+
+
+def handed_over(bag_dir: Path, *stalls: Stall) -> tuple[Path, Path]:
+    """The two recordings of a complete handover, of which the new recorder stalled."""
+    published = publications(13)
+    Recorder(0, 7.5).writes(bag_dir / "a", published)
+    Recorder(4, 13, stalls).writes(bag_dir / "b", published)
+    hand_over(bag_dir, 5)
+    return bag_dir / "a", bag_dir / "b"
 
 
 STALLS = st.lists(st.builds(Stall, st.floats(3, 9), st.floats(0.05, 1.5)), max_size=2).map(tuple)
@@ -220,14 +245,11 @@ def test_short_recordings_that_follow_each_other_are_compared_in_pairs(tmp_path:
 
 
 def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Path) -> None:
-    published = publications(13)
-    Recorder(0, 7.5).writes(tmp_path / "a", published)
-    Recorder(4, 13).writes(tmp_path / "b", published)
-    hand_over(tmp_path, 5)
-    before = (tmp_path / "a" / "handover.json").stat().st_mtime_ns
-    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
-    assert (tmp_path / "a" / "handover.json").stat().st_mtime_ns == before
-    after = read_handover(tmp_path / "b").handover
+    old, new = handed_over(tmp_path)
+    before = (old / "handover.json").stat().st_mtime_ns
+    assert settle_handover(old, new, READER)
+    assert (old / "handover.json").stat().st_mtime_ns == before
+    after = read_handover(new).handover
     assert (after.compared, after.also_counts, after.counts_elsewhere) == (True, {}, {})
     assert_union(tmp_path)
 
@@ -249,19 +271,13 @@ class TestWhenItIsDue:
     def test_a_disk_that_fails_is_no_missing_message(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        published = publications(13)
-        Recorder(0, 7.5).writes(tmp_path / "a", published)
-        Recorder(4, 13).writes(tmp_path / "b", published)
-        hand_over(tmp_path, 5)
-
-        def fails(*_: object, **__: object) -> object:
-            raise BagUnreachableError("b_0.mcap", "input/output error")
-
+        old, new = handed_over(tmp_path)
+        fails = Mock(side_effect=BagUnreachableError("b_0.mcap", "input/output error"))
         with monkeypatch.context() as patch:
             patch.setattr(McapReader, "records", fails)
             with pytest.raises(RecorderError, match="input/output"):
-                settle_handover(tmp_path / "a", tmp_path / "b", READER)
-        assert read_handover(tmp_path / "b").handover.compared is False
+                settle_handover(old, new, READER)
+        assert read_handover(new).handover.compared is False
 
 
 @pytest.mark.parametrize("published_at", ["log", "zero"])
@@ -286,12 +302,189 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
 def test_where_too_many_would_be_listed_all_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(union, "MOST_LISTED", 5)
-    published = publications(13)
-    Recorder(0, 7.5).writes(tmp_path / "a", published)
-    Recorder(4, 13, (Stall(5.8, 1),)).writes(tmp_path / "b", published)
-    hand_over(tmp_path, 5)
-    assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
-    reader = BagDirReader(READER)
-    for name in ("a", "b"):
-        assert numbers(tmp_path / name, reader) == numbers(tmp_path / name, READER)
+    monkeypatch.setattr(handover, "MOST_LISTED", 5)
+    both = handed_over(tmp_path, Stall(5.8, 1))
+    assert settle_handover(*both, READER)
+    for recording in both:
+        assert numbers(recording, BagDirReader(READER)) == numbers(recording, READER)
+
+
+class Receiver(NamedTuple):
+    """When a recorder received, in seconds of the wall clock, and by how much later it did."""
+
+    start: float
+    stop: float
+    delay_s: float
+
+
+class Publisher(NamedTuple):
+    """Publishes at multiples of its period, by a clock that is off by `skew_s`."""
+
+    period_s: float
+    phase_s: float
+    skew_s: float
+
+
+@given(
+    publisher=st.builds(Publisher, st.floats(0.003, 0.3), st.floats(0, 0.3), st.floats(-0.9, 0.9)),
+    subscribed_s=st.floats(0.2, 5),
+    delays=st.tuples(st.floats(0, 0.002), st.floats(0, 0.002)),
+    ends_after_s=st.floats(0.0, 5.0),
+)
+def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays(
+    publisher: Publisher,
+    subscribed_s: float,
+    delays: tuple[float, float],
+    ends_after_s: float,
+) -> None:
+    old, new = complete_sidecars(
+        Handover(),
+        "a",
+        "b",
+        began=T0,
+        both=T0 + round(subscribed_s * S),
+        ended=T0 + round((subscribed_s + 2) * S),
+        old_files=["a.mcap"],
+        new_files=["b.mcap"],
+        simulated=False,
+        clock=CutClock.PUBLISH,
+    )
+    recorders = {
+        "a.mcap": (old, Receiver(-10.0, subscribed_s + 2 + ends_after_s, delays[0])),
+        # A second later at most: it said that it had subscribed after it had.
+        "b.mcap": (new, Receiver(subscribed_s - 0.1, 20.0, delays[1])),
+    }
+    moment = -5 + publisher.phase_s
+    while moment < 15:
+        counted = 0
+        for file, (sidecar, receiver) in recorders.items():
+            received = moment + receiver.delay_s
+            if not receiver.start <= received < receiver.stop:
+                continue
+            published = T0 + round((moment + publisher.skew_s) * S)
+            logged = T0 + round(received * S)
+            counted += not any(
+                each.excludes(published, logged) for each in sidecar.exclusions(file)
+            )
+        assert counted == 1, moment
+        moment += publisher.period_s
+
+
+def bump(published: int, delay: int) -> Msg:
+    made = boolean(published, True)
+    return Msg(made.topic, made.type, published + delay, made.body, published)
+
+
+def cut_recording(bag_dir: Path, name: str, start: float, stop: float, *, delay: int) -> Path:
+    """A recording cut short that received ten messages a second from start to stop."""
+    first, last = round(start * 10), round(stop * 10)
+    messages = [bump(T0 + n * S // 10, delay) for n in range(first, last)]
+    directory = bag_dir / name
+    write_mcap(directory / f"{name}_0.mcap", messages, TRUNCATED)
+    return directory
+
+
+def interrupted(old: Path, new: Path) -> None:
+    """What a crash before the cut leaves."""
+    write_handover(old, intended(Handover(), new.name))
+    write_handover(new, pending(old.name))
+
+
+def counted(bag_dir: Path) -> Counter[int]:
+    """The publish times that count, once all is settled."""
+    recover_handovers(bag_dir, READER)
+    found: Counter[int] = Counter()
+    for path in bag_dir.glob("*/*.mcap"):
+        records = BagDirReader(READER).records(path, ["/bumper"], TimeWindow.everything())
+        found.update(record.publish_time for record in records)
+    return found
+
+
+def once(numbers: Iterable[int]) -> dict[int, int]:
+    """Each of these messages of ten a second."""
+    return dict.fromkeys((T0 + number * S // 10 for number in numbers), 1)
+
+
+@given(
+    old_stop=st.floats(5, 20),
+    new_start=st.floats(5, 20),
+    new_lasts=st.floats(0, 20),
+    delays=st.tuples(st.integers(0, S // 1000), st.integers(0, S // 1000)),
+)
+def test_whatever_either_holds_counts_exactly_once(
+    tmp_path_factory: pytest.TempPathFactory,
+    old_stop: float,
+    new_start: float,
+    new_lasts: float,
+    delays: tuple[int, int],
+) -> None:
+    bag_dir = tmp_path_factory.mktemp("bags")
+    old = cut_recording(bag_dir, "a", 0, old_stop, delay=delays[0])
+    new = cut_recording(bag_dir, "b", new_start, new_start + new_lasts, delay=delays[1])
+    interrupted(old, new)
+    of_new = range(round(new_start * 10), round((new_start + new_lasts) * 10))
+    assert counted(bag_dir) == once({*range(round(old_stop * 10)), *of_new})
+    assert read_handover(old).handover.counts_until is not None
+
+
+def test_a_crash_between_the_two_sidecars_is_brought_to_its_end(tmp_path: Path) -> None:
+    old = cut_recording(tmp_path, "a", 0, 10, delay=5)
+    new = cut_recording(tmp_path, "b", 7, 15, delay=9)
+    cut = T0 + 9 * S
+    write_handover(old, intended(Handover(), "b"))
+    begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
+    write_handover(new, Handover(previous="a", counts_from=cut, begin=begin))
+    assert counted(tmp_path) == once(range(150))
+    assert read_handover(old).handover.counts_until == cut
+
+
+def test_latched_messages_do_not_say_how_far_a_recording_reaches(tmp_path: Path) -> None:
+    directory = tmp_path / "a"
+    static = tf(T0 + 99 * S, transform(T0, "a", "b", (0, 0, 0)), topic="/tf_static")
+    write_mcap(directory / "a_0.mcap", [bump(T0, 5), static], TRUNCATED)
+    new = cut_recording(tmp_path, "b", 0, 50, delay=9)
+    interrupted(directory, new)
+    assert counted(tmp_path) == once(range(500))
+
+
+def test_after_a_clock_that_was_set_back_no_more_than_a_minute_is_in_doubt(tmp_path: Path) -> None:
+    day = 86400
+    old = cut_recording(tmp_path, "a", day, day + 2, delay=0)
+    new = cut_recording(tmp_path, "b", 0, 300, delay=0)
+    interrupted(old, new)
+    assert len(counted(tmp_path)) >= 20 + 2400
+
+
+def test_what_cannot_be_completed_is_reported_and_the_rest_is_completed(tmp_path: Path) -> None:
+    for name in ("a", "c"):
+        old = cut_recording(tmp_path, name, 0, 1, delay=0)
+        write_handover(old, intended(Handover(), name + "2"))
+    (tmp_path / "a" / ".handover.json.tmp").mkdir()
+    with capture_logs() as logs:
+        World(tmp_path).started(100)
+    assert [each["recording"] for each in logs if each["log_level"] == "error"] == ["a"]
+    assert read_handover(tmp_path / "c").handover.next is None
+
+
+def test_a_new_one_that_has_handed_over_since_keeps_what_it_gave_away(tmp_path: Path) -> None:
+    first = cut_recording(tmp_path, "a", 0, 10, delay=5)
+    second = cut_recording(tmp_path, "b", 8, 20, delay=9)
+    third = cut_recording(tmp_path, "c", 18, 25, delay=2)
+    write_handover(first, intended(Handover(), "b"))
+    end = Overlap(T0 + 18 * S, None, ("b_0.mcap",))
+    handed_over = replace(pending("a"), next="c", counts_until=T0 + 19 * S, end=end)
+    write_handover(second, handed_over)
+    begin = Overlap(T0 + 17 * S, T0 + 21 * S, ("c_0.mcap",))
+    write_handover(third, Handover(previous="b", counts_from=T0 + 19 * S, begin=begin))
+    assert counted(tmp_path) == once(range(250))
+
+
+def test_one_whose_predecessor_was_deleted_is_settled(tmp_path: Path) -> None:
+    new = cut_recording(tmp_path, "b", 7, 15, delay=9)
+    begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
+    after = Handover(previous="a", counts_from=T0 + 9 * S, begin=begin, compared=False)
+    write_handover(new, after)
+    with capture_logs() as logs:
+        recover_handovers(tmp_path, READER)
+    assert not logs
+    assert read_handover(new).handover == after

@@ -1,1 +1,0 @@
-"""One recording takes over from another without losing or doubling a message."""

@@ -1,1 +1,0 @@
-"""What outlives the bags: thinned days, which the recorder writes before it deletes a bag."""
