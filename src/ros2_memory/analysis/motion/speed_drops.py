@@ -45,11 +45,10 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     if rows.size < _ROWS:
         return ()
     times = poses.times[rows]
-    moved = np.diff(poses.positions[rows, :2], axis=0)
-    speeds = np.hypot(moved[:, 0], moved[:, 1]) / (np.diff(times) / NS_PER_S)
+    places = poses.positions[rows]
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (np.diff(times) / NS_PER_S)
     # Of two slots: a robot whose position jumps, and is back, gets no farther.
-    away = poses.positions[rows[2:], :2] - poses.positions[rows[:-2], :2]
-    ahead = np.hypot(away[:, 0], away[:, 1]) / ((times[2:] - times[:-2]) / NS_PER_S)
+    ahead = np.linalg.norm(places[2:] - places[:-2], axis=1) / ((times[2:] - times[:-2]) / NS_PER_S)
     before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
     after = np.maximum(speeds[:-1], speeds[1:])
     falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])
