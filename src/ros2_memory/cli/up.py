@@ -18,6 +18,7 @@ from tempfile import TemporaryDirectory
 from typing import Annotated, Final, NamedTuple
 
 import typer
+import yaml
 from rich.live import Live
 
 from ros2_memory.bag_dir.durable_write import write_durably

@@ -545,10 +545,10 @@ def speed_drops(poses: Poses) -> tuple[SpeedDrop, ...]:
     rows = valid[np.flatnonzero(np.diff(slots, prepend=slots[:1] - 1))]
     if rows.size < _DROP_SLOTS:
         return ()
-    times, places = poses.times[rows], poses.positions[rows, :2]
-    speeds = np.hypot(*np.diff(places, axis=0).T) / (np.diff(times) / NS_PER_S)
+    times, places = poses.times[rows], poses.positions[rows]
+    speeds = np.linalg.norm(np.diff(places, axis=0), axis=1) / (np.diff(times) / NS_PER_S)
     # Of two slots: a robot whose position jumps, and is back, gets no farther.
-    ahead = np.hypot(*(places[2:] - places[:-2]).T) / ((times[2:] - times[:-2]) / NS_PER_S)
+    ahead = np.linalg.norm(places[2:] - places[:-2], axis=1) / ((times[2:] - times[:-2]) / NS_PER_S)
     before = np.minimum(np.minimum(speeds[:-1], speeds[1:]), ahead)
     after = np.maximum(speeds[:-1], speeds[1:])
     falls = (before[:-3] >= MOVING_MPS) & (after[3:] <= FRACTION * before[:-3])

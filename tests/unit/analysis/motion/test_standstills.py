@@ -305,6 +305,14 @@ def test_a_robot_that_suddenly_slows_down_is_noticed_with_its_speeds() -> None:
     assert drop.after_mps == pytest.approx(0.05, abs=0.01)
 
 
+def test_a_drone_that_sinks_where_it_flew_has_the_speed_at_which_it_sinks() -> None:
+    flown = [(BEGIN + n * S // 20, (0.15 * n, 0.0, 30.0)) for n in range(100)]
+    sinking = [(BEGIN + n * S // 20, (15.0, 0.0, 30.0 - 0.05 * (n - 100))) for n in range(100, 200)]
+    upright = [(0.0, 0.0, 0.0, 1.0)] * 200
+    [drop] = speed_drops(posed([*flown, *sinking], upright))
+    assert (drop.before_mps, drop.after_mps) == pytest.approx((3.0, 1.0), abs=0.05)
+
+
 @pytest.mark.parametrize(
     "poses",
     [
