@@ -505,10 +505,9 @@ def count_range(
         raise no_data_between(view, (name,), asked)
     member = binned.bins.member
     binned.add("count", "count", (counts @ member).tolist(), int(counts.sum()))
-    in_bins = [counts.astype(bool) & in_bin for in_bin in member.T]
-    firsts = [min(first[in_bin].tolist(), default=None) for in_bin in in_bins]
-    lasts = [max(last[in_bin].tolist(), default=None) for in_bin in in_bins]
-    binned.add("first", "time", firsts, first.min())
+    has_some = counts > 0
+    binned.add_first("first", first[has_some])
+    lasts = [max(last[has_some & in_bin].tolist(), default=None) for in_bin in member.T]
     binned.add("last", "time", lasts, last.max())
     for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:

@@ -324,21 +324,22 @@ class SplitSearch:
         return fired, stopped
 
     def _firings_at(self, event: _Event, state: TriggerState) -> Iterator[Firing]:
-        record, rules = event.record, self._rules_of(event.topic)
-        latched = record is not None and record.channel.latched
-        if record is not None and latched:
-            rules = tuple(rule for rule in rules if rule.condition is not None)
-            if _receive(record, event.recording, state):
-                return
+        record, latched = event.record, False
         value: JsonValue | UndecodableError = None
-        if record is not None and any(rule.condition is not None for rule in rules):
+        rules = self._rules_of(event.topic)
+        if record is not None:
+            latched = record.channel.latched
+            if latched and _receive(record, event.recording, state):
+                return
             try:
                 value = self._extractor.exact(self._reader.decode(record), record.channel.type)
             except UndecodableError as error:
                 value = error
         for rule in rules:
-            matches: bool | None = False
-            if rule.condition is not None and record is not None:
+            if latched and rule.condition is None:
+                continue  # its publisher is silent until something changes
+            matches = None
+            if rule.condition is not None:
                 matches = self._test(rule, rule.condition, event.topic, value, state)
             runs = state.rules[rule.name].runs
             fired = rule.take(runs, event.topic, event.time, matches=matches, latched=latched)

@@ -12,6 +12,7 @@ import threading
 import time
 import uuid
 from copy import deepcopy
+from itertools import product
 from typing import TYPE_CHECKING, Final
 
 import structlog
@@ -25,7 +26,7 @@ from ros2_memory.bag_dir.state_files import (
     RuleRecord,
     TriggerState,
 )
-from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
 from ros2_memory.triggers.rules import GLOB_MARKS, Firing, Rule, SplitSearch, chains_to_search
@@ -115,10 +116,9 @@ class Triggers:
         with self._lock:
             restarts, self.restarts = self.restarts, []
             deleted, self._deleted = self._deleted, 0
-        for first, at in restarts:
-            for rule in self._rules.values():
-                if rule.topic is None:
-                    self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
+        for (first, at), rule in product(restarts, self._rules.values()):
+            if rule.topic is None:
+                self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
             self._store_moments(name, state.rules[name], snapshot)
             if rule.condition is not None:
@@ -212,11 +212,11 @@ class Triggers:
 
     def _first_state(self, snapshot: Snapshot) -> TriggerState:
         closed, live = self._closed_bags(snapshot, TriggerState())
-        before = (name for name in reversed([*self._own.names()]) if name not in live)
+        ended = [name for name in self._own.names() if name not in live]
         searched = {
-            name: max(bag.end for bag in closed[name]) + 1 for name in closed if name in live
+            name: max(bag.end for bag in bags) + 1 for name, bags in closed.items() if name in live
         }
-        return TriggerState(before=next(before, None), searched=searched)
+        return TriggerState(before=ended[-1] if ended else None, searched=searched)
 
     def _closed_bags(
         self, snapshot: Snapshot, state: TriggerState
@@ -229,14 +229,9 @@ class Triggers:
         live = frozenset((*read_heartbeat(self._bag_dir).recordings, *active))
         names = [*self._own.names()]
         positions = {name: number for number, name in enumerate(names)}
-        known_positions = [
-            positions[name] for name in (state.before, *state.searched) if name in positions
-        ]
-        first = (
-            positions[state.before] + 1
-            if state.before in positions
-            else min(known_positions, default=0)
-        )
+        searched = (positions[name] for name in state.searched if name in positions)
+        before = positions.get(state.before or "")
+        first = min(searched, default=0) if before is None else before + 1
         folders = {str(self._bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
@@ -260,7 +255,7 @@ class Triggers:
         _log.info("trigger_fired", rule=rule.name, topic=firing.topic, at_ns=firing.at)
         window = rule.window(firing.first, firing.at)
         newest = record.newest[-1] if record.newest else None
-        if newest is not None and _joins(newest.start, newest.end, window.start, window.stop):
+        if newest is not None and _joins(newest, window):
             newest.start, newest.end = min(newest.start, window.start), max(newest.end, window.stop)
             newest.matches += 1
             newest.stored = False
@@ -341,9 +336,9 @@ def _note_lasting_match(name: str, record: RuleRecord) -> None:
     record.always_since = longest
 
 
-def _joins(start: Ns, end: Ns, other_start: Ns, other_end: Ns) -> bool:
-    """Whether two windows touch, and are not too long together."""
-    if other_start > end or start > other_end:
+def _joins(moment: RuleMoment, window: TimeWindow) -> bool:
+    """Whether a window touches a moment, and is not too long with it."""
+    if window.start > moment.end or moment.start > window.stop:
         return False
-    longest = max(LONGEST_NS, end - start, other_end - other_start)
-    return max(end, other_end) - min(start, other_start) <= longest
+    longest = max(LONGEST_NS, moment.end - moment.start, window.stop - window.start)
+    return max(moment.end, window.stop) - min(moment.start, window.start) <= longest
