@@ -105,9 +105,9 @@ def ask(
     if not asked:
         rows: list[JsonValue] = []
         for tool_listed in dispatcher.tools:
-            purpose, _, _ = tool_listed.description.removeprefix("Blocking. ").partition(". ")
+            description = tool_listed.description.removeprefix("Blocking. ")
+            purpose = re.split(r"\. |;", description)[0].rstrip(".")
             taken = ", ".join(argument for argument, _ in _arguments(tool_listed))
-            purpose = purpose.partition(";")[0].rstrip(".")
             rows.append({"tool": tool_listed.name, "purpose": purpose, "arguments": taken})
         if as_json:
             print_line(json.dumps(rows))
