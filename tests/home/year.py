@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.recorder.days import MemoryDays, MemoryLimits
+from ros2_memory.recorder.housekeeping import Housekeeping
 from ros2_memory.retention.policy import RetentionLimits
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
