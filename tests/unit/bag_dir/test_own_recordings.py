@@ -238,6 +238,17 @@ class TestWhatAKillLeaves:
         assert [each.get("recording") for each in lines(tmp_path)] == [None, A, A, B]
         assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
+    @settings(max_examples=examples(100), deadline=None)
+    @given(data=st.binary(max_size=300))
+    def test_whatever_stands_in_the_list_no_directory_is_made_up(
+        self, tmp_path_factory: pytest.TempPathFactory, data: bytes
+    ) -> None:
+        bag_dir = tmp_path_factory.mktemp("bags")
+        (bag_dir / ".episodic").mkdir()
+        (bag_dir / A).mkdir()
+        (bag_dir / LIST_FILE).write_bytes(data)
+        assert not OwnRecordings(bag_dir).owns(bag_dir / A)
+
 
 class TestCopies:
     def test_a_restored_directory_is_foreign_until_it_is_adopted(self, tmp_path: Path) -> None:
@@ -422,3 +433,14 @@ class TestEmbedded:
         known = found.index(OURS)
         assert found == [None] * known + [OURS] * (len(data) - known)
         assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
+
+    @settings(max_examples=examples(100), deadline=None)
+    @given(at=st.integers(0, 400), value=st.integers(0, 255))
+    def test_a_damaged_file_never_raises_more_than_an_oserror(
+        self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int
+    ) -> None:
+        path = embedding(tmp_path_factory.mktemp("bag") / "a_0.mcap", OURS, size=2)
+        data = bytearray(path.read_bytes())
+        data[at % len(data)] = value
+        path.write_bytes(data)
+        assert custom_data(path) in (None, OURS) or isinstance(custom_data(path), dict)

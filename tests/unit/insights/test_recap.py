@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.facts import FLAG, MOST
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.regions import Circle, Place, Rectangle
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.insights.recap import MOST_EVENTS, recap
@@ -35,8 +36,10 @@ from tests.support.bags import (
     write_mcap,
     write_splits,
 )
+from tests.support.closed_form import SESSIONS, SPEED
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.shared_bags import needs_recorded
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
@@ -552,3 +555,68 @@ def test_what_one_of_two_detectors_still_sees_is_in_view(tmp_path: Path) -> None
     found = over(memory_of(tmp_path), 0, 99.5)
     [cup] = [each for each in found.events if "cup" in each.text]
     assert cup.goes_on
+
+
+@needs_recorded
+def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
+    session = SESSIONS["session_mcap"]
+    for bag in session.folder.glob("*.mcap"):
+        (tmp_path / bag.name).write_bytes(bag.read_bytes())
+    memory = memory_of(tmp_path)
+    answer = recap(memory, Call(), TimeRange(start_s=session.at(2.0), end_s=session.at(60.0)))
+    assert answer.distance_m == pytest.approx(58 * SPEED, rel=0.002)
+    assert answer.stood == 0
+    assert answer.throughout == ("table",)
+    expected = [
+        ("cup in view", 5, 24),
+        ("scissors in view", 12, 5),
+        ("/bumper became true", 25, 1),
+        ("/bumper became false", 26, None),
+        ("scissors in view", 40, 5),
+    ]
+    assert [each.text for each in answer.events] == [text for text, _, _ in expected]
+    for event, (_, start, length) in zip(answer.events, expected, strict=True):
+        assert abs(session.since(unix_from_ns(event.start)) - start) < 0.05
+        if length is None:
+            assert event.end is None
+        else:
+            assert event.end is not None
+            assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
+
+
+@pytest.mark.parametrize("split_s", [10, 1000])
+@pytest.mark.parametrize(("hz", "hole_s"), [(10, 25), (10, 60), (0.5, 0), (0.2, 0)])
+def test_mean_speed_does_not_depend_on_how_files_are_split(
+    tmp_path: Path, split_s: int, hz: float, hole_s: int
+) -> None:
+    """A robot that drives at 0.5 m/s; poses are missing for a while, or come seldom."""
+    at = [n / hz for n in range(round(200 * hz)) if not 30 <= n / hz < 30 + hole_s]
+    poses = [odom(BEGIN + round(each * S), each / 2, 0.0, vx=0.5) for each in at]
+    flags = [boolean(BEGIN + n * S, False, "/bumper") for n in range(200)]
+    write_splits(tmp_path, [*poses, *flags], split_s)
+    window = {"start": BEGIN / S, "end": BEGIN / S + 200}
+    path = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", **window)
+    assert path["avg_speed"] == pytest.approx(0.5, abs=0.001)
+    unrecorded_s = path["duration_s"] - path.get("recorded_s", path["duration_s"])
+    assert unrecorded_s == pytest.approx(hole_s, abs=0.11)
+
+
+def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
+    seconds = [*range(10), *range(100, 110)]
+    write_splits(tmp_path, [odom(BEGIN + t * S, 0.1 * t, 0.0, 0.0) for t in seconds])
+    answer = over(memory_of(tmp_path), 0, 120)
+    [gap] = [each for each in answer.events if each.kind == "gap"]
+    assert ((gap.start - BEGIN) / S, ((gap.end or 0) - BEGIN) / S) == (9.0, 100.0)
+
+
+def test_errors_in_logs_are_reported_once_with_their_count(tmp_path: Path) -> None:
+    said = [(1, 20, "all well"), (2, 40, "no path"), (3, 40, "no path"), (4, 50, "giving up")]
+    messages = [log_entry(BEGIN + at * S, level, "planner", msg) for at, level, msg in said]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    answer = over(memory_of(tmp_path), 0, 10)
+    assert times(answer.events, "error") == [
+        ("error: planner: no path (2 times)", 2.0),
+        ("error: planner: giving up", 4.0),
+    ]
+    assert answer.distance_m is None
+    assert any("the path is unknown" in note for note in answer.notes)

@@ -2,23 +2,34 @@ from __future__ import annotations
 
 import json
 import math
+import random
 from dataclasses import replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from ros2_memory import queries
+from ros2_memory.analysis.conditions import parse_condition
+from ros2_memory.analysis.intervals import SILENCE_NS
+from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
+    NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.model import JsonValue
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.view import View
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.where import WhileCondition
+from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
     boolean,
     command,
@@ -33,8 +44,10 @@ from tests.support.bags import (
 )
 from tests.support.clocks import FixedClock
 from tests.support.closed_form import SESSIONS, position
+from tests.support.examples import examples
 from tests.support.mcap_surgery import raw_mcap
-from tests.support.memories import asked, each_way, memory_of
+from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.random_histories import write_history
 from tests.support.shared_bags import needs_recorded
 
 if TYPE_CHECKING:
@@ -230,6 +243,19 @@ def test_a_state_lasts_until_the_message_that_says_otherwise(tmp_path: Path) -> 
     assert reply["all"][seconds - 1] == 20
 
 
+def test_the_window_and_the_limit_bound_what_is_reported(tmp_path: Path) -> None:
+    said = [(float(t), "cup" if t % 2 else "") for t in range(20)]
+    memory = spoken(tmp_path, *said)
+    at = BEGIN / S
+    assert seconds(memory, "cup", OBJECTS, start_s=at + 5, end_s=at + 9) == [(9, 9), (7, 7), (5, 5)]
+    answer = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=3)
+    assert [(each.last - BEGIN) // S for each in answer.sightings] == [19, 17, 15]
+    assert answer.more
+    assert answer.total is None
+    whole = find_matches(memory, Call(), OBJECTS, "contains", "cup", limit=10)
+    assert (whole.more, whole.total) == (False, 10)
+
+
 def test_the_last_seconds_count_from_now(tmp_path: Path) -> None:
     spoken(tmp_path, *((float(t), "cup" if t % 2 else "") for t in range(20)))
     memory = memory_of(tmp_path, clock=FixedClock(BEGIN + 25 * S))
@@ -264,6 +290,14 @@ def test_only_a_few_texts_are_shown_and_not_whole(tmp_path: Path) -> None:
     [seen] = reply["sightings"]
     assert [len(each) for each in seen["matched"]] == [200] * 5
     assert seen["matched_count"] == 8
+
+
+def test_what_is_no_text_has_no_matched_texts(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [boolean(BEGIN, True)])
+    memory = memory_of(tmp_path)
+    reply = asked(memory, tmp_path, "find_matches", topic="/bumper", condition_type="equals",
+                  value=True)  # fmt: skip
+    assert not {"matched", "value"} & reply["sightings"][0].keys()
 
 
 def test_a_sighting_has_the_fields_that_are_asked_of_its_last_message(tmp_path: Path) -> None:
@@ -326,6 +360,65 @@ def test_a_sighting_whose_search_runs_out_of_time_says_that_it_began_earlier(
         assert sighting.begun != any("ran out of time" in note for note in answer.notes)
     assert counts == sorted(counts)
     assert counts[0] < bags * 10 == counts[-1]
+
+
+def grouped(
+    memory: Memory, topic: str, kind: str, value: JsonValue
+) -> list[tuple[str, int, int, int]]:
+    """What sightings are, read off all messages in order."""
+    condition = parse_condition(kind, value, memory.limits.position_tolerance_m)
+    view = View(memory, Call(), memory.clock.now())
+    search = ReverseSearch(view, topic, condition)
+    rows: list[list[tuple[str, int]]] = []
+    under_way: dict[str, list[tuple[str, int]]] = {}
+    backwards = view.stream.messages(search.topics, TimeWindow.everything(), newest_first=True)
+    for each in reversed(list(backwards)):
+        name = each.record.channel.topic
+        row = under_way.get(name)
+        if not search.matches(each):
+            under_way.pop(name, None)
+        elif row is None or each.time - row[-1][1] > SILENCE_NS:
+            under_way[name] = [(name, each.time)]
+            rows.append(under_way[name])
+        else:
+            row.append((name, each.time))
+    told = [(row[0][0], row[0][1], row[-1][1], len(row)) for row in rows]
+    return sorted(told, key=lambda each: (-each[2], each[0]))
+
+
+ASKED: tuple[tuple[str, str, JsonValue], ...] = (
+    ("/vision/*", "contains", "cup"),
+    ("/vision/a", "contains", "e"),
+    ("/bumper", "equals", True),
+    ("/odom", "near_position", {"x": 0.0, "y": 0.0}),
+    ("/dock", "contains", "docked"),
+)
+
+
+@settings(max_examples=examples(40), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.0, 0.5, 1.0]))
+def test_sightings_are_the_rows_of_matches_whatever_the_catalogue_knows(
+    seed: int, part: float
+) -> None:
+    draw = random.Random(seed)
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        write_history(bag_dir, draw)
+        plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=QuerySettings())
+        memory = with_store(plain, bag_dir, part=part)
+        for topic, kind, value in ASKED:
+            try:
+                expected = grouped(plain, topic, kind, value)
+            except NoDataError:
+                continue
+            answer = find_matches(memory, Call(), topic, kind, value, limit=100)
+            told = [(each.topic, each.first, each.last, each.messages) for each in answer.sightings]
+            assert sorted(told, key=lambda each: (-each[2], each[0])) == expected, (topic, value)
+            assert [each[2] for each in told] == sorted((each[2] for each in told), reverse=True)
+            assert find_matches(memory, Call(), topic, kind, value, limit=100) == answer
+            oldest = find_matches(memory, Call(), topic, kind, value, limit=2, oldest_first=True)
+            assert oldest.sightings == tuple(reversed(answer.sightings))[:2]
+            assert oldest.total == len(answer.sightings)
 
 
 def test_each_line_of_a_log_is_a_sighting_and_levels_have_names(tmp_path: Path) -> None:

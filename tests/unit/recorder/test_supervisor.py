@@ -189,6 +189,14 @@ class TestMessagesOfOneRecordingAlone:
         world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
+    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.0, 24.5, 26.0, 26.5])
+    def test_a_stop_amid_a_rotation_hides_nothing(self, tmp_path: Path, after_s: float) -> None:
+        world = World(tmp_path, session_duration_s=20).started(after_s - 0.5)
+        world.recorders[0].deaf = True
+        world.run(0.5)
+        world.supervisor.stop()
+        assert_what_stands_counts_once(world)
+
 
 class TestClock:
     def test_set_back_in_a_handover_the_handover_is_tried_again(self, tmp_path: Path) -> None:
@@ -398,6 +406,16 @@ class TestWaiting:
         ).started(40)
         assert world.heartbeat()["state"] == "waiting"
         assert expected in world.heartbeat()["waiting_for"]
+
+    def test_its_own_log_is_no_sign_of_the_robot(self, tmp_path: Path) -> None:
+        world = World(
+            tmp_path,
+            expected=("/rosout", "/odom"),
+            defaults={"topics": ("/rosout",), "heard": ("/rosout",)},
+        ).started(40)
+        beat = world.heartbeat()
+        assert beat["state"] == "waiting"
+        assert "no publisher offers any of the listed topics" in beat["waiting_for"]
 
 
 def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> None:

@@ -400,3 +400,11 @@ def test_long_lists_are_cut_to_6_kb_with_their_totals(tmp_path: Path) -> None:
         assert len(things[kind]) == shown
         assert 20 < things[f"{kind}_total"] <= 24
     assert reply["errors_total"] == 20
+
+
+def test_a_thing_that_was_detected_without_a_place_is_not_missed(tmp_path: Path) -> None:
+    lost = ("mug", math.nan, math.nan)
+    reply = compared(tmp_path, [*looked(0, 20, HERE, MUG), *looked(60, 90, HERE, lost)])
+    assert labels(reply) == {"not_looked_at": ["mug"]}
+    [note] = reply["notes"]
+    assert "could not be placed: mug (30 times" in note

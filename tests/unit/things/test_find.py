@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
 
 from ros2_memory.analysis import sights
 from ros2_memory.core.regions import Circle, Place, Rectangle
@@ -28,6 +30,7 @@ from tests.support.bags import (
     transform,
     write_splits,
 )
+from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, replied
 
 if TYPE_CHECKING:
@@ -828,3 +831,57 @@ def test_detections_that_cannot_be_decoded_are_no_silence_of_the_detector(
     for reply in (found, asked(memory, tmp_path, "compare", **whole)):
         assert "messages of /vision/scene/scene_objects could not be decoded, so" in str(reply)
     assert "no things are known" not in str(found)
+
+
+@settings(
+    max_examples=examples(6),
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+)
+@given(
+    moved=st.integers(45, 60),
+    split_s=st.sampled_from([4.0, 10.0, 17.0]),
+    back=st.booleans(),
+)
+@example(moved=45, split_s=10.0, back=True)
+@example(moved=54, split_s=10.0, back=False)
+def test_things_are_the_same_in_one_file_and_in_many(
+    tmp_path_factory: pytest.TempPathFactory, moved: int, split_s: float, back: bool
+) -> None:
+    """A cup is taken away while the robot looks elsewhere; then the robot looks again, or not."""
+    cup, book, mug = ("cup", 3.0, 0.5), ("book", 3.5, -1.0), ("mug", -1.5, 1.0)
+    messages = looked(0, moved, HERE, cup, book) + looked(moved, moved + 25, AWAY, mug)
+    if back:
+        messages += looked(moved + 25, moved + 50, HERE, book)
+    answers, missed_by = [], []
+    for each in (split_s, 1e6):
+        bag_dir = tmp_path_factory.mktemp("bags")
+        write_splits(bag_dir, messages, each)
+        answers.append(ask(bag_dir, NAMED))
+        [lost] = [each for each in answers[-1]["things"] if each["label"] == "cup"]
+        missed_by.append(lost["still_there"].pop("not_seen_where_expected", None))
+    assert answers[0] == answers[1]
+    assert [each is not None for each in missed_by] == [back, back]
+    if back:  # by when is known to a split, or a slice of one
+        assert abs(missed_by[0] - missed_by[1]) <= max(split_s, 15.0)
+
+
+def test_a_thing_on_the_table_is_in_the_kitchen_too(tmp_path: Path) -> None:
+    write_splits(tmp_path, looked(0, 20, HERE, ("Mug", 3.0, 0.5)))
+    table = Place("table", "map", Circle(3.0, 0.0, 1.0))
+    reply = ask(tmp_path, QuerySettings(places=(KITCHEN, table)))
+    [mug] = reply["things"]
+    assert (mug["in"], mug["also_in"]) == ("table", ["kitchen"])
+
+
+def test_people_move_and_are_where_they_were_seen_last(tmp_path: Path) -> None:
+    walk = [
+        message
+        for at in range(30)
+        for message in scene(at, HERE, [("person", 2.0 + at * 0.3, 0.0), ("person", 3.0, 1.0)])
+    ]
+    write_splits(tmp_path, walk)
+    [people] = ask(tmp_path, label="people")["things"]
+    assert people["moves"] is True
+    assert people["at_once"] == 2
+    assert "still_there" not in people

@@ -290,3 +290,13 @@ def test_what_is_far_off_while_localisation_is_poor_is_no_second_thing(tmp_path:
     assert (mug["place"]["y"], mug["last_seen"]) == (0.5, BEGIN + 29)
     assert mug["still_there"] == {"not_looked_at_since": BEGIN + 29}
     assert any(note.startswith("localisation was poor") for note in reply["notes"])
+
+
+@pytest.mark.parametrize(
+    ("bias", "sides"), [(0.0, ""), (0.1, ""), (0.1, "000001"), (0.1, "000011"), (0.1, "010101")]
+)
+def test_a_world_without_moves_has_none(tmp_path: Path, bias: float, sides: str) -> None:
+    things = found(tmp_path, Home(4, bias=bias, sides=sides))
+    assert not any("moved" in thing for thing in things.values())
+    reply = compare(tmp_path)
+    assert (reply["things"], reply["things_unchanged"]) == ({}, len(LABELS))
