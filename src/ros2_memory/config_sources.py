@@ -192,17 +192,23 @@ def _split_variable(given: Mapping[str, str]) -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:
-        shown = "what it holds" if _names_token(text) else repr(text)
+        shown = "what it holds" if _may_hold_secret(text) else repr(text)
         raise ConfigError(
             f"MEMORY_CONFIG_OVERRIDES: {shown} is not allowed ({error}); "
             "write assignments as for a shell, separated by spaces"
-        ) from (None if _names_token(text) else error)
+        ) from (None if _may_hold_secret(text) else error)
 
 
 def _names_token(text: str) -> bool:
     """Returns whether a text sets a token as if it were a setting; it must not be shown then."""
     # `fleet.tokens` has the names of files.
     return re.search(r"(?<!\bfleet\.)token\w*\s*=", text, re.IGNORECASE) is not None
+
+
+def _may_hold_secret(text: str) -> bool:
+    """Returns whether a text that is no setting has something that must not be shown."""
+    named = r"(token|secret|password|access.?key)[\w.-]*\W*[=:]"
+    return re.search(named, text, re.IGNORECASE) is not None
 
 
 def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
@@ -218,15 +224,18 @@ def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Ove
         spaces = "; if it has a space, it needs quotes as a whole" if is_cut else ""
         is_path = "/" in text and "=" not in text
         folder = f" (a folder of bags: recording.bag_dir={text})" if is_path else ""
+        is_secret = _may_hold_secret(text)
+        shown = "what may hold a secret" if is_secret else repr(text)
         raise ConfigError(
-            f"{text!r} is not a setting (given {source}); write key=value, such as "
+            f"{shown} is not a setting (given {source}); write key=value, such as "
             f"server.port=9300{folder}, and key='value' where special characters are in it{spaces}"
-        ) from error
+        ) from (None if is_secret else error)
     key = override.key_or_group
     is_group = key in options
     if not key or override.is_sweep_override():
+        shown = "what may hold a secret" if _may_hold_secret(text) else repr(text)
         raise ConfigError(
-            f"{text!r} is not one value for one key (set {source}); a list is written key=[a,b]"
+            f"{shown} is not one value for one key (set {source}); a list is written key=[a,b]"
         )
     changes = override.type is OverrideType.CHANGE
     if is_group and changes and override.value() not in options[key]:

@@ -68,6 +68,19 @@ class TestRefusals:
         for fragment in fragments:
             assert fragment in message
 
+    @pytest.mark.parametrize(
+        "override",
+        [
+            "server={token: s3cret",
+            "lake.properties={s3.secret-access-key: s3cret",
+            "lake.password=s3cret,other",
+        ],
+    )
+    def test_show_no_secret_of_what_is_no_setting(self, override: str) -> None:
+        for message in (refusal(override), refusal(MEMORY_CONFIG_OVERRIDES=f"'{override}")):
+            assert "s3cret" not in message
+            assert "secret" in message or "shell" in message
+
     def test_are_all_listed_each_with_its_source(self, own_config: Path) -> None:
         edit(own_config / "config.yaml", "max_age_h: 168", "max_age_h: -1")
         message = refusal(

@@ -45,6 +45,7 @@ from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
     LIST_FILE,
+    LOST_AND_FOUND,
     bag_kind,
     has_own_name,
     is_kept_apart,
@@ -584,7 +585,9 @@ _ADVICE: Final = (
 
 
 def folders_with_bags(folder: Path) -> Iterator[Path]:
-    """Yields a directory and those below it that hold bag files; follows no link.
+    """Yields a directory and those below it that hold bag files; follows no link below it.
+
+    Hidden directories are left out, and `lost+found`.
 
     Raises:
         OSError: one of them cannot be listed.
@@ -594,7 +597,9 @@ def folders_with_bags(folder: Path) -> Iterator[Path]:
         raise error
 
     for root, names, files in os.walk(folder, onerror=fail):
-        names[:] = sorted(name for name in names if not name.startswith("."))
+        names[:] = sorted(
+            name for name in names if not name.startswith(".") and name != LOST_AND_FOUND
+        )
         if any(bag_kind(name) and is_regular(Path(root, name)) for name in files):
             yield Path(root)
 

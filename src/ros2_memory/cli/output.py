@@ -39,6 +39,8 @@ _EARLIEST_TIME: Final = 1e9
 _LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
 _MINUTES_FROM_S: Final = 120.0
+_RATES: Final = ("_m_s", "_deg_s", "_rad_s", "_per_s")
+"""Ends of keys of what is by the second."""
 _HOURS_FROM_S: Final = 7200.0
 _DAYS_FROM_S: Final = 172_800.0
 _NO_AGE_BELOW_S: Final = 0.05
@@ -227,7 +229,7 @@ def _format_line(key: str, value: JsonValue, now: float | None) -> str:
 
 
 def _format_for_key(key: str, value: JsonValue) -> str:
-    """Formats a value; under a key that ends in `_s`, long durations in minutes, hours or days.
+    """Formats a value; of seconds, as under `duration_s`, long ones in minutes, hours or days.
 
     A time of a clock that was never set gets its unit.
     """
@@ -236,6 +238,7 @@ def _format_for_key(key: str, value: JsonValue) -> str:
     if (
         isinstance(value, int | float)
         and key.endswith("_s")
+        and not key.endswith(_RATES)
         and abs(value) >= _MINUTES_FROM_S
         and not _is_time(value)
     ):

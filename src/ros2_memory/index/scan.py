@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
+    LOST_AND_FOUND,
     METADATA_FILE,
     MOMENTS_FOLDER,
     bag_kind,
@@ -32,9 +33,6 @@ YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 
 BAG_DIR_SETTING: Final = "recording.bag_dir (MEMORY_BAG_DIR)"
 """The setting that names the bag directory, unless another one does."""
-
-LOST_AND_FOUND: Final = "lost+found"
-"""A folder in the root of every ext4 file system, which only root may open."""
 
 _OTHER_DISK = (
     "the bag directory is on another disk than before, and contains no bags: the disk of the bags "

@@ -68,6 +68,7 @@ def test_long_times_are_in_a_unit_that_suits_them(shown: Shown) -> None:
     rows: JsonValue = [{"topic": "/a", "ago_s": 186_462_260.5}, {"topic": "/b", "ago_s": 12.25}]
     output = shown({"duration_s": 7500.0, "total": 7500, "topics": rows}).split()
     assert output[:4] == ["duration_s", "2.1", "h", "total"]
+    assert shown({"yaw_rate_deg_s": 180.0, "speed_m_s": 130.0}).split()[1::2] == ["180", "130"]
     assert output[-3:] == ["days", "/b", "12.25"]
 
 

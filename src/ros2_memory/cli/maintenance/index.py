@@ -70,7 +70,7 @@ def index(
     for name in robots or ("",):
         try:
             progress = _fill_for_people(settings, name, verbose=verbose)
-        except RecorderError as error:
+        except (ConfigError, RecorderError) as error:
             if not robots:
                 raise
             problems.append(f"{name}: {error}")
