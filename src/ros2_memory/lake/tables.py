@@ -312,7 +312,9 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     except struct.error as error:
         raise ValueError("packed messages are cut short") from error
     if form not in (_PLAIN, _PLACED):
-        raise ValueError(f"messages are packed in format {form}, this program reads {_PLACED}")
+        raise ValueError(
+            f"messages are packed in format {form}; this program reads {_PLAIN}, {_PLACED}"
+        )
     at = _HEAD.size
     logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
     published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)

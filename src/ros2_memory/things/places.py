@@ -355,7 +355,7 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
     if not len(at):
         return
     old, new = _before_and_after(series, begins, at, variance)
-    likely = _likelihoods(old, new)
+    likely = _squared_errors(old, new)
     # Of each thing the likeliest, of equal ones the first.
     order = np.lexsort((at, -likely, series.thing[at]))
     things, first = np.unique(series.thing[at[order]], return_index=True)
@@ -364,10 +364,10 @@ def _steps(series: _Series, variance: Floats) -> Iterator[tuple[int, int]]:
     yield from zip(things[is_sure].tolist(), at[best[is_sure]].tolist(), strict=True)
 
 
-def _likelihoods(old: Floats, new: Floats) -> Floats:
-    """Returns for each step, by the squares before and after it, how many standard errors it is.
+def _squared_errors(old: Floats, new: Floats) -> Floats:
+    """Returns the square of how many standard errors each step is; 0 of one too short to be any.
 
-    Squared; 0 of one that is too short to be any.
+    By the squares before and after it. Unknown are the place, the bias in x and y, and the step.
     """
     both = old + new
     normal = np.zeros((len(both), 4, 4))

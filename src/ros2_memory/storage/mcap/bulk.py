@@ -30,7 +30,7 @@ from ros2_memory.storage.mcap.chunk import (
     pairs_in,
     require_indexed,
 )
-from ros2_memory.storage.mcap.records import CHUNK_TIMES, MESSAGE, RECORD
+from ros2_memory.storage.mcap.records import CHUNK, MESSAGE, RECORD
 from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
             while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
                 chunk = chunks[end]
                 body, index = _bytes_of(file, chunk, whole, chunks[0].offset)
-                if parts and CHUNK_TIMES.unpack_from(body)[2] > left:
+                if parts and CHUNK.unpack_from(body)[2] > left:
                     break
                 end += 1
                 head = chunk_head(body)

@@ -6,6 +6,7 @@ a Python object for every record of a chunk (2.4 ms a chunk, where walking its b
 
 from __future__ import annotations
 
+import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
@@ -33,10 +34,11 @@ from ros2_memory.storage.errors import (
     too_large,
 )
 from ros2_memory.storage.mcap.records import (
-    CHUNK_TIMES,
+    CHUNK,
     MESSAGE,
     MESSAGE_FIELDS,
     RECORD,
+    UINT64,
     FileRecord,
 )
 from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
@@ -437,17 +439,15 @@ def chunk_head(body: bytes) -> ChunkHead:
 
     Raises:
         UnreadableError: the body is too short.
+        ValueError: the name of the compression is not UTF-8.
     """
-    if len(body) < CHUNK_TIMES.size + 12:
-        raise UnreadableError("damaged: a chunk ends inside its own header")
-    crc: int = CHUNK_TIMES.unpack_from(body)[3]
-    at = CHUNK_TIMES.size + 4
-    name_size = int.from_bytes(body[at - 4 : at], "little")
-    name = body[at : at + name_size]
-    at += name_size + 8
-    if at > len(body):
-        raise UnreadableError("damaged: a chunk ends inside its own header")
-    return ChunkHead(crc, name.decode(), int.from_bytes(body[at - 8 : at], "little"), at)
+    try:
+        *_, crc, name_size = CHUNK.unpack_from(body)
+        name_end = CHUNK.size + name_size
+        (data_size,) = UINT64.unpack_from(body, name_end)
+    except struct.error as error:
+        raise UnreadableError("damaged: a chunk ends inside its own header") from error
+    return ChunkHead(crc, body[CHUNK.size : name_end].decode(), data_size, name_end + UINT64.size)
 
 
 def decompressed_chunk(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:

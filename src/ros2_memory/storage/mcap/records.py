@@ -46,8 +46,12 @@ RECORD: Final = struct.Struct("<BQ")
 MESSAGE: Final = struct.Struct("<BQHIQQ")
 """A message record up to its payload: opcode, length, channel, sequence, log and publish time."""
 MESSAGE_FIELDS: Final = MESSAGE.size - RECORD.size
-CHUNK_TIMES: Final = struct.Struct("<QQQI")
-"""A chunk's first and last log time, uncompressed size and CRC; compression and data follow."""
+CHUNK: Final = struct.Struct("<QQQII")
+"""A chunk's first and last log time, uncompressed size, CRC and length of its compression's name.
+
+That name follows, then the size of the data (`UINT64`), and the data.
+"""
+UINT64: Final = struct.Struct("<Q")
 FOOTER: Final = struct.Struct("<BQQQI")
 """Opcode, length, start of the summary section, start of the summary offsets, summary CRC."""
 _COUNTS_AT: Final = 46
