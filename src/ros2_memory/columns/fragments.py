@@ -1,7 +1,8 @@
 """What follows from the rows of some parts: made once, remembered, and stored beside the parts.
 
-A fragment is of a slice of the clock, and of the parts that have rows in it or beside it. Parts do
-not change, so a fragment does not either, and goes with the first of its parts.
+A fragment is of a slice of the clock, and of the parts that have rows in it or beside it. What a
+part says does not change, though columns of it may be dropped later; so a fragment does not change
+either, and goes with the first of its parts.
 """
 
 from __future__ import annotations

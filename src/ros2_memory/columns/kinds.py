@@ -1,4 +1,4 @@
-"""The kinds of fragments, and the classes that each consists of."""
+"""The kinds of fragments of motion and of events, and the classes that each consists of."""
 
 from __future__ import annotations
 

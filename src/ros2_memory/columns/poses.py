@@ -1,7 +1,7 @@
 """The poses of a table, from its columns alone.
 
 The same as `SchemaExtractor.pose` and `twist` give for each message, rounded alike everywhere: to
-0.1 mm and what the store keeps of rotations. So nothing depends on what is stored.
+0.1 mm and what the store keeps of rotations. So what is stored changes no pose below 1e9 m.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 _UNIT_TOLERANCE: Final = 1e-12
 _ABOUT_UNIT: Final = 1e-2
 _MOST_STEPPED: Final = 1e9
-"""Larger numbers of metres are no places, nor does the store round them."""
+"""Larger numbers of metres are no places, and are not rounded here."""
 _TEXTS: Final = frozenset({"string", "wstring"})
 
 

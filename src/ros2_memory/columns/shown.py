@@ -76,7 +76,7 @@ class TruthValues(NamedTuple):
 
 
 def nowhere(size: int) -> TruthValues:
-    """Returns the column of a field that none of so many rows or elements has."""
+    """Returns that a value stands in none of so many rows or elements."""
     return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 

@@ -142,7 +142,7 @@ class PartHead:
         last: the latest, inclusive.
         bags: the numbers of the bags that its rows are of, ascending.
         messages: how many rows it has.
-        dropped: the paths of its columns that are beyond the topic's share.
+        dropped: the paths of its columns that were dropped, as the bags' share was used up.
         is_whole: whether it stays as it is, as its ten minutes are over.
     """
 
@@ -490,7 +490,9 @@ class ColumnStore(Database):
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = [bag for bag in bags if stored.get(bag.key, -1) < bag.hashed]
+            missing = [
+                bag for bag in bags if bag.key not in stored or (bag.hashed and not stored[bag.key])
+            ]
             new = [bag for bag in missing if bag.is_current()]
             delete_bags(connection, [bag.key.path for bag in new])
             parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)

@@ -108,7 +108,7 @@ class StoredTable(Table):
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """What the caller keeps of a topic under its number.
+    """A topic with its columns, and its definition.
 
     `define` finds the definition, when it is first asked for: to parse one takes some 10 ms.
     """

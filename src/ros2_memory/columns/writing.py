@@ -47,7 +47,7 @@ DELAY: Final = "#delay"
 ZONE_ALONE: Final = "zone"
 """The codec of a column of which there is never more than the zone."""
 DROPPED: Final = "dropped"
-"""The codec of a column of which only the zone is stored: its topic is beyond its share."""
+"""The codec of a column of which only the zone is stored: the rest is beyond the bags' share."""
 ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
 UNHASHED: Final = -1
 """In place of the hash of a payload that was not hashed."""
