@@ -62,7 +62,6 @@ OTHER_ROBOTS: Final = {
     "apriltag_msgs/msg/AprilTagDetectionArray": (
         "std_msgs/Header header\nAprilTagDetection[] detections\n"
     ),
-    "home_msgs/msg/Door": "string label\nfloat32 score\nbool open\n",
     "px4_msgs/msg/ManyFlags": "".join(f"bool flag_{nth:03}\n" for nth in range(600)),
 }
 """Types that carry a pose in ways of their own, many booleans, or detections without a label."""

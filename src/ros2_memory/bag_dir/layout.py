@@ -164,8 +164,9 @@ def split_name(recording: str, number: int) -> str:
 def split_number(recording: str, file: str) -> int | None:
     """Returns the number of a file that is named as a split of a recording; None of others."""
     digits = file.removesuffix(".mcap").rpartition("_")[2]
-    number = int(digits) if digits.isdecimal() else -1
-    return number if file == split_name(recording, number) else None
+    if not digits.isdecimal() or file != split_name(recording, int(digits)):
+        return None
+    return int(digits)
 
 
 def named_start(recording: str) -> Ns | None:

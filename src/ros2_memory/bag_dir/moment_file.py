@@ -368,7 +368,8 @@ class RequestQueue:
         number = name.partition(".")[0]
         path = self._folder / f"{number}.taken"
         try:
-            (self._folder / name).rename(path)
+            if not name.endswith(".taken"):
+                (self._folder / name).rename(path)
             return _read_request(path, number, now)
         except FileNotFoundError:
             return None  # withdrawn

@@ -183,7 +183,8 @@ def _with_named_cells(value: Mapping[str, JsonValue]) -> Mapping[str, JsonValue]
     Where a row has a time in two columns, only the exact one is shown.
     """
     shown = {**value}
-    fields, rows = shown.pop("columns", None) or shown.pop("fields", None), shown.pop("rows", None)
+    names = "columns" if "columns" in shown else "fields"
+    fields, rows = shown.pop(names, None), shown.pop("rows", None)
     if not isinstance(fields, list) or not isinstance(rows, list):
         return value
     if isinstance(totals := shown.get(_ALL), list):  # a row of its own, without its name

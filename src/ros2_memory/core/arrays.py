@@ -82,9 +82,13 @@ def joined_codes(parts: Iterable[tuple[Codes, Sequence[Word]]]) -> tuple[Ints, t
     """Returns codes one after the other, by one list of words in place of one for each part."""
     code_of: dict[Word, int] = {}
     codes = [np.empty(0, np.int64)]
+    recoded: dict[tuple[Word, ...], Ints] = {}  # many parts have the same words
     for old, words in parts:
-        recoded = [code_of.setdefault(word, len(code_of)) for word in words]
-        codes.append(np.array(recoded, np.int64)[old])
+        listed = tuple(words)
+        if listed not in recoded:
+            new = [code_of.setdefault(word, len(code_of)) for word in listed]
+            recoded[listed] = np.array(new, np.int64)
+        codes.append(recoded[listed][old])
     return np.concatenate(codes), tuple(code_of)
 
 

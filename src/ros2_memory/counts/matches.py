@@ -195,14 +195,8 @@ def _held_by_events(
         if condition.field is not None or not isinstance(value, str) or any(map(has_errors, types)):
             return None, None
         return _label_held(binned, topics, condition, scope)
-    # What texts say of a topic that had them before is no event, nor are booleans in lists. Nor do
-    # events have the score of what holds a boolean.
-    if (
-        condition.min_score
-        or len(types) > 1
-        or len(topics) > 1
-        or (not condition.field and _has_lists(view, topic))
-    ):
+    # What texts say of a topic that had them before is no event, nor are booleans in lists.
+    if len(types) > 1 or len(topics) > 1 or (not condition.field and _has_lists(view, topic)):
         return None, None
     parts, since = _events_in_order(view, topic, binned.counted)
     before = _met_before(binned, topic, condition) if since is None else None

@@ -71,17 +71,16 @@ def clock_steps(view: View, window: TimeWindow | None = None) -> tuple[ClockStep
 def without_steps(view: View, gaps: Sequence[tuple[Ns, Ns]]) -> Sequence[tuple[Ns, Ns]]:
     """Returns those gaps, of which there is one at least, in order, that are no clock step."""
     around = TimeWindow(gaps[0][0], gaps[-1][1])
-    steps = {step.at for step in _known_steps(view, around) if step.by > 0}
+    steps = {step.at for step in _known_steps(view, around) or () if step.by > 0}
     return [(start, end) for start, end in gaps if start not in steps]
 
 
 def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     """Returns how much time passed between moments of a window; notes name the steps in it."""
-    steps = [
-        step
-        for step in _known_steps(view, window)
-        if window.overlaps(step.at, step.at + max(step.by - 1, 0))
-    ]
+    known = _known_steps(view, window)
+    if known is None:
+        return Elapsed()
+    steps = [step for step in known if window.overlaps(step.at, step.at + max(step.by - 1, 0))]
     _note_pauses(view, window)
     for at, by in steps:
         view.notes.add(
@@ -93,15 +92,15 @@ def elapsed_in(view: View, window: TimeWindow) -> Elapsed:
     return Elapsed(steps)
 
 
-def _known_steps(view: View, window: TimeWindow) -> list[ClockStep]:
-    """Returns the steps in and near a window; none, with a note, where the call's time is over."""
+def _known_steps(view: View, window: TimeWindow) -> list[ClockStep] | None:
+    """Returns the steps in and near a window; None, with a note, where the call's time is over."""
     try:
         return _steps_around(view, window)
     except QueryTimeoutError:
         view.notes.add_lack(
             "out of time before it was known whether the clock was set: durations are by the clock"
         )
-        return []
+        return None
 
 
 def across_steps(trajectory: Trajectory, path: PathSlice, elapsed: Elapsed) -> Trajectory:

@@ -527,7 +527,7 @@ class ReverseSearch:
         failures: list[UndecodableError] = []
         with self._view.call.stages.timed("extract"):
             message = self._view.bags.decode(stored, failures)
-            if message is not None:
+            if not failures:  # a message may be null, as JSON
                 self._has_decoded = True
                 value = self._view.extractor.exact(message, stored.type)
                 return self.condition.matches(value)

@@ -57,6 +57,7 @@ class Timeline:
         self.segments = tuple(segments)
         self.memo = Memo()
         self._recordings: dict[str, dict[Path, TopicTotals]] = {}
+        self._spans: dict[str, dict[Path, Span]] = {}
 
     @classmethod
     def of(cls, bags: Iterable[BagFile]) -> Timeline:
@@ -124,7 +125,10 @@ class Timeline:
 
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
-        return {path: totals[:2] for path, totals in self._totals_by_recording(topic).items()}
+        if topic not in self._spans:
+            totals = self._totals_by_recording(topic)
+            self._spans[topic] = {path: (held.first, held.last) for path, held in totals.items()}
+        return self._spans[topic]
 
     def _totals_by_recording(self, topic: str) -> dict[Path, TopicTotals]:
         if topic not in self._recordings:

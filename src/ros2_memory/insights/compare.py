@@ -15,7 +15,7 @@ noise and the rounding of what is stored may make of equal ones (`_LEAST`).
 from __future__ import annotations
 
 import math
-from collections import Counter, defaultdict
+from collections import defaultdict
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -486,7 +486,7 @@ def _minutes_in_places(
 
 def _error_counts(view: View, window: TimeWindow) -> Mapping[str, float]:
     """Returns how often each error was reported."""
-    counts = Counter[str]()
+    counts: dict[str, float] = defaultdict(float)
     for events in found_events(view, window, has_errors).values():
         for error in () if events is None else events.errors:
             counts[Quoted(error.text)] += error.reports

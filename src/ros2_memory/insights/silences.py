@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import Silence
@@ -46,14 +47,14 @@ def silences_of(memory: Memory, snapshot: Snapshot) -> Iterator[Silence]:
 
 def _all_silences(bag_dir: Path, snapshot: Snapshot) -> list[Silence]:
     """Returns those that bags show, and those that deleted bags showed, in order of time."""
+    shown: defaultdict[str, list[Silence]] = defaultdict(list)
+    for kept in snapshot.silences:
+        shown[kept.topic].append(kept)
     # Until its bags are deleted, they show it as well.
     deleted = [
         silence
         for silence in map(Silence._make, read_thinned(bag_dir).silences)
-        if not any(
-            kept.topic == silence.topic and silence.within(kept.start, kept.end)
-            for kept in snapshot.silences
-        )
+        if not any(silence.within(kept.start, kept.end) for kept in shown[silence.topic])
     ]
     return sorted(
         [*snapshot.silences, *deleted],

@@ -220,7 +220,7 @@ class Reception:
             # that it finds.
             return None
         if flow is None:
-            return ALL_MESSAGES if asked is None else _profile(depth)
+            return {**ALL_MESSAGES} if asked is None else _profile(depth)
         reliable, latched, publishers = flow.offered
         is_skipped = topic in self._skipped and publishers == 1
         latched &= asked is None and topic not in self._volatile and not is_skipped

@@ -331,10 +331,11 @@ class SplitSearch:
             latched = record.channel.latched
             if latched and _receive(record, event.recording, state):
                 return
-            try:
-                value = self._extractor.exact(self._reader.decode(record), record.channel.type)
-            except UndecodableError as error:
-                value = error
+            if any(rule.condition is not None for rule in rules):
+                try:
+                    value = self._extractor.exact(self._reader.decode(record), record.channel.type)
+                except UndecodableError as error:
+                    value = error
         for rule in rules:
             if latched and rule.condition is None:
                 continue  # its publisher is silent until something changes

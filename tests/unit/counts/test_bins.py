@@ -17,7 +17,7 @@ from ros2_memory.history import driven_path
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.view import TimeRange
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import Msg, boolean, detections, make, odom, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, write_mcap
 from tests.support.memories import asked, memory_of, with_store
 
 if TYPE_CHECKING:
@@ -273,28 +273,6 @@ def test_a_least_score_counts_only_what_reaches_it(tmp_path: Path) -> None:
         return dict(zip(reply["columns"][1:], reply["all"], strict=True))["count"]
 
     assert [count(), count(min_score=0.5), count(min_score=0.95)] == [3, 2, 0]
-
-
-def test_a_least_score_counts_booleans_of_what_reaches_it(tmp_path: Path) -> None:
-    kind = "home_msgs/msg/Door"
-    doors = [
-        Msg("/door", kind, BEGIN + at * S, make(kind, label="door", score=score, open=at % 4 > 1))
-        for at, score in enumerate([0.9] * 4 + [0.2] * 4)
-    ]
-    write_mcap(tmp_path / "rec_0.mcap", doors)
-    memory = with_store(memory_of(tmp_path, limits=LATEST), tmp_path)
-    question: dict[str, object] = {
-        "topic": "/door",
-        "condition_type": "equals",
-        "value": True,
-        "field": "open",
-    }
-    for more, expected in (({}, 2), ({"min_score": 0.5}, 1)):
-        asked_for = {**question, **more}
-        listed = asked(memory, tmp_path, "find_matches", **asked_for)
-        counted = asked(memory, tmp_path, "find_matches", by="day", **asked_for)
-        count = dict(zip(counted["columns"][1:], counted["all"], strict=True))["count"]
-        assert (listed["total"], count) == (expected, expected), more
 
 
 def test_by_refuses_what_it_does_not_take_and_ignores_how_much_is_shown(

@@ -572,3 +572,20 @@ def test_the_named_place_of_a_thing_is_told_with_its_coordinates(tmp_path: Path)
     [sighting] = asked(memory, tmp_path, "find_matches", **asked_for)["sightings"]
     assert sighting["place"] == {"x": 3.0, "y": 0.0, "z": 0.5, "in": "shelf", "frame_id": "odom"}
     assert sighting["robot"]["in"] == "chair"
+
+
+def test_a_message_that_is_null_meets_no_condition(tmp_path: Path) -> None:
+    def fill(writer: Writer) -> None:
+        channel = writer.register_channel(
+            "/mode", "json", writer.register_schema("Mode", "jsonschema", b"{}")
+        )
+        for n, payload in enumerate([b'{"on": true}', b"null", b'{"on": false}']):
+            writer.add_message(channel, BEGIN + n * S, payload, BEGIN + n * S)
+
+    raw_mcap(tmp_path / "rec" / "rec_0.mcap", fill)
+    question = {"topic": "/mode", "condition_type": "equals", "value": True, "field": "on"}
+    for oldest_first in (False, True):
+        reply = asked(
+            memory_of(tmp_path), tmp_path, "find_matches", oldest_first=oldest_first, **question
+        )
+        assert [each["first_seen"] for each in reply["sightings"]] == [BEGIN / S]
