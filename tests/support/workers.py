@@ -22,20 +22,23 @@ if TYPE_CHECKING:
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {
     "live": ("integration/test_live_*.py",),
-    "recorder": ("integration/test_recorder_[a-m]*.py", "integration/test_retention_*.py"),
-    "stalls": ("integration/test_recorder_[n-z]*.py", "integration/test_ros2_double*.py"),
+    "recorder": (
+        "integration/test_recorder_*.py",
+        "integration/test_retention_*.py",
+        "integration/test_ros2_double*.py",
+    ),
     "heavy": ("fuzz/*.py", "soak/*.py", "faults/*.py"),
 }
 """Groups of files, which begin before all else, in this order.
 
-The first three mostly wait for real time, and take longest. "heavy" burns processor time: one such
+The first two mostly wait for real time, and take longest. "heavy" burns processor time: one such
 test at a time leaves some to those that wait.
 """
 
-WORKERS: Final = 6
-"""On two cores: three mostly wait for real time at first, and the others leave no core idle."""
+WORKERS: Final = 4
+"""On two cores: two mostly wait for real time at first, and the others leave no core idle."""
 
-PUNCTUAL: Final = ("live", "recorder", "stalls")
+PUNCTUAL: Final = ("live", "recorder")
 """Groups whose programs are to run when their time has come, whatever else there is to do."""
 
 _MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
