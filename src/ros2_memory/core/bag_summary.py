@@ -39,7 +39,7 @@ _NUMBERS: Final = struct.Struct("<qqq")
 _COUNT_BYTES: Final = 3
 _TIME_BYTES: Final = 5
 """Of a count, and of a time since the first one, in packed numbers: for bags of up to 18 min."""
-_PACKED: Final = struct.Struct(f"<{_COUNT_BYTES}s{_TIME_BYTES}s{_TIME_BYTES}s")
+_PACKED_BYTES: Final = _COUNT_BYTES + 2 * _TIME_BYTES
 _BASE: Final = struct.Struct("<q")
 
 _CACHED_SCHEMAS: Final = 1024
@@ -156,12 +156,6 @@ def packed_numbers(numbers: Sequence[tuple[int, Ns, Ns]]) -> bytes:
     return b"".join((_BASE.pack(base), *parts)) if parts else b""
 
 
-def _wide(base: Ns, count: bytes, first: bytes, last: bytes) -> tuple[int, Ns, Ns]:
-    """Returns the packed numbers of a topic."""
-    number = int.from_bytes
-    return number(count, "little"), base + number(first, "little"), base + number(last, "little")
-
-
 def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     """Returns count, first and last of each topic of summaries that share one schema.
 
@@ -169,7 +163,7 @@ def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     """
     topics = len(summaries[0].schema.topics)
     stored = [summary.packed for summary in summaries]
-    size = _BASE.size + topics * _PACKED.size
+    size = _BASE.size + topics * _PACKED_BYTES
     if any(len(numbers) != size for numbers in stored):
         whole = np.array([summary.numbers for summary in summaries], np.int64)
         return whole.reshape(len(stored), topics, 3)
@@ -251,25 +245,21 @@ class BagSummary:
     @property
     def numbers(self) -> list[tuple[int, Ns, Ns]]:
         """Count, first and last of each topic, in the order of the schema."""
-        if self._is_wide:
-            wide = _NUMBERS.iter_unpack(self.packed)
-            return [(count, first, last) for count, first, last in wide]
-        (base,) = _BASE.unpack_from(self.packed)
-        return [_wide(base, *stated) for stated in _PACKED.iter_unpack(self.packed[_BASE.size :])]
+        return [*map(self._numbers_at, range(len(self.schema.topics)))]
 
     def _numbers_at(self, position: int) -> tuple[int, Ns, Ns]:
         """Returns count, first and last of the topic at a position, without unpacking others."""
-        if self._is_wide:
-            count, first, last = _NUMBERS.unpack_from(self.packed, position * _NUMBERS.size)
+        packed = self.packed
+        if len(packed) == len(self.schema.topics) * _NUMBERS.size:  # they did not fit
+            count, first, last = _NUMBERS.unpack_from(packed, position * _NUMBERS.size)
             return count, first, last
-        (base,) = _BASE.unpack_from(self.packed)
-        at = _BASE.size + position * _PACKED.size
-        return _wide(base, *_PACKED.unpack_from(self.packed, at))
-
-    @property
-    def _is_wide(self) -> bool:
-        """Whether the numbers did not fit into few bytes."""
-        return len(self.packed) == len(self.schema.topics) * _NUMBERS.size
+        at = _BASE.size + position * _PACKED_BYTES
+        begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
+        (base,) = _BASE.unpack_from(packed)
+        count = int.from_bytes(packed[at:begin], "little")
+        first = base + int.from_bytes(packed[begin:end], "little")
+        last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
+        return count, first, last
 
     def replaced(
         self,
