@@ -97,8 +97,6 @@ _VERIFIED_BYTES: Final = 32 << 20
 _COMPARED: Final = -1
 """In place of a channel: all indexes of a chunk were found right."""
 _YES: Final = NO_MESSAGES
-_LOOSE: Final = 0
-"""In place of the offset of a chunk: messages outside chunks."""
 _NEXT_BUT_ONE: Final = 2
 
 
@@ -227,7 +225,7 @@ class McapBags:
             passed: dict[int, Chunk] = {}
             try:
                 yield from self._batches(file, index, wanted, read, window, passed=passed)
-                column = self._loose(file, index, wanted, window)
+                column = _loose(index, wanted, window)
                 fetch = _fetch_loose(file, wanted, self._uncompressed)
                 pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
                 yield from batched((loose_place(place), fetch(place, at)) for place, at in pairs)
@@ -368,7 +366,7 @@ class McapBags:
             self._require_beside(file, index, window)
         for chunk in _with_any(index, wanted, window):
             yield Run(chunk.start, chunk.end, chunk.offset, partial(read, chunk))
-        column = self._loose(file, index, wanted, window)
+        column = _loose(index, wanted, window)
         if column.times.size:
             fetch = _fetch_loose(file, wanted, self._uncompressed)
             yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: (column, fetch))
@@ -440,19 +438,6 @@ class McapBags:
         if data is not None:
             self._indexes.put(key, column, column.memory_bytes)
         return column
-
-    def _loose(
-        self, file: OpenFile, index: McapIndex, wanted: Collection[int], window: TimeWindow
-    ) -> Column:
-        """Returns the wanted messages outside chunks."""
-        if index.loose is None:
-            return NO_MESSAGES
-        key = (file.key, _LOOSE, frozenset(wanted))
-        column = self._indexes.get(key)
-        if not isinstance(column, Column):
-            column = index.loose.column(wanted)
-            self._indexes.put(key, column, column.memory_bytes)
-        return column.between(window)
 
     def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
         """Compares the chunks beside a window with their records, each once.
@@ -572,6 +557,11 @@ def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
         for number, channel in index.channels.items()
         if channel.topic in topics and number in index.totals
     }
+
+
+def _loose(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Column:
+    """Returns the wanted messages outside chunks."""
+    return NO_MESSAGES if index.loose is None else index.loose.column(wanted).between(window)
 
 
 def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
