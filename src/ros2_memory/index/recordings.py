@@ -69,7 +69,6 @@ class RecordingFilter:
         self._is_named = paths_named(str(bag_dir), name).fullmatch
         self._lock = threading.Lock()
         self._parts: dict[Segment, Segment | None] = {}
-        self._whole: Timeline | None = None
         self._narrowed = Timeline()
 
     def narrowed(self, snapshot: Snapshot) -> Snapshot:
@@ -91,20 +90,17 @@ class RecordingFilter:
 
     def _narrowed_timeline(self, whole: Timeline) -> Timeline:
         with self._lock:
-            if whole is not self._whole:
-                known = self._parts
-                self._parts = {
-                    segment: known[segment] if segment in known else self._part_of(segment)
-                    for segment in whole.segments
-                }
-                narrowed = Timeline([*filter(None, self._parts.values())])
-                if narrowed.bags != self._narrowed.bags:
-                    self._narrowed = narrowed
-                self._whole = whole
+            known = self._parts
+            self._parts = {
+                segment: known[segment]
+                if segment in known
+                else segment.without(lambda file: not self._is_named(file))
+                for segment in whole.segments
+            }
+            narrowed = Timeline([*filter(None, self._parts.values())])
+            if narrowed.bags != self._narrowed.bags:
+                self._narrowed = narrowed
             return self._narrowed
-
-    def _part_of(self, segment: Segment) -> Segment | None:
-        return segment.without(lambda file: not self._is_named(file))
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
