@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import heapq
 import math
-from functools import partial
 from itertools import count, pairwise
 from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
@@ -175,7 +174,6 @@ def simplified(
     """
     # What is the same everywhere, as z mostly is, is off by nothing.
     columns = points.T[(points != points[0]).any(axis=0)].copy()
-    measure = partial(_farthest_of_each, columns, clock, of_time)
     kept_indices, error = [kept], 0.0
     looked_at: list[_Farthest] = []
     starts, ends = kept[:-1], kept[1:]
@@ -184,7 +182,7 @@ def simplified(
         starts, ends = starts[inner], ends[inner]
         if not starts.size:
             break
-        most, where = measure(starts, ends)
+        most, where = _farthest_of_each(columns, clock, starts, ends, of_time)
         looked_at.append((starts, ends, most, where))
         splits = most > tolerance_m * tolerance_m
         error = max(error, float(most[~splits].max(initial=0.0)))
@@ -193,7 +191,15 @@ def simplified(
             where = (starts + ends) // 2
         kept_indices.append(where)
         if sum(map(len, kept_indices)) > at_most:
-            return _worst_first(measure, kept, looked_at, tolerance_m, at_most)
+            return _worst_first(
+                columns,
+                clock,
+                kept,
+                looked_at,
+                tolerance_m=tolerance_m,
+                at_most=at_most,
+                of_time=of_time,
+            )
         starts, ends = np.append(starts, where), np.append(where, ends)
         order = np.argsort(starts)
         starts, ends = starts[order], ends[order]
@@ -201,11 +207,14 @@ def simplified(
 
 
 def _worst_first(
-    measure: Callable[[NDArray[np.intp], NDArray[np.intp]], tuple[Numbers, NDArray[np.intp]]],
+    columns: NDArray[np.float64],
+    clock: Numbers,
     kept: NDArray[np.intp],
     looked_at: Sequence[_Farthest],
+    *,
     tolerance_m: float,
     at_most: int,
+    of_time: float,
 ) -> tuple[NDArray[np.intp], float]:
     """Does what `simplified` does, the worst interval first: of a few points these are the best.
 
@@ -220,7 +229,7 @@ def _worst_first(
     }
 
     def farthest(start: int, end: int) -> tuple[float, int]:
-        most, where = measure(np.array([start]), np.array([end]))
+        most, where = _farthest_of_each(columns, clock, np.array([start]), np.array([end]), of_time)
         return -float(most[0]), int(where[0])
 
     def look(*edges: int) -> None:
@@ -230,7 +239,7 @@ def _worst_first(
                 heapq.heappush(worst, (off, where, start, end))
 
     look(*indices)
-    scans_left = _MOST_LOPSIDED * (indices[-1] + 1)
+    scans_left = _MOST_LOPSIDED * len(clock)
     while worst and -worst[0][0] > tolerance_m * tolerance_m and len(indices) < at_most:
         _, split, start, end = heapq.heappop(worst)
         scans_left -= end - start
@@ -245,9 +254,9 @@ def _worst_first(
 def _farthest_of_each(
     columns: NDArray[np.float64],
     clock: Numbers,
-    of_time: float,
     starts: NDArray[np.intp],
     ends: NDArray[np.intp],
+    of_time: float,
 ) -> tuple[Numbers, NDArray[np.intp]]:
     """Finds the point of each interval with the largest deviation from the segment of its ends.
 

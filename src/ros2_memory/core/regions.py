@@ -56,8 +56,8 @@ class Circle:
         x, y, radius = self.x, self.y, self.radius_m
         return x - radius, x + radius, y - radius, y + radius
 
-    def crossings(self, steps: Steps) -> Parts:
-        """Returns the parts of steps inside."""
+    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+        """Returns from and to which share each step is inside; reversed where it never is."""
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
         px, py = steps.x - self.x, steps.y - self.y
         a = dx * dx + dy * dy
@@ -71,7 +71,7 @@ class Circle:
         start = np.where(moves, (-b - root) / size, 0.0)
         stop = np.where(moves, (-b + root) / size, 1.0)
         meets = np.where(moves, within >= 0, c <= 0)
-        return _clipped(np.where(meets, start, 2.0), np.where(meets, stop, -1.0))
+        return np.where(meets, start, 2.0), np.where(meets, stop, -1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,8 +92,8 @@ class Rectangle:
         """The least and greatest x, and the least and greatest y."""
         return self.min_x, self.max_x, self.min_y, self.max_y
 
-    def crossings(self, steps: Steps) -> Parts:
-        """Returns the parts of steps inside."""
+    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+        """Returns from and to which share each step is inside; reversed where it never is."""
         start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
         for at, to, low, high in (
             (steps.x, steps.to_x, self.min_x, self.max_x),
@@ -106,7 +106,7 @@ class Rectangle:
             still = (at >= low) & (at <= high)
             start = np.maximum(start, np.where(moves, np.minimum(to_low, to_high), ~still * 2.0))
             stop = np.minimum(stop, np.where(moves, np.maximum(to_low, to_high), 1.0))
-        return _clipped(start, stop)
+        return start, stop
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,15 +211,13 @@ def parts_inside(region: Region, steps: Steps) -> Parts:
         & (np.maximum(steps.y, steps.to_y) >= low_y)
     )
     nearby = Steps(*(column[near] for column in steps))
-    step, start, stop = region.crossings(nearby)
-    return Parts(near[step], start, stop)
-
-
-def _clipped(start: Floats, stop: Floats) -> Parts:
-    """Returns the parts of steps between these shares of the lines that they lie on."""
+    if isinstance(region, Polygon | AnyOf):
+        parts = region.crossings(nearby)
+        return Parts(near[parts.step], parts.start, parts.stop)
+    start, stop = region.parts(nearby)
     start, stop = np.maximum(start, 0.0), np.minimum(stop, 1.0)
-    [step] = np.nonzero(start <= stop)
-    return Parts(step, start[step], stop[step])
+    meets = start <= stop
+    return Parts(near[meets], start[meets], stop[meets])
 
 
 @dataclass(frozen=True, slots=True)

@@ -86,16 +86,12 @@ def iso_local(ns: Ns) -> str | None:
 
     Rounded up to microseconds, as `unix_rounded_up`; whole seconds have no decimals.
     """
+    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
     try:
-        return _zoned(ns).isoformat()
+        whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
+        return (whole + fraction).astimezone().isoformat()
     except (OverflowError, ValueError, OSError):
         return None
-
-
-def _zoned(ns: Ns) -> datetime:
-    """Returns local time with its offset, rounded up to microseconds."""
-    whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
-    return (whole + timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))).astimezone()
 
 
 def local_time(ns: Ns) -> datetime:
@@ -106,7 +102,9 @@ def local_time(ns: Ns) -> datetime:
     Raises:
         ValueError, OverflowError, OSError: the calendar does not have its year.
     """
-    local = _zoned(ns)
+    whole = datetime.fromtimestamp(ns // NS_PER_S, tz=UTC)
+    fraction = timedelta(microseconds=-(-(ns % NS_PER_S) // NS_PER_US))
+    local = (whole + fraction).astimezone()
     naive = local.replace(tzinfo=None)
     return naive if naive.timestamp() == naive.replace(fold=1).timestamp() else local
 

@@ -51,7 +51,7 @@ from ros2_memory.storage.errors import (
     SizeLimit,
     UnreadableError,
 )
-from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
+from ros2_memory.storage.file_io import EMPTY_FILE, FileKey, OpenFile, open_regular
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.zstd_bag import uncompressed_payload
 from ros2_memory.typestore import full_name
@@ -64,6 +64,7 @@ if TYPE_CHECKING:
 
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
+_PROOF_BYTES: Final = 200
 _LAST_NS: Final[Ns] = MAX_NS - 1
 """The last possible log time; the first is 0, as in MCAP: so no length of time overflows."""
 _TOTALS: Final = """
@@ -115,27 +116,29 @@ _STEP: Final = 10_000
 """Instructions of the virtual machine of sqlite between two calls of the progress handler."""
 _ALWAYS_ALLOWED: Final = 20_000_000
 _FOR_EACH_BYTE: Final = 50
+_READ: Final = ("topics", "messages", "message_definitions")
 _ODD: Final = """
-    SELECT name FROM sqlite_master AS object
-    WHERE lower(name) IN ('topics', 'messages', 'message_definitions') AND (
-        type != 'table' OR rootpage = 0
-        OR EXISTS (SELECT 1 FROM pragma_table_xinfo(object.name) WHERE hidden != 0)
-    )
+    SELECT name, type FROM sqlite_master
+    WHERE lower(name) IN (SELECT value FROM json_each(?))
+    AND (type != 'table' OR rootpage = 0)
 """
+_COMPUTED: Final = "SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden != 0"
 
 
 _MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
 
 
-@dataclass(slots=True)
+@dataclass(frozen=True, slots=True)
 class _Topics:
-    """The channels of a file by topic id, and whether its indexes agree with its table.
+    """The channels of a file by topic id; `key` identifies the content of the file."""
 
-    `is_right` is None until they were compared.
-    """
-
+    key: FileKey
     channels: Mapping[int, Channel]
-    is_right: bool | None = None
+
+    def named(self, topics: Collection[str]) -> dict[int, Channel]:
+        return {
+            number: channel for number, channel in self.channels.items() if channel.topic in topics
+        }
 
 
 class SqliteBags:
@@ -154,6 +157,8 @@ class SqliteBags:
         self._large = large or LargeReads()
         self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
+        # Whether the indexes of a file agree with its table.
+        self._proven: ByteLru[bool] = ByteLru(_CACHE_BYTES)
 
     def closing(self, path: Path) -> Closing:
         """Returns open if a journal or WAL lies beside the file, or it is empty."""
@@ -212,11 +217,7 @@ class SqliteBags:
         if window.empty:
             return
         with self._opened(path) as (base, declared):
-            wanted = {
-                number: channel
-                for number, channel in declared.channels.items()
-                if channel.topic in topics
-            }
+            wanted = declared.named(topics)
             is_right = self._is_indexed_right(base, declared)
             if not is_right:
                 yield ContradictionError(_WRONG_INDEX, window.start, window.stop - 1)
@@ -255,15 +256,17 @@ class SqliteBags:
 
     def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:
         """Returns whether the indexes of a file agree with its table; compares them once."""
-        if topics.is_right is None:
+        is_right = self._proven.get(topics.key)
+        if is_right is None:
             ordered = partial(_ordered_rows, base, topics.channels, TimeWindow.everything())
             try:
                 both = zip_longest(ordered(indexed=True), ordered(indexed=False))
-                topics.is_right = all(starmap(eq, both))
+                is_right = all(starmap(eq, both))
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
-                topics.is_right = False
-        return topics.is_right
+                is_right = False
+            self._proven.put(topics.key, is_right, _PROOF_BYTES)
+        return is_right
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -284,7 +287,7 @@ class SqliteBags:
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)
-                topics = _Topics(self._read_channels(base))
+                topics = _Topics(key, self._read_channels(base))
                 size = 1000 + sum(300 + c.memory_bytes for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
@@ -426,8 +429,11 @@ def require_plain_tables(base: sqlite3.Connection) -> None:
     Raises:
         UnreadableError: there is one.
     """
-    if odd := base.execute(_ODD).fetchone():
-        raise UnreadableError(f"not a rosbag2 file: its {odd[0]} is not a plain table")
+    odd = base.execute(_ODD, (json.dumps(_READ),)).fetchall()
+    computed = [name for name in _READ if base.execute(_COMPUTED, (name,)).fetchone()[0]]
+    if odd or computed:
+        name = odd[0][0] if odd else computed[0]
+        raise UnreadableError(f"not a rosbag2 file: its {name} is not a plain table")
 
 
 def require_short_texts(base: sqlite3.Connection, table: str, columns: Sequence[str]) -> None:

@@ -497,12 +497,14 @@ class OpenedChunk(NamedTuple):
     Attributes:
         data: the decompressed records; only the first `content.usable` bytes are whole records.
         content: what the records hold.
-        head: how it was compressed, and where its data begins.
+        data_at: where the compressed data begins in the body of the chunk record.
+        compression: how it was compressed; empty where it was not.
     """
 
     data: bytes
     content: ChunkContent
-    head: ChunkHead
+    data_at: int
+    compression: str
 
 
 class ChunkOpener:
@@ -540,4 +542,4 @@ class ChunkOpener:
             content = walk_chunk(data)
         self._bytes += MESSAGE_BYTES * content.messages
         self._chunks += 1
-        return OpenedChunk(data, content, head)
+        return OpenedChunk(data, content, head.data_at, head.compression)

@@ -7,6 +7,7 @@ counts, and so do the messages of a last, partial chunk as far as the file reach
 from __future__ import annotations
 
 from array import array
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -52,31 +53,35 @@ def index_by_scan(file: OpenFile, limit: SizeLimit, note: str = "") -> McapIndex
     Raises:
         UnreadableError: the file is not MCAP, or is empty.
     """
-    scan = _Scan(file, limit)
+    scan = _Scan(file, limit.max_bytes, ChunkOpener(file, limit))
     for record in file_records(file):
         scan.add(record)
     return scan.index(note)
 
 
+@dataclass(slots=True)
 class _Scan:
-    def __init__(self, file: OpenFile, limit: SizeLimit) -> None:
-        self.file = file
-        self.max_bytes = limit.max_bytes
-        self.opener = ChunkOpener(file, limit)
-        self.read_to = MAGIC_SIZE
-        self.data_ended = False
-        # Schemas and channels of the summary section, of the records before it, and of the chunks.
-        # Those of chunks win: a checksum protects them.
-        self.repeated, self.declared, self.in_chunks = (Declarations() for _ in range(3))
-        self.redeclared = False
-        self.chunks: list[Chunk] = []
-        self.contents = Contents()
-        # Of messages outside chunks: channels, log times and offsets.
-        self.loose = array("H"), array("Q"), array("q")
-        self.stated: Statistics | None = None
-        self.messages = 0
-        self.damaged: list[str] = []
-        self.partial = 0  # bytes of a last, compressed chunk that was read in part
+    file: OpenFile
+    max_bytes: int
+    opener: ChunkOpener
+    read_to: int = MAGIC_SIZE
+    data_ended: bool = False
+    # Schemas and channels of the summary section, of the records before it, and of the chunks.
+    # Those of chunks win: a checksum protects them.
+    repeated: Declarations = field(default_factory=Declarations)
+    declared: Declarations = field(default_factory=Declarations)
+    in_chunks: Declarations = field(default_factory=Declarations)
+    redeclared: bool = False
+    chunks: list[Chunk] = field(default_factory=list)
+    contents: Contents = field(default_factory=Contents)
+    # Of messages outside chunks: channels, log times and offsets.
+    loose: tuple[array[int], array[int], array[int]] = field(
+        default_factory=lambda: (array("H"), array("Q"), array("q"))
+    )
+    stated: Statistics | None = None
+    messages: int = 0
+    damaged: list[str] = field(default_factory=list)
+    partial: int = 0  # bytes of a last, compressed chunk that was read in part
 
     def add(self, record: FileRecord) -> None:
         """Adds a record; one that is damaged is noted, since those behind it may be whole."""
@@ -128,11 +133,11 @@ class _Scan:
         if not usable:
             return
         self._add_content(opened.content, record.offset, self.file.size, usable)
-        if opened.head.compression:
+        if opened.compression:
             self.partial = self.file.size - record.offset
             self.read_to = self.file.size
         else:
-            self.read_to = record.body_at + opened.head.data_at + usable
+            self.read_to = record.body_at + opened.data_at + usable
 
     def _add_content(
         self, content: ChunkContent, offset: int, end: int, usable: int | None
