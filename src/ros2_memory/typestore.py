@@ -177,20 +177,16 @@ class Typestores:
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 definitions.update(definition)
-            parts = [_elements_of(field) for _, field in definitions[name][1]]
-            if wide := _WIDE.intersection(kind.rpartition("/")[2] for kind, *_ in parts):
+            fields = [field for _, field in definitions[name][1]]
+            if wide := _WIDE.intersection(map(_short_name, fields)):
                 raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
-            unrolled += sum(
-                length or 0
-                for kind, is_nested, length in parts
-                if length != SEQUENCE and (is_nested or kind == "string")
-            )
+            unrolled += sum(map(_unrolled, fields))
             if unrolled > MAX_UNROLLED:
                 raise _UnusableError(
                     f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
                     " elements"
                 )
-            nested = dict.fromkeys(kind for kind, is_nested, _ in parts if is_nested)
+            nested = dict.fromkeys(filter(None, map(_nested_type, fields)))
             todo += [(inner, (*trail, name)) for inner in reversed(nested)]
         return {
             name: (constants, [(field_name, _unsigned(field)) for field_name, field in fields])
@@ -360,40 +356,70 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
     finished_types: dict[str, Definition] = {}
     waiting = [root]
     while waiting:
-        described = [(name, *_elements_of(field)) for name, field in definitions[waiting[-1]][1]]
-        nested = {kind for _, kind, is_nested, _ in described if is_nested}
-        if unfinished := nested - finished_types.keys():
-            waiting += sorted(unfinished)
+        described = definitions[waiting[-1]][1]
+        nested = {_nested_type(field) for _, field in described} - finished_types.keys() - {None}
+        if nested:
+            waiting += sorted(filter(None, nested))
             continue
-        fields = [
-            Field(name, finished_types[kind] if is_nested else kind, length)
-            for name, kind, is_nested, length in described
-        ]
+        fields: list[Field] = []
+        for name, field in described:
+            if field[0] == Nodetype.BASE or field[0] == Nodetype.NAME:
+                fields.append(Field(name, _kind(field, finished_types)))
+            else:
+                element, length = field[1]
+                stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
+                fields.append(Field(name, _kind(element, finished_types), stated))
         finished = waiting.pop()
         finished_types[finished] = Definition(finished, tuple(fields))
     return finished_types[root]
 
 
-def _elements_of(field: FieldDesc) -> tuple[str, bool, int | None]:
-    """Returns what a field is made of, whether that is a message, and its `Field.length`."""
-    length: int | None = None
-    if field[0] == Nodetype.ARRAY:
-        field, length = field[1]
-    elif field[0] == Nodetype.SEQUENCE:
-        field, length = field[1][0], SEQUENCE
+def _kind(field: FieldDesc, finished_types: Mapping[str, Definition]) -> str | Definition:
+    """Returns what a field that is no array holds: the name of a primitive, or a known type."""
+    if field[0] == Nodetype.BASE:
+        return str(field[1][0])
+    return finished_types[str(field[1])]
+
+
+def _nested_type(field: FieldDesc) -> str | None:
+    """Returns the message type of a field, alone or in an array; None for a primitive."""
     if field[0] == Nodetype.NAME:
-        return str(field[1]), True, length
-    return str(field[1][0]), False, length
+        return str(field[1])
+    if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
+        element = field[1][0]
+        return str(element[1]) if element[0] == Nodetype.NAME else None
+    return None
 
 
 def _unsigned(field: FieldDesc) -> FieldDesc:
     """Returns a field whose bytes are unsigned, as in ROS; rosbags decodes them as int8."""
-    if _elements_of(field)[:2] != ("byte", False):
+    if _primitive(field) != "byte":
         return field
     byte: BaseDesc = (Nodetype.BASE, ("uint8", 0))
     if field[0] == Nodetype.ARRAY:
         return (Nodetype.ARRAY, (byte, field[1][1]))
     return (Nodetype.SEQUENCE, (byte, field[1][1])) if field[0] == Nodetype.SEQUENCE else byte
+
+
+def _short_name(field: FieldDesc) -> str:
+    """Returns the name of a type without its package, of a field alone or in an array."""
+    return (_primitive(field) or _nested_type(field) or "").rpartition("/")[2]
+
+
+def _primitive(field: FieldDesc) -> str | None:
+    """Returns the primitive type of a field, alone or in an array; None for a message."""
+    if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
+        field = field[1][0]
+    return str(field[1][0]) if field[0] == Nodetype.BASE else None
+
+
+def _unrolled(field: FieldDesc) -> int:
+    """Returns how many elements generated code spells out one by one."""
+    if field[0] != Nodetype.ARRAY:
+        return 0
+    element, count = field[1]
+    is_primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
+    return 0 if is_primitive else count
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:

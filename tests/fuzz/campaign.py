@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 HANG_S: Final = 60.0
 """After so long without a word a child hangs: it asks seven questions, of 10 s each at most."""
 _ROOT: Final = Path(__file__).resolve().parents[2]
+_MOST_FAULTS: Final = 200
 _MOST_LEFT_MB: Final = 260
 
 
@@ -32,9 +33,16 @@ class Tally:
     mutants: int = 0
     served: int = 0
     held: int = 0
+    reasons: int = 0
     questions: int = 0
     crashes: int = 0
     hangs: int = 0
+    faults: int = 0
+    peak_mb: float = 0.0
+    slowest_s: float = 0.0
+    cpu_s: float = 0.0
+    store_s: float = 0.0
+    recover_s: float = 0.0
     found: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, verdict: dict[str, Any]) -> None:
@@ -46,9 +54,17 @@ class Tally:
         else:
             self.served += verdict["served"]
             self.held += verdict["told_apart"] and verdict["served"]
+            self.reasons += not verdict["served"]
             self.questions += verdict["asked"]
+            self.peak_mb = max(self.peak_mb, verdict["peak_mb"])
+            self.slowest_s = max(self.slowest_s, verdict["seconds"])
+            self.cpu_s = max(self.cpu_s, verdict["cpu_s"])
+            self.store_s = max(self.store_s, verdict["store_s"])
+            self.recover_s = max(self.recover_s, verdict["recover_s"])
         if verdict["faults"]:
-            self.found.append(verdict)
+            self.faults += 1
+            if len(self.found) < _MOST_FAULTS:
+                self.found.append(verdict)
 
 
 class Child:

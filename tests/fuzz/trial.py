@@ -8,7 +8,7 @@ import os
 import shutil
 import time
 import traceback
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import redirect_stderr, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -29,7 +29,7 @@ from tests.fuzz.mutant import LONG_AGO_S, Mutant
 from tests.fuzz.traps import sprung
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, MutableMapping
+    from collections.abc import Mapping, MutableMapping
 
     from ros2_memory.history.context import Memory
     from ros2_memory.serving.mcp_server import EpisodicServer
@@ -51,12 +51,19 @@ class Verdict:
     """What became of one mutant. `faults` are what must not happen.
 
     `told_apart`: what of it can be read is known, and its answers were held to that.
+
+    `seconds` are of the slowest question by the clock on the wall; the others are of the processor,
+    since a machine that is busy otherwise is no fault.
     """
 
     served: bool = False
     told_apart: bool = False
     state: str = ""
     asked: int = 0
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    store_s: float = 0.0
+    recover_s: float = 0.0
     peak_mb: float = 0.0
     left_mb: float = 0.0
     faults: list[str] = field(default_factory=list)
@@ -157,8 +164,11 @@ async def _asked(
     *,
     trapped: bool,
 ) -> None:
-    with _in_time("looking into the bag", verdict):
-        memory, server = world.serving()
+    begun, busy = time.monotonic(), time.process_time()
+    memory, server = world.serving()
+    verdict.seconds, verdict.cpu_s = time.monotonic() - begun, time.process_time() - busy
+    if verdict.cpu_s > MOST_S:
+        verdict.faults.append(f"slow: looking into the bag took {verdict.cpu_s:.1f} s")
     rng = job.rng
     if world.stored and job.number % 2:
         _fill(world, memory, verdict)
@@ -181,24 +191,19 @@ async def _asked(
             )
 
 
-@contextmanager
-def _in_time(what: str, verdict: Verdict) -> Iterator[None]:
-    """Of the processor: a machine that is busy otherwise is no fault."""
-    begun = time.process_time()
-    yield
-    spent = time.process_time() - begun
-    if spent > MOST_S:
-        verdict.faults.append(f"slow: {what} took {spent:.1f} s")
-
-
 async def _timed(server: EpisodicServer, name: str, given: dict[str, Any], verdict: Verdict) -> Any:
-    answer = None
-    with _in_time(f"{name} {given}", verdict):
-        try:
-            answer = await ask(server, name, given)
-        except Exception as error:  # noqa: BLE001
-            verdict.faults.append(f"no reply: {name}: {error!r}"[:500])
+    begun, busy = time.monotonic(), time.process_time()
+    try:
+        answer = await ask(server, name, given)
+    except Exception as error:  # noqa: BLE001
+        verdict.faults.append(f"no reply: {name}: {error!r}"[:500])
+        answer = None
+    spent = time.process_time() - busy
     verdict.asked += 1
+    verdict.seconds = max(verdict.seconds, time.monotonic() - begun)
+    verdict.cpu_s = max(verdict.cpu_s, spent)
+    if spent > MOST_S:
+        verdict.faults.append(f"slow: {name} {given} took {spent:.1f} s")
     if isinstance(answer, dict) and answer.get("error") == "internal":
         verdict.faults.append(f"internal: {name} {given}")
     if isinstance(answer, dict) and "error" in answer and not answer.get("detail"):
@@ -257,13 +262,20 @@ def _count(memory: Memory, bag: Path, notes: tuple[str, ...], verdict: Verdict) 
 
 
 def _fill(world: World, memory: Memory, verdict: Verdict) -> None:
-    with _in_time("storing", verdict):
-        fill_store(build_backfill(world.settings, memory))
+    begun = time.process_time()
+    fill_store(build_backfill(world.settings, memory))
+    verdict.store_s = time.process_time() - begun
+    if verdict.store_s > MOST_S:
+        verdict.faults.append(f"slow: storing took {verdict.store_s:.1f} s")
 
 
 def _recovered(world: World, verdict: Verdict) -> None:
-    with _in_time("recovering", verdict), suppress(EpisodicError):
-        recover_files(world.bag_dir, lambda _line: None, force=True)
+    begun = time.process_time()
+    with suppress(EpisodicError):
+        recover_files(world.bag_dir, _quiet, force=True)
+    verdict.recover_s = time.process_time() - begun
+    if verdict.recover_s > MOST_S:
+        verdict.faults.append(f"slow: recovering took {verdict.recover_s:.1f} s")
 
 
 def _indexed(world: World) -> None:
@@ -278,6 +290,10 @@ def _indexed(world: World) -> None:
         )
     if code:
         raise AssertionError(f"ros2-memory index ended with {code}")
+
+
+def _quiet(_line: str) -> None:
+    pass
 
 
 class _failures_in:  # noqa: N801  reads as the statement that it is

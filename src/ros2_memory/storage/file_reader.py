@@ -66,29 +66,39 @@ class _Walk:
         self._position = _HEADER_BYTES
 
     def message(self, definition: Definition) -> None:
-        self._count(1)
+        self._count()
         if not definition.fields:
             self._advance(1, 1)
         for field in definition.fields:
-            count = 1 if field.length is None else field.length
-            self._pass(field.kind, self._length() if count == SEQUENCE else count)
+            if field.length is None:
+                self._one(field.kind)
+            else:
+                length = self._length() if field.length == SEQUENCE else field.length
+                self._elements(field.kind, length)
 
-    def _pass(self, kind: str | Definition, count: int) -> None:
+    def _elements(self, kind: str | Definition, count: int) -> None:
         """Goes past some elements: at once where all have one size."""
+        if isinstance(kind, str) and kind in _SIZES:
+            if count:  # without elements there is no padding either
+                self._advance(_SIZES[kind], _SIZES[kind] * count)
+            return
+        if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
+            # Each is an object: none of them needs to be read.
+            self.objects += count
+            raise _StoppedError
+        for _ in range(count):
+            self._one(kind)
+
+    def _one(self, kind: str | Definition) -> None:
         if isinstance(kind, Definition):
-            # Each is an object: of too many none needs to be read.
-            if self.objects + count > MAX_OBJECTS:
-                self._count(count)
-            for _ in range(count):
-                self.message(kind)
+            self.message(kind)
         elif kind == "string":
-            for _ in range(count):
-                self._count(1)
-                self._advance(1, self._length())
-        elif count:  # without elements there is no padding either
-            if kind not in _SIZES:
-                raise _StoppedError
-            self._advance(_SIZES[kind], _SIZES[kind] * count)
+            self._count()
+            self._advance(1, self._length())
+        elif kind in _SIZES:
+            self._advance(_SIZES[kind], _SIZES[kind])
+        else:
+            raise _StoppedError
 
     def _length(self) -> int:
         at = self._advance(4, 4)
@@ -103,8 +113,8 @@ class _Walk:
             raise _StoppedError
         return at
 
-    def _count(self, objects: int) -> None:
-        self.objects += objects
+    def _count(self) -> None:
+        self.objects += 1
         if self.objects > MAX_OBJECTS:
             raise _StoppedError
 

@@ -60,7 +60,8 @@ def bags(tmp_path: Path) -> Iterator[Path]:
 
 
 def test_they_are_cleared_at_startup(bags: Path, bag: Path) -> None:
-    put(bags, bag, name="longer_than_a_path_may_be")
+    name = "a_name_that_makes_paths_of_30_kB"
+    put(bags, bag, name=name)
     wiped = clear_bags(bags)
     assert (wiped.files, wiped.faults, wiped.more) == (1, [], 0)
     left = subprocess.run(["find", bags, "-name", "*.mcap"], check=True, capture_output=True)

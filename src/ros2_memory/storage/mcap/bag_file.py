@@ -58,6 +58,7 @@ from ros2_memory.storage.mcap.chunk import (
     declarations_of,
     in_file_order,
     index_groups,
+    joined,
     pairs_in,
     require_indexed,
     walk_chunk,
@@ -66,11 +67,11 @@ from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     DoubtError,
     McapIndex,
+    chunk_columns,
     chunk_data,
-    chunk_pairs,
     index_from_summary,
 )
-from ros2_memory.storage.mcap.merge import Fetch, Run, merged
+from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
@@ -328,7 +329,7 @@ class McapBags:
         window: TimeWindow,
         *,
         newest_first: bool,
-    ) -> Iterator[Run[Record | LostError]]:
+    ) -> Iterator[SortedRun[Record | LostError]]:
         """Yields a run for each chunk with messages of the topics, and one for all loose messages.
 
         Raises:
@@ -343,7 +344,7 @@ class McapBags:
         def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
             return _fetch_from_chunk(last_used(chunk), wanted, self._uncompressed)(place, time)
 
-        def read(chunk: Chunk) -> tuple[Column, Fetch[Record | LostError]] | None:
+        def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
             try:
                 with as_unreadable():
@@ -351,25 +352,26 @@ class McapBags:
             except UnreadableError as error:
                 # Only what is wanted by the chunk's index is lost.
                 lost = self._lost(file, chunk, wanted, window, str(error))
-                if lost is None:
-                    return None
-                at = lost.last if newest_first else lost.first
-                return Column(np.array([at]), np.zeros(1, np.int64)), lambda _place, _time: lost
-            column = self._column(file, chunk, wanted, data).between(window)
+                return None if lost is None else _lost_rows(lost, newest_first=newest_first)
+            columns = self._chunk_columns(file, chunk, wanted, data)
+            column = joined([indexed.between(window.start, window.stop) for indexed in columns])
             if not column.times.size:
                 return None
             if len(data) <= _LARGE_BYTES:
-                return column, _fetch_from_chunk(data, wanted, self._uncompressed)
-            return column, partial(fetch_large, chunk)
+                fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
+            else:
+                fetch = partial(fetch_large, chunk)
+            return _rows(column, fetch, newest_first=newest_first)
 
         if wanted:
             self._require_beside(file, index, window)
         for chunk in _with_any(index, wanted, window):
-            yield Run(chunk.start, chunk.end, chunk.offset, partial(read, chunk))
+            yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
         column = _loose(index, wanted, window)
         if column.times.size:
             fetch = _fetch_loose(file, wanted, self._uncompressed)
-            yield Run(int(column.times[0]), int(column.times[-1]), 0, lambda: (column, fetch))
+            rows = _rows(column, fetch, newest_first=newest_first)
+            yield SortedRun(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
 
     def _index(self, file: OpenFile) -> McapIndex:
         index = self._indexes.get(file.key)
@@ -406,15 +408,16 @@ class McapBags:
         """Returns what of the window is lost with a chunk that cannot be read; None if nothing."""
         try:
             with as_unreadable():
-                times = self._column(file, chunk, wanted, None).between(window).times
+                columns = self._chunk_columns(file, chunk, wanted, None)
         except UnreadableError:
             first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
             return LostError(reason, first, last)
+        times = joined([column.between(window.start, window.stop) for column in columns]).times
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
 
-    def _column(
+    def _chunk_columns(
         self, file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes | None
-    ) -> Column:
+    ) -> list[Column]:
         """Returns the messages of the wanted channels in a chunk, compared with its records.
 
         Without `data`, the decompressed records, the message indexes are believed.
@@ -422,22 +425,29 @@ class McapBags:
         Raises:
             _ContradictedError: the message indexes do not agree with the records.
         """
-        key = (file.key, chunk.offset, chunk.channels.intersection(wanted))
-        column = self._indexes.get(key)
-        if isinstance(column, Column):
-            return column
+        columns: list[Column] = []
+        missing: list[int] = []
+        for channel in chunk.channels.intersection(wanted):
+            column = self._indexes.get((file.key, chunk.offset, channel))
+            if isinstance(column, Column):
+                columns.append(column)
+            else:
+                missing.append(channel)
+        if not missing:
+            return columns
         if chunk.index_places is None:
-            walked = walk_chunk(self._chunk_data(file, chunk) if data is None else data)
-            column = walked.pairs.column(wanted)
+            data = self._chunk_data(file, chunk) if data is None else data
+            read = walk_chunk(data).pairs.columns(missing)
         else:
             with _contradicting(chunk):
-                pairs = chunk_pairs(file, chunk, wanted)
-                if data is not None:
-                    require_indexed(pairs, data, pairs.offsets)
-                column = Column.of(pairs.times, pairs.offsets)
-        if data is not None:
-            self._indexes.put(key, column, column.memory_bytes)
-        return column
+                read = chunk_columns(file, chunk, missing)
+                for channel, fresh in read.items():
+                    if data is not None:
+                        require_indexed(np.array(channel), fresh.times, data, fresh.places)
+        for channel, fresh in read.items():
+            if data is not None:
+                self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
+        return [*columns, *read.values()]
 
     def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
         """Compares the chunks beside a window with their records, each once.
@@ -463,7 +473,7 @@ class McapBags:
         """
         with _contradicting(chunk):
             pairs = _pairs(file, chunk, chunk.channels, data)
-            require_indexed(pairs, data, pairs.offsets)
+            require_indexed(pairs.channels, pairs.times, data, pairs.offsets)
             places = in_file_order(pairs.offsets)
         self._indexes.put((file.key, chunk.offset, _COMPARED), _YES, _YES.memory_bytes)
         return places
@@ -529,7 +539,8 @@ def _pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes) -
         UnreadableError: it has other indexes than it should.
     """
     if chunk.index_places is None:
-        return walk_chunk(data).pairs.of_channels(wanted)
+        pairs = walk_chunk(data).pairs
+        return pairs.taken(np.isin(pairs.channels, sorted(wanted)))
     [(chunks, indexes)] = index_groups(file, [chunk])
     return pairs_in(chunks, indexes, wanted)
 
@@ -561,7 +572,8 @@ def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
 
 def _loose(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Column:
     """Returns the wanted messages outside chunks."""
-    return NO_MESSAGES if index.loose is None else index.loose.column(wanted).between(window)
+    loose = [column for channel, column in index.loose.items() if channel in wanted]
+    return joined([column.between(window.start, window.stop) for column in loose])
 
 
 def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
@@ -628,6 +640,21 @@ def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
     for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
         if after.end < before.start:
             yield from (before, after)
+
+
+def _lost_rows(lost: LostError, *, newest_first: bool) -> RunRows[Record | LostError]:
+    """Returns a loss as the one message of its run."""
+    at = lost.last if newest_first else lost.first
+    return RunRows([at], [0], lambda _place, _time: lost)
+
+
+def _rows(
+    column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
+) -> RunRows[Record | LostError]:
+    times, places = column
+    if newest_first:
+        times, places = times[::-1], places[::-1]
+    return RunRows(times.tolist(), places.tolist(), fetch)
 
 
 def _fetch_from_chunk(

@@ -163,7 +163,7 @@ def batches_of(
     begins = ends - sizes
     begin, end = begins[pairs.chunks], ends[pairs.chunks]
     at = pairs.offsets + begin
-    heads = require_indexed(pairs, buffer, at)
+    heads = require_indexed(pairs.channels, pairs.times, buffer, at)
     stops = at + RECORD.size + heads["length"]
     if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)

@@ -46,7 +46,8 @@ from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
-    from ros2_memory.core.model import TimeWindow
+    from numpy.typing import NDArray
+
     from ros2_memory.storage.base import IntArray, Mask
     from ros2_memory.storage.file_io import OpenFile
 
@@ -68,7 +69,7 @@ _ZERO: Final[IntArray] = np.zeros(1, dtype=np.int64)
 
 
 class Column(NamedTuple):
-    """The messages of some channels in one part of a file, by log time, ties in file order.
+    """The messages of one channel in one part of a file, by log time, ties in file order.
 
     `places` are the offsets of the message records, in the file or in the decompressed chunk.
     """
@@ -91,16 +92,28 @@ class Column(NamedTuple):
                 raise UnreadableError("damaged: a message index holds a message twice")
         return cls(times, places)
 
-    def between(self, window: TimeWindow) -> Column:
-        """Returns the part with log times inside a window."""
+    def between(self, start: int, stop: int) -> Column:
+        """Returns the part with log times in `[start, stop)`."""
         times = self.times
-        first, stop = times.searchsorted(window.start), times.searchsorted(window.stop)
-        if not first and stop == times.size:
+        first, last = times.searchsorted(start), times.searchsorted(stop)
+        if not first and last == times.size:
             return self
-        return Column(times[first:stop], self.places[first:stop])
+        return Column(times[first:last], self.places[first:last])
 
 
 NO_MESSAGES: Final = Column(_EMPTY, _EMPTY)
+
+
+def joined(columns: list[Column]) -> Column:
+    """Returns the messages of several channels as one column."""
+    if len(columns) == 1:
+        return columns[0]
+    if not columns:
+        return NO_MESSAGES
+    times = np.concatenate([column.times for column in columns])
+    places = np.concatenate([column.places for column in columns])
+    order = np.lexsort((places, times))
+    return Column(times[order], places[order])
 
 
 class Chunk(NamedTuple):
@@ -150,14 +163,14 @@ class Pairs(NamedTuple):
         """Returns some of the messages."""
         return Pairs(*(column[rows] for column in self))
 
-    def of_channels(self, wanted: Collection[int]) -> Pairs:
-        """Returns the messages of some channels."""
-        return self.taken(np.isin(self.channels, sorted(wanted)))
-
-    def column(self, wanted: Collection[int]) -> Column:
-        """Returns the messages of some channels, which are of one chunk or of none."""
-        pairs = self.of_channels(wanted)
-        return Column.of(pairs.times, pairs.offsets)
+    def columns(self, wanted: Collection[int]) -> dict[int, Column]:
+        """Returns the messages of the wanted channels, which are of one chunk."""
+        columns: dict[int, Column] = {}
+        for number in wanted:
+            is_wanted = self.channels == number
+            if is_wanted.any():
+                columns[number] = Column.of(self.times[is_wanted], self.offsets[is_wanted])
+        return columns
 
 
 def pairs_in(
@@ -264,7 +277,7 @@ _HEAD: Final = np.dtype(
 
 
 def require_indexed(
-    pairs: Pairs, data: bytes, places: IntArray
+    channels: IntArray | NDArray[np.int64], times: IntArray, data: bytes, places: IntArray
 ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     """Compares messages with their records, and returns the heads of these.
 
@@ -272,7 +285,8 @@ def require_indexed(
     proves that all messages of these channels are there.
 
     Args:
-        pairs: the messages, by their indexes.
+        channels: of each message, or the one of all, by their indexes.
+        times: their log times, likewise.
         data: the decompressed records, which checksums protect.
         places: where the record of each message begins.
 
@@ -284,8 +298,8 @@ def require_indexed(
     heads = gathered(data, _HEAD, places)
     if (
         (heads["opcode"] != Opcode.MESSAGE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
+        or (heads["channel"] != channels).any()
+        or (heads["log_time"] != times).any()
     ):
         raise UnreadableError(NOT_THERE)
     return heads

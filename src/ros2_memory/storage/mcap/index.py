@@ -13,6 +13,7 @@ import zlib
 from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter, le
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -34,6 +35,7 @@ from ros2_memory.storage.mcap.chunk import (
     INDEX_OFFSET,
     OUTSIDE,
     Chunk,
+    Column,
     Extent,
     Pairs,
     decompressed_chunk,
@@ -208,7 +210,7 @@ class McapIndex(NamedTuple):
         channel_bytes: memory that the channels take which no other file shares.
         chunks: the chunks with messages, in file order.
         totals: the messages of each channel that has some.
-        loose: the messages outside chunks, by their offsets in the file.
+        loose: the messages outside chunks, by channel; their places are offsets in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
         set_back: by how much the log times of a channel go back at most, from one chunk to a later
@@ -224,7 +226,7 @@ class McapIndex(NamedTuple):
     channel_bytes: int
     chunks: tuple[Chunk, ...]
     totals: Mapping[int, Extent]
-    loose: Pairs | None = None
+    loose: Mapping[int, Column] = MappingProxyType({})
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: tuple[Ns, Ns] = (0, 0)
@@ -237,11 +239,11 @@ class McapIndex(NamedTuple):
     def memory_bytes(self) -> int:
         """About how much memory it takes, without the channels that files share."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
-        loose = 0 if self.loose is None else 4 * self.loose.times.nbytes
+        loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
         return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
 
 
-def chunk_pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> Pairs:
+def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
     """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
 
     `pairs_in` checks all indexes of the chunk, which makes a cold point query a fifth slower. Here
@@ -252,16 +254,14 @@ def chunk_pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> Pairs:
     """
     base = chunk.offset + chunk.length
     region = file.read(base, chunk.index_length)
-    numbers: list[int] = []
-    parts = [_NONE]
+    columns: dict[int, Column] = {}
     for number, offset in _INDEX_OFFSET.iter_unpack(chunk.index_places or b""):
         if number in wanted:
             _, _, _, size = _INDEX_HEAD.unpack_from(region, offset - base)
-            part = np.frombuffer(region, "<i8", size // 8, offset - base + _INDEX_HEAD.size)
-            parts.append(part)
-            numbers += [number] * (part.size // 2)
-    times, places = np.concatenate(parts).reshape(-1, 2).T
-    return Pairs(np.array(numbers, np.int64), times, places, np.zeros_like(times))
+            at = offset - base + _INDEX_HEAD.size
+            pairs = np.frombuffer(region, "<i8", size // 8, at).reshape(-1, 2)
+            columns[number] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
+    return columns
 
 
 class Contents:

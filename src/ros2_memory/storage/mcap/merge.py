@@ -1,58 +1,80 @@
-"""Merges runs of messages that are each in order and may overlap in time."""
+"""Merges runs of messages that are each in order and may overlap in time.
+
+`heapq.merge` compares every message; this yields whole stretches that no other run interrupts.
+"""
 
 from __future__ import annotations
 
 from bisect import bisect_left
-from itertools import repeat
-from typing import TYPE_CHECKING, Generic, NamedTuple, TypeAlias, TypeVar
+from heapq import heappop, heappush
+from typing import TYPE_CHECKING, Generic, NamedTuple, TypeVar
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.storage.mcap.chunk import Column
 
 T = TypeVar("T")
-Fetch: TypeAlias = "Callable[[int, Ns], T]"
-"""Returns a message by its offset and its log time."""
 
 
-class Run(NamedTuple, Generic[T]):
+class RunRows(NamedTuple, Generic[T]):
+    """The messages of one run in output order: log times, offsets, and how to fetch one by both.
+
+    For newest first the times are descending, and equal ones are in reverse file order.
+    """
+
+    times: list[Ns]
+    places: list[int]
+    fetch: Callable[[int, Ns], T]
+
+
+class SortedRun(NamedTuple, Generic[T]):
     """A part of a file: no message in it lies outside `first` to `last` (inclusive).
 
-    `rank` is its position in the file, which no other run has; `read` returns its messages, if it
-    has any, and is called only when its turn comes.
+    `rank` is its position in the file, which no other run has; `rows` reads it, and is called only
+    when its turn comes.
     """
 
     first: Ns
     last: Ns
     rank: int
-    read: Callable[[], tuple[Column, Fetch[T]] | None]
+    rows: Callable[[], RunRows[T] | None]
 
 
-def merged(runs: Iterable[Run[T]], *, newest_first: bool) -> Iterator[T]:
+def merged(runs: Iterable[SortedRun[T]], *, newest_first: bool) -> Iterator[T]:
     """Yields the messages of all runs by log time, ties in file order; or exactly the reverse.
 
     A run is read only when it can hold the next message, and dropped at its end: only the runs that
     overlap in time are in memory.
     """
-    # Negated, what is newest first ascends as well.
     sign = -1 if newest_first else 1
+    # Sorted so that the next to be read is the last of the list.
     waiting = sorted(
-        (-run.last if newest_first else run.first, sign * run.rank, run) for run in runs
+        ((-run.last if newest_first else run.first, sign * run.rank, run) for run in runs),
+        reverse=True,
     )
-    held: list[tuple[Ns, int, int]] = []  # log time, rank and place of each message, in order
-    fetches: dict[int, Fetch[T]] = {}
-    for nth, (_, rank, run) in enumerate(waiting, start=1):
-        read = run.read()
-        if read is not None:
-            column, fetches[rank] = read
-            times, places = (values * sign for values in column)
-            held += zip(times.tolist(), repeat(rank), places.tolist(), strict=False)
-            held.sort()
-        del read
-        end = bisect_left(held, waiting[nth][:1]) if nth < len(waiting) else len(held)
-        for time, of_rank, place in held[:end]:
-            yield fetches[of_rank](sign * place, sign * time)
-        del held[:end]
-        fetches = {of_rank: fetches[of_rank] for _, of_rank, _ in held}
+    heap: list[tuple[Ns, int, int, RunRows[T], list[Ns]]] = []
+    while waiting or heap:
+        while waiting and (not heap or waiting[-1][0] <= heap[0][0]):
+            _, rank, run = waiting.pop()
+            rows = run.rows()
+            if rows is not None:
+                keys = [-time for time in rows.times] if newest_first else rows.times
+                heappush(heap, (keys[0], rank, 0, rows, keys))
+            del rows, run
+        if not heap:
+            continue
+        _, rank, position, rows, keys = heappop(heap)
+        stop = len(keys)
+        if heap:
+            stop = bisect_left(keys, heap[0][0], position, stop)
+        if waiting:
+            stop = bisect_left(keys, waiting[-1][0], position, stop)
+        # At a tie with another run, the lower rank goes first, one message at a time.
+        stop = max(stop, position + 1)
+        fetch = rows.fetch
+        for place, time in zip(rows.places[position:stop], rows.times[position:stop], strict=True):
+            yield fetch(place, time)
+        if stop < len(keys):
+            heappush(heap, (keys[stop], rank, stop, rows, keys))
+        del rows, keys, fetch

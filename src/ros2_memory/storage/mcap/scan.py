@@ -182,7 +182,7 @@ class _Scan:
             unshared_bytes(channels),
             tuple(self.chunks),
             totals,
-            loose,
+            loose.columns({*loose.channels.tolist()}),
             complete=complete,
             notes=tuple(notes),
             set_back=self.contents.back,
