@@ -1,14 +1,10 @@
 """The files of a bag directory: scans it again and again, and classifies what has changed.
 
 One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, of which one counts.
-So does one of those that somebody copied beside themselves, `run_0 (copy).mcap` beside
-`run_0.mcap`: messages of one folder are no copies of each other, so all would count twice.
 """
 
 from __future__ import annotations
 
-import os
-from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,14 +16,14 @@ from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
 from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
+from ros2_memory.index.copied_files import alike_among, is_copy
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
 from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
-from ros2_memory.index.segment import folder_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterable, Mapping
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -35,9 +31,6 @@ if TYPE_CHECKING:
 
 PATROL: Final = 256
 """Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
-
-_BLOCK_BYTES: Final = 64 << 10
-_BLOCKS: Final = 16
 
 Unchanged: TypeAlias = "dict[str, tuple[BagFile, int, Ns]]"
 """By path, the bag, the inode and the ctime of closed files that do not change any more, or not
@@ -177,9 +170,9 @@ class BagTable:
     def _copies(self) -> tuple[BagFile, ...]:
         """Returns the bags that are copies of others in their folder; compares each once."""
         compared, self._compared = self._compared, {}
-        for pair in _alike_among(self._timeline.bags):
+        for pair in alike_among(self._timeline.bags):
             with suppress(OSError):
-                self._compared[pair] = compared[pair] if pair in compared else _is_copy(*pair)
+                self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
         return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
 
     def _superseded(self) -> Iterable[BagFile]:
@@ -418,35 +411,3 @@ def _by_start(bags: list[BagFile]) -> list[BagFile]:
     """Returns bags by start; by numpy, since sorting what is sorted takes no time later."""
     starts = np.array([bag.start for bag in bags], np.int64)
     return [bags[row] for row in np.argsort(starts, kind="stable").tolist()]
-
-
-def _alike_among(bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, BagFile]]:
-    """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
-    starts = Counter(bag.start for bag in bags)
-    suspects = [bag for bag in bags if starts[bag.start] > 1]
-    originals: dict[tuple[str, int, int, int], BagFile] = {}
-    for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
-        original = originals.setdefault((folder_of(bag), bag.size, bag.start, bag.end), bag)
-        if original is not bag and original.summary == bag.summary:
-            yield original, bag
-
-
-def _is_copy(original: BagFile, bag: BagFile) -> bool:
-    """Returns whether two bags of one size are the same bytes, as blocks all over them show.
-
-    Runs of a simulation may have the same times and sizes.
-
-    Raises:
-        OSError: one of them cannot be read.
-    """
-    return _blocks(original) == _blocks(bag)
-
-
-def _blocks(bag: BagFile) -> list[bytes]:
-    step = max(bag.size // _BLOCKS, _BLOCK_BYTES)
-    places = (*range(0, bag.size, step), max(bag.size - _BLOCK_BYTES, 0))
-    file = os.open(bag.file, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-    try:
-        return [os.pread(file, _BLOCK_BYTES, place) for place in places]
-    finally:
-        os.close(file)

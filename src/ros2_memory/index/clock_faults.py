@@ -14,6 +14,7 @@ clock is before 2017 no date counts as being in the future.
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, takewhile
@@ -199,15 +200,18 @@ def _step_faults(
 
 def _span(segments: Sequence[Segment], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
     """Returns the first start and the last end of the bags that are not left out."""
+    starts = sorted(bag.start for bag in left_out)
     files = {bag.file for bag in left_out}
-    if files:
-        rest = (segment.without(files.__contains__) for segment in segments)
-        segments = [*filter(None, rest)]
-    if not segments:
+    spans: list[tuple[Ns, Ns]] = []
+    for segment in segments:
+        first, last = segment.bags[0].start, segment.bags[-1].start
+        if bisect_left(starts, first) == bisect_right(starts, last):
+            spans.append((first, segment.latest))
+        else:
+            spans += [(bag.start, bag.end) for bag in segment.bags if bag.file not in files]
+    if not spans:
         return None, None
-    return min(segment.bags[0].start for segment in segments), max(
-        segment.latest for segment in segments
-    )
+    return min(first for first, _ in spans), max(last for _, last in spans)
 
 
 def _seconds(at: Ns) -> str:

@@ -18,6 +18,7 @@ from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
+from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, is_thinned
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
@@ -68,7 +69,8 @@ class RecordingFilter:
     def __init__(self, bag_dir: Path, name: str) -> None:
         self._is_named = paths_named(str(bag_dir), name).fullmatch
         self._lock = threading.Lock()
-        self._parts: dict[Segment, Segment | None] = {}
+        self._bags_by_segment: WeakKeyDictionary[Segment, list[BagFile]] = WeakKeyDictionary()
+        self._whole: Timeline | None = None
         self._narrowed = Timeline()
 
     def narrowed(self, snapshot: Snapshot) -> Snapshot:
@@ -90,17 +92,23 @@ class RecordingFilter:
 
     def _narrowed_timeline(self, whole: Timeline) -> Timeline:
         with self._lock:
-            known = self._parts
-            self._parts = {
-                segment: known[segment]
-                if segment in known
-                else segment.without(lambda file: not self._is_named(file))
-                for segment in whole.segments
-            }
-            narrowed = Timeline([*filter(None, self._parts.values())])
-            if narrowed.bags != self._narrowed.bags:
-                self._narrowed = narrowed
+            if whole is not self._whole:
+                before = {bag.file: bag for bag in self._narrowed.bags}
+                after = {
+                    bag.file: bag for segment in whole.segments for bag in self._bags_in(segment)
+                }
+                removed = [bag for file, bag in before.items() if after.get(file) is not bag]
+                added = [bag for file, bag in after.items() if before.get(file) is not bag]
+                self._narrowed = self._narrowed.changed(removed, added)
+                self._whole = whole
             return self._narrowed
+
+    def _bags_in(self, segment: Segment) -> list[BagFile]:
+        if segment not in self._bags_by_segment:
+            self._bags_by_segment[segment] = [
+                bag for bag in segment.bags if self._is_named(bag.file)
+            ]
+        return self._bags_by_segment[segment]
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:

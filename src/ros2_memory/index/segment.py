@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from functools import cached_property, lru_cache, reduce
-from itertools import chain, starmap
+from itertools import chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -40,7 +40,6 @@ _FEW_MESSAGES: Final = 5
 _CACHED_SEGMENTS: Final = 320
 """A week of splits has some 260: 16 MB of eleven topics. Of one more than fit, none would stay."""
 
-T = TypeVar("T")
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
 
@@ -134,7 +133,7 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._known_recordings: dict[str, dict[Path, TopicTotals]] = {}
+        self._known_recordings: dict[str, dict[Path, Span]] = {}
 
     @cached_property
     def latest(self) -> Ns:
@@ -155,18 +154,17 @@ class Segment:
     @cached_property
     def recorded(self) -> Segment | None:
         """The bags without that of carried messages: mostly itself; None where no other is left."""
-        return self.without(is_carried)
+        return self._without(is_carried)
 
     @cached_property
     def unthinned(self) -> Segment | None:
         """The bags that have every message that was recorded; itself where all do."""
-        return self.without(is_thinned)
+        return self._without(is_thinned)
 
-    def without(self, is_left_out: Callable[[str], bool]) -> Segment | None:
-        """Returns the other bags, by their paths: itself where that is all; None where none."""
+    def _without(self, is_left_out: Callable[[str], bool]) -> Segment | None:
         rest = [bag for bag in self.bags if not is_left_out(bag.file)]
         if len(rest) == len(self.bags):
-            return self  # what it remembers serves whoever asks next
+            return self
         return Segment(rest) if rest else None
 
     @cached_property
@@ -176,35 +174,37 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
-    def _folder_numbers(self) -> NDArray[np.uint16]:
-        """For each bag the number of its folder, in order of their first bags."""
-        numbers: dict[str, int] = {}
-        folders = [numbers.setdefault(folder_of(bag), len(numbers)) for bag in self.bags]
-        return np.array(folders, np.uint16)
+    def _numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
+        """The folders of the bags, and for each bag the position of its folder among them."""
+        number_of: dict[str, int] = {}
+        numbers = [number_of.setdefault(folder_of(bag), len(number_of)) for bag in self.bags]
+        return [*number_of], np.array(numbers, np.uint16)
 
-    @property
-    def folders(self) -> Collection[str]:
+    @cached_property
+    def folders(self) -> frozenset[str]:
         """The folders of the bags."""
-        return self.folder_spans.keys()
+        folders, _ = self._numbered_folders
+        return frozenset(folders)
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        spans: dict[str, Span] = {}
-        for bag in self.bags:
-            folder = folder_of(bag)
-            spans[folder] = wider(spans.get(folder), (bag.start, bag.end))
-        return spans
+        folders, numbers = self._numbered_folders
+        firsts = [bag.start for bag in self.bags]
+        lasts = [bag.end for bag in self.bags]
+        return dict(zip(folders, _spans_of(len(folders), numbers, firsts, lasts), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        tallies = np.zeros((len(self.folders), 3), np.int64)
+        folders, numbers = self._numbered_folders
+        tallies = np.zeros((len(folders), 3), np.int64)
         messages = _topic_columns(self).numbers[:, :, 0].sum(axis=0)
         sizes = np.array([bag.size for bag in self.bags], np.int64)
-        of_bags = np.stack([np.ones_like(sizes), messages, sizes], axis=1)
-        np.add.at(tallies, self._folder_numbers, of_bags)
-        return dict(zip(self.folders, starmap(Tally, tallies.tolist()), strict=True))
+        np.add.at(tallies, numbers, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
+        return {
+            folder: Tally(*tally) for folder, tally in zip(folders, tallies.tolist(), strict=True)
+        }
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
@@ -259,25 +259,28 @@ class Segment:
             for topic, by_type in self.totals.items()
         }
 
-    def recordings(self, topic: str) -> dict[Path, TopicTotals]:
-        """Returns the recordings that hold a topic, under all of its types, and what each holds."""
+    def recordings(self, topic: str) -> dict[Path, Span]:
+        """Returns the recordings that hold the topic, with its first and last log time in each."""
         if topic not in self._known_recordings:
-            self._known_recordings[topic] = self._totals_by_recording(topic)
+            self._known_recordings[topic] = self._spans_by_recording(topic)
         return self._known_recordings[topic]
 
-    def _totals_by_recording(self, topic: str) -> dict[Path, TopicTotals]:
+    def _spans_by_recording(self, topic: str) -> dict[Path, Span]:
         column = self.column(topic)
         if column is None:
             return {}
-        folders = self._folder_numbers[column.bags]
-        totals: dict[Path, TopicTotals] = {}
-        for number in dict.fromkeys(folders.tolist()):
-            rows = folders == number
-            _, firsts, lasts, counts = (values[rows] for values in column)
-            # A path for each bag of a week would take longer than all else.
-            path = self.bags[column.bags[rows.argmax()]].recording
-            totals[path] = TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
-        return totals
+        _, folder_numbers = self._numbered_folders
+        numbers, paths = folder_numbers[column.bags], self._recording_paths
+        spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
+        return {paths[number]: spans[number] for number in dict.fromkeys(numbers.tolist())}
+
+    @cached_property
+    def _recording_paths(self) -> list[Path]:
+        """The recordings of the bags, in the order in which their folders are numbered."""
+        # A path for each bag of a week would take longer than all else.
+        _, folder_numbers = self._numbered_folders
+        _, rows = np.unique(folder_numbers, return_index=True)
+        return [self.bags[row].recording for row in rows.tolist()]
 
     def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type."""
@@ -328,6 +331,18 @@ class Segment:
             header.topic for schema in self._schemas for header in schema.topics if header.latched
         )
 
+    def totals_in(self, topic: str, folder: str) -> TopicTotals | None:
+        """Returns what the bags in a folder hold of a topic, under all of its types."""
+        column = self.column(topic)
+        folders, numbers = self._numbered_folders
+        if column is None or folder not in folders:
+            return None
+        in_folder = numbers[column.bags] == folders.index(folder)
+        _, firsts, lasts, counts = (values[in_folder] for values in column)
+        if not counts.size:
+            return None
+        return TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
+
     @cached_property
     def presences(self) -> dict[str, Presence]:
         """By topic, when the bags hold it and how often."""
@@ -373,10 +388,23 @@ def wider(span: Span | None, other: Span) -> Span:
     return min(first, other_first), max(last, other_last)
 
 
-def add_totals(totals: dict[T, TopicTotals], key: T, more: tuple[Ns, Ns, int]) -> None:
-    """Adds first and last log time and count to the totals of a type or a recording."""
-    before, added = totals.get(key), TopicTotals(*more)
-    totals[key] = added if before is None else before | added
+def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, Ns, int]) -> None:
+    """Adds first and last log time and count of a type to its totals."""
+    before, added = totals.get(type_name), TopicTotals(*more)
+    totals[type_name] = added if before is None else before | added
+
+
+def _spans_of(
+    folders: int,
+    numbers: NDArray[np.uint16],
+    firsts: Sequence[Ns] | _Times,
+    lasts: Sequence[Ns] | _Times,
+) -> list[Span]:
+    """Returns the span of each folder; of each row there are its folder's number, and its span."""
+    starts, ends = np.full(folders, MAX_NS), np.full(folders, MIN_NS)
+    np.minimum.at(starts, numbers, firsts)
+    np.maximum.at(ends, numbers, lasts)
+    return [*zip(starts.tolist(), ends.tolist(), strict=True)]
 
 
 def folder_of(bag: BagFile) -> str:

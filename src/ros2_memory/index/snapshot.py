@@ -1,20 +1,4 @@
-"""The bag directory as it is known at one moment.
-
-Also when the messages of a file that cannot be read may have been recorded. It shows nothing of its
-times; the files around it do:
-
-    not before   the end of the split before it in its recording, else the time in the name of a
-                 recording of this program
-    not after    the start of the split after it, else the last time that the file was written to
-
-Between two splits nothing more is known. Where only one side is known, the file is taken to hold a
-day at most: so an old file that nobody removes, or one that was copied here later, does not affect
-answers about other days. Where neither side is known, or the file's own date cannot be true, its
-time is unknown.
-
-That a file holds a day at most is an estimate, good enough for a note beside an answer. Where the
-answer is that there is nothing, the file counts wherever it can contain a message: `bounds`.
-"""
+"""The bag directory as it is known at one moment."""
 
 from __future__ import annotations
 
@@ -33,19 +17,14 @@ from ros2_memory.analysis.silences import (
     silences,
     usual_period,
 )
-from ros2_memory.bag_dir.layout import is_carried, named_start
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import united, without
-from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, Ns
-from ros2_memory.index.clock_faults import (
-    FIRST_BAGS_NS,
-    ClockFault,
-    Dating,
-    check_dates,
-    max_plausible,
-)
+from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates
 from ros2_memory.index.holes import Pause, Rhythm, pauses_between
+from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.index.split_order import (
     Neighbours,
     is_recording,
@@ -53,13 +32,12 @@ from ros2_memory.index.split_order import (
     split_of,
     steps_of,
 )
-from ros2_memory.index.timeline import MAX_FILE_NS, Timeline
+from ros2_memory.index.timeline import Timeline
+from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
-
-    from ros2_memory.index.segment import Segment, TopicTotals
 
 
 _MAX_PLACED: Final = 500
@@ -140,7 +118,14 @@ class Snapshot:
         misdated = self.dating.misdated
         if not misdated:
             return segments
-        return [*filter(None, (segment.without(misdated.__contains__) for segment in segments))]
+        dated_segments: list[Segment] = []
+        for segment in segments:
+            dated = [bag for bag in segment.bags if bag.file not in misdated]
+            if len(dated) == len(segment.bags):
+                dated_segments.append(segment)  # what it remembers serves the next snapshot
+            elif dated:
+                dated_segments.append(Segment(dated))
+        return dated_segments
 
     @cached_property
     def _presences(self) -> dict[str, Presence]:
@@ -315,55 +300,3 @@ class Snapshot:
         folder = str(aside.path.parent)
         segments = (segment for segment in self.timeline.segments if folder in segment.folders)
         return neighbours(str(aside.path), segments)
-
-
-def unreadable_span(
-    recording: str, near: Neighbours, written: Ns | None, now: Ns, *, growing: bool = False
-) -> TimeWindow | None:
-    """Returns the log times between which all messages of a file lie; None where unknown.
-
-    Args:
-        recording: the name of the file's folder.
-        near: the splits around it.
-        written: the file's mtime; None where unknown.
-        now: the present.
-        growing: whether the file is still being written.
-    """
-    start = named_start(recording) if near.before is None else near.before
-    if near.after is not None:
-        if start is None or (near.before is None and start > near.after):
-            start = max(near.after - MAX_FILE_NS, MIN_NS)
-        low, high = sorted((start, near.after))
-        return TimeWindow(low, min(high + 1, MAX_NS))
-    if growing:
-        return TimeWindow(max(now - MAX_FILE_NS, MIN_NS) if start is None else start, MAX_NS)
-    end = _last_written(written, now)
-    if start is None:
-        return None if end is None else TimeWindow(end - MAX_FILE_NS, end)
-    longest = min(start + MAX_FILE_NS, MAX_NS)
-    # A file last written before its start was recorded by another clock than its file system's.
-    return TimeWindow(start, longest if end is None or end <= start else min(end, longest))
-
-
-def unreadable_bounds(
-    recording: str, near: Neighbours, written: Ns | None, now: Ns
-) -> TimeWindow | None:
-    """Returns the log times outside of which a closed file has no message; None: anywhere.
-
-    As `unreadable_span`, without the estimate of how much a file holds. Splits between which the
-    clock was set back bound nothing.
-    """
-    start = named_start(recording) if near.before is None else near.before
-    end = _last_written(written, now) if near.after is None else min(near.after + 1, MAX_NS)
-    if start is None and end is None:
-        return None
-    if start is not None and end is not None and end <= start:
-        return None
-    return TimeWindow(MIN_NS if start is None else start, MAX_NS if end is None else end)
-
-
-def _last_written(written: Ns | None, now: Ns) -> Ns | None:
-    """Returns the end of what a file can contain by its mtime; None where that is implausible."""
-    if written is None or not FIRST_BAGS_NS <= written <= max_plausible(now):
-        return None
-    return min(written + FUTURE_NS, MAX_NS)

@@ -31,6 +31,7 @@ from ros2_memory.index.segment import (
     is_log,
     wider,
 )
+from ros2_memory.index.unreadable_span import MAX_FILE_NS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -39,8 +40,6 @@ if TYPE_CHECKING:
 
 SEGMENT_BAGS: Final = 256
 """The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
-MAX_FILE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
-"""The longest span that a file is taken to hold when one end of it is known."""
 _STARTS: Final = 1024
 """One of so many bags begins a segment wherever it is. So the oldest bags may go, and a later
 process still has the segments of those that are left, but for the first few."""
@@ -56,8 +55,7 @@ class Timeline:
     def __init__(self, segments: Sequence[Segment] = ()) -> None:
         self.segments = tuple(segments)
         self.memo = Memo()
-        self._recordings: dict[str, dict[Path, TopicTotals]] = {}
-        self._spans: dict[str, dict[Path, Span]] = {}
+        self._recordings: dict[str, dict[Path, Span]] = {}
 
     @classmethod
     def of(cls, bags: Iterable[BagFile]) -> Timeline:
@@ -125,18 +123,12 @@ class Timeline:
 
     def recordings(self, topic: str) -> dict[Path, Span]:
         """Returns the recordings that hold the topic, with its first and last log time in each."""
-        if topic not in self._spans:
-            totals = self._totals_by_recording(topic)
-            self._spans[topic] = {path: (held.first, held.last) for path, held in totals.items()}
-        return self._spans[topic]
-
-    def _totals_by_recording(self, topic: str) -> dict[Path, TopicTotals]:
         if topic not in self._recordings:
-            totals: dict[Path, TopicTotals] = {}
+            spans: dict[Path, Span] = {}
             for segment in self.segments:
-                for recording, more in segment.recordings(topic).items():
-                    add_totals(totals, recording, more)
-            self._recordings[topic] = totals
+                for folder, span in segment.recordings(topic).items():
+                    spans[folder] = wider(spans.get(folder), span)
+            self._recordings[topic] = spans
         return self._recordings[topic]
 
     @cached_property
@@ -220,10 +212,11 @@ class Timeline:
 
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
-        spans = (segment.folder_spans.get(str(recording)) for segment in self.segments)
-        return Pace(
-            self._totals_by_recording(topic)[recording], *reduce(wider, filter(None, spans))
-        )
+        folder = str(recording)
+        segments = [segment for segment in self.segments if folder in segment.folders]
+        totals = filter(None, (segment.totals_in(topic, folder) for segment in segments))
+        extents = (segment.folder_spans[folder] for segment in segments)
+        return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
 
     @cached_property
     def silent(self) -> frozenset[str]:

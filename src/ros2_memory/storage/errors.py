@@ -24,7 +24,6 @@ from ros2_memory.core.errors import (
     EpisodicError,
     sqlite_code,
 )
-from ros2_memory.core.large_reads import LARGE_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -178,17 +177,6 @@ class SizeLimit(NamedTuple):
 
     max_bytes: int
     take_turn: Callable[[], None] = lambda: None
-
-    def front(self, decompress: Callable[[int], bytes]) -> bytes:
-        """Returns what decompresses, up to one byte more than allowed, which shows the excess.
-
-        `decompress` returns up to so many bytes; it is called again for more than `LARGE_BYTES`.
-        """
-        data = decompress(min(LARGE_BYTES, self.max_bytes) + 1)
-        if LARGE_BYTES < len(data) <= self.max_bytes:
-            self.take_turn()
-            data = decompress(self.max_bytes + 1)
-        return data
 
 
 def max_decompressed_bytes(compressed: int) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from functools import partial
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 import zstandard
@@ -129,7 +128,10 @@ def decompress_zstd(compressed: bytes, limit: SizeLimit) -> bytes:
         if stated > LARGE_BYTES:
             take_turn()
         return _OWN.decompressor.decompress(compressed)
-    data = limit.front(partial(zstd_front, compressed))
+    data = zstd_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
+    if LARGE_BYTES < len(data) <= max_bytes:
+        take_turn()
+        data = zstd_front(compressed, max_bytes + 1)
     if len(data) > max_bytes:
         raise UnreadableError(too_large("compressed data", max_bytes))
     return data

@@ -8,8 +8,9 @@ messages themselves where the indexes of a file are missing or wrong (see `mcap.
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import suppress
 from functools import lru_cache, partial
 from itertools import pairwise
 from operator import attrgetter
@@ -40,6 +41,7 @@ from ros2_memory.storage.errors import (
     SizeLimit,
     UnreadableError,
     as_unreadable,
+    reason_of,
 )
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bulk import (
@@ -111,16 +113,6 @@ class _ContradictedError(UnreadableError):
     def __init__(self, reason: str, chunk: Chunk | None = None) -> None:
         super().__init__(reason)
         self.chunk = chunk
-
-
-@contextmanager
-def _contradicting(chunk: Chunk | None = None) -> Iterator[None]:
-    """Raises what records that are not as their indexes say cause as a `_ContradictedError`."""
-    try:
-        with as_unreadable():
-            yield
-    except UnreadableError as error:
-        raise _ContradictedError(str(error), chunk) from error
 
 
 class McapBags:
@@ -312,13 +304,17 @@ class McapBags:
             if lost is not None:
                 yield lost
             return
-        with nullcontext() if chunk.index_places is None else _contradicting():
+        try:
             pairs = _pairs(file, chunk, wanted, data)
             if before is not None:
                 earlier = _pairs(file, before, wanted, data)
                 pairs = pairs.taken(~np.isin(pairs.offsets, earlier.offsets))
             content = ReadChunks([chunk], data, [len(data)])
             batches = batches_of(content, pairs, wanted, window, self._uncompressed)
+        except (UnreadableError, ValueError, IndexError) as error:
+            if chunk.index_places is None:
+                raise
+            raise _ContradictedError(reason_of(error)) from error
         yield from batches
 
     def _runs(
@@ -379,21 +375,18 @@ class McapBags:
             return index
         reason = self._contradictions.get(file.key)
         if reason is not None:
-            return self._scanned(file, reason, reason)
+            return self._index_without_indexes(file, reason)
         if not is_finished(file):
-            return self._scanned(file)
+            return self._cache_index(file, index_by_scan(file, self._limit))
         try:
             index = index_from_summary(file)
         except DoubtError as doubt:
-            return self._scanned(file, str(doubt))
+            index = index_by_scan(file, self._limit, str(doubt))
         except UnreadableError as error:
             return self._distrust(file, error)
-        self._indexes.put(file.key, index, index.memory_bytes)
-        return index
+        return self._cache_index(file, index)
 
-    def _scanned(self, file: OpenFile, note: str = "", contradiction: str = "") -> McapIndex:
-        """Returns an index of the messages themselves."""
-        index = index_by_scan(file, self._limit, note)._replace(contradiction=contradiction)
+    def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
         self._indexes.put(file.key, index, index.memory_bytes)
         return index
 
@@ -439,11 +432,13 @@ class McapBags:
             data = self._chunk_data(file, chunk) if data is None else data
             read = walk_chunk(data).pairs.columns(missing)
         else:
-            with _contradicting(chunk):
+            try:
                 read = chunk_columns(file, chunk, missing)
                 for channel, fresh in read.items():
                     if data is not None:
-                        require_indexed(np.array(channel), fresh.times, data, fresh.places)
+                        require_indexed(fresh.of_channel(channel), data, fresh.places)
+            except (UnreadableError, ValueError, IndexError, struct.error) as error:
+                raise _ContradictedError(reason_of(error), chunk) from error
         for channel, fresh in read.items():
             if data is not None:
                 self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
@@ -461,8 +456,10 @@ class McapBags:
             data = self._readable_data(file, chunk)
             if data is None:
                 continue
-            with _contradicting():
+            try:
                 self._compared(file, chunk, data)
+            except _ContradictedError as error:
+                raise _ContradictedError(str(error)) from error
             del data  # before the next is read
 
     def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> IntArray:
@@ -471,10 +468,12 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes do not agree with the records.
         """
-        with _contradicting(chunk):
+        try:
             pairs = _pairs(file, chunk, chunk.channels, data)
-            require_indexed(pairs.channels, pairs.times, data, pairs.offsets)
+            require_indexed(pairs, data, pairs.offsets)
             places = in_file_order(pairs.offsets)
+        except (UnreadableError, ValueError, IndexError) as error:
+            raise _ContradictedError(reason_of(error), chunk) from error
         self._indexes.put((file.key, chunk.offset, _COMPARED), _YES, _YES.memory_bytes)
         return places
 
@@ -521,7 +520,11 @@ class McapBags:
         reason = f"{error}; {READ_WITHOUT_INDEXES}"
         # Kept apart from the index: not every read that follows would find it out again.
         self._contradictions.put(file.key, reason, len(reason) + len(file.key.path) + 200)
-        return self._scanned(file, reason, reason)
+        return self._index_without_indexes(file, reason)
+
+    def _index_without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
+        index = index_by_scan(file, self._limit, reason)
+        return self._cache_index(file, index._replace(contradiction=reason))
 
     def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
         key = (file.key, chunk.offset)
@@ -556,9 +559,15 @@ def _require_declared(declared: Declarations, data: bytes, places: IntArray) -> 
     Raises:
         _ContradictedError: the chunk declares a channel otherwise, or holds more messages.
     """
-    with _contradicting():
-        if not all(declared.agrees(*record) for record in declarations_of(data, places)):
-            raise UnreadableError(OTHER_DECLARED)
+    try:
+        with as_unreadable():
+            agrees = all(
+                declared.agrees(*declaration) for declaration in declarations_of(data, places)
+            )
+    except UnreadableError as error:
+        raise _ContradictedError(reason_of(error)) from error
+    if not agrees:
+        raise _ContradictedError(OTHER_DECLARED)
 
 
 def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
@@ -625,14 +634,20 @@ def _overlooked(
     chunks = [
         chunk
         for chunk in _with_any(index, wanted, passed)
-        if (known := believed_at.get(chunk.offset)) is None
-        or not (known.start <= chunk.start <= chunk.end <= known.end)
-        or not chunk.channels <= known.channels
+        if not _describes(believed_at.get(chunk.offset), chunk)
     ]
     if not chunks:
         return None
     first = max(min(chunk.start for chunk in chunks), passed.start)
     return first, min(max(chunk.end for chunk in chunks), passed.stop - 1)
+
+
+def _describes(believed: Chunk | None, chunk: Chunk) -> bool:
+    """Returns whether an index had all times and channels of a chunk."""
+    if believed is None:
+        return False
+    is_within = believed.start <= chunk.start and chunk.end <= believed.end
+    return is_within and chunk.channels <= believed.channels
 
 
 def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
@@ -662,11 +677,14 @@ def _fetch_from_chunk(
 ) -> Callable[[int, Ns], Record]:
     """Returns what fetches messages from a decompressed chunk."""
     unpack = MESSAGE.unpack_from
+    last = len(data) - MESSAGE.size
 
     def fetch(place: int, time: Ns) -> Record:
-        _, length, number, _, log_time, publish_time = unpack(data, place)
+        if not 0 <= place <= last:
+            raise UnreadableError(NOT_THERE)
+        opcode, length, number, _, log_time, publish_time = unpack(data, place)
         end = place + RECORD.size + length
-        if log_time != time or end > len(data):
+        if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
             raise UnreadableError(NOT_THERE)
         channel = _channel(channels, number)
         payload = data[place + MESSAGE.size : end]

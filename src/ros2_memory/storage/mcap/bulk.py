@@ -44,9 +44,15 @@ _UINT32: Final = np.dtype("<u4")
 _MAGIC: Final = int.from_bytes(FRAME_MAGIC, "little")
 _CHUNK_STEP: Final = 6
 _PLACE_BITS: Final = 29
-"""Places are in the order of the file: two chunks with messages begin more than 64 bytes apart, and
-a chunk has at most 512 MiB."""
 _LOOSE: Final = -(1 << 62)
+
+
+def place_of(chunk: Chunk) -> int:
+    """Returns what is added to offsets in a chunk, so that places are in the order of the file.
+
+    Two chunks with messages begin more than 64 bytes apart; a chunk has at most 512 MiB.
+    """
+    return chunk.offset >> _CHUNK_STEP << _PLACE_BITS
 
 
 def loose_place(offset: int) -> int:
@@ -163,26 +169,35 @@ def batches_of(
     begins = ends - sizes
     begin, end = begins[pairs.chunks], ends[pairs.chunks]
     at = pairs.offsets + begin
-    heads = require_indexed(pairs.channels, pairs.times, buffer, at)
+    heads = require_indexed(pairs, buffer, at)
     stops = at + RECORD.size + heads["length"]
     if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
         raise UnreadableError(NOT_THERE)
     in_file_order(at)
     order = _in_window(pairs, window)
+    at, numbers = at[order], pairs.channels[order]
+    steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]
     published = _published(heads["publish_time"][order], pairs.times[order])
-    starts = at[order] + MESSAGE.size
+    times, places = pairs.times[order], pairs.offsets[order] + steps
+    starts = at + MESSAGE.size
     lengths = stops[order] - starts
-    batches = _by_channel(
-        channels,
-        content.chunks,
-        pairs,
-        order,
-        published=published,
-        buffer=buffer,
-        starts=starts,
-        lengths=lengths,
-    )
-    if not _are_frames(buffer, starts, lengths).any():
+    has_frames = bool(_are_frames(buffer, starts, lengths).any())
+    bounds = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
+    edges = [0, *bounds.tolist(), numbers.size] if numbers.size else []
+    batches: list[Batch] = []
+    for first, last in pairwise(edges):
+        rows = slice(first, last)
+        batch = Batch(
+            channels[int(numbers[first])],
+            times[rows],
+            published[rows],
+            places[rows],
+            buffer,
+            starts[rows],
+            lengths[rows],
+        )
+        batches.append(batch)
+    if not has_frames:
         return iter(batches)
     return chain.from_iterable(_decompressed(framed, uncompressed) for framed in batches)
 
@@ -192,37 +207,6 @@ def _in_window(pairs: Pairs, window: TimeWindow) -> IntArray:
     order: IntArray = np.argsort(pairs.channels, kind="stable")
     is_inside = (pairs.times >= window.start) & (pairs.times < window.stop)
     return order if is_inside.all() else order[is_inside[order]]
-
-
-def _by_channel(
-    channels: Mapping[int, Channel],
-    chunks: Sequence[Chunk],
-    pairs: Pairs,
-    order: IntArray,
-    *,
-    published: IntArray,
-    buffer: bytes,
-    starts: IntArray,
-    lengths: IntArray,
-) -> list[Batch]:
-    """Returns messages, given channel by channel by their positions, in a batch for each."""
-    numbers, times = pairs.channels[order], pairs.times[order]
-    begins = np.array([chunk.offset >> _CHUNK_STEP << _PLACE_BITS for chunk in chunks])
-    places = pairs.offsets[order] + begins[pairs.chunks[order]]
-    bounds = np.flatnonzero(numbers[1:] != numbers[:-1]) + 1
-    edges = [0, *bounds.tolist(), numbers.size] if numbers.size else []
-    return [
-        Batch(
-            channels[int(numbers[first])],
-            times[first:last],
-            published[first:last],
-            places[first:last],
-            buffer,
-            starts[first:last],
-            lengths[first:last],
-        )
-        for first, last in pairwise(edges)
-    ]
 
 
 def _published(stated: IntArray, logged: IntArray) -> IntArray:
@@ -265,8 +249,11 @@ def bare_batches(
     for group, indexes in index_groups(file, chunks):
         pairs = pairs_in(group, indexes, channels)
         order = _in_window(pairs, window)
-        none = np.zeros(order.size, np.int64)
-        logged = pairs.times[order]
-        yield from _by_channel(
-            channels, group, pairs, order, published=logged, buffer=b"", starts=none, lengths=none
-        )
+        steps = np.array([place_of(chunk) for chunk in group])[pairs.chunks[order]]
+        numbers, times = pairs.channels[order], pairs.times[order]
+        places = pairs.offsets[order] + steps
+        for number in np.unique(numbers).tolist():
+            is_of_channel = numbers == number
+            none = np.zeros(int(is_of_channel.sum()), np.int64)
+            logged = times[is_of_channel]
+            yield Batch(channels[number], logged, logged, places[is_of_channel], b"", none, none)

@@ -10,7 +10,6 @@ import struct
 import zlib
 from array import array
 from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]  # has no types
@@ -45,8 +44,6 @@ from ros2_memory.storage.zstd_bag import decompress_zstd, zstd_front
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
-
-    from numpy.typing import NDArray
 
     from ros2_memory.storage.base import IntArray, Mask
     from ros2_memory.storage.file_io import OpenFile
@@ -91,6 +88,10 @@ class Column(NamedTuple):
             if bool(((times[1:] == times[:-1]) & (places[1:] == places[:-1])).any()):
                 raise UnreadableError("damaged: a message index holds a message twice")
         return cls(times, places)
+
+    def of_channel(self, channel: int) -> Pairs:
+        """Returns the same as messages of a channel, in one chunk."""
+        return Pairs(np.array(channel), self.times, self.places, _ZERO)
 
     def between(self, start: int, stop: int) -> Column:
         """Returns the part with log times in `[start, stop)`."""
@@ -277,7 +278,7 @@ _HEAD: Final = np.dtype(
 
 
 def require_indexed(
-    channels: IntArray | NDArray[np.int64], times: IntArray, data: bytes, places: IntArray
+    pairs: Pairs, data: bytes, places: IntArray
 ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     """Compares messages with their records, and returns the heads of these.
 
@@ -285,8 +286,7 @@ def require_indexed(
     proves that all messages of these channels are there.
 
     Args:
-        channels: of each message, or the one of all, by their indexes.
-        times: their log times, likewise.
+        pairs: the messages, by their indexes.
         data: the decompressed records, which checksums protect.
         places: where the record of each message begins.
 
@@ -298,8 +298,8 @@ def require_indexed(
     heads = gathered(data, _HEAD, places)
     if (
         (heads["opcode"] != Opcode.MESSAGE).any()
-        or (heads["channel"] != channels).any()
-        or (heads["log_time"] != times).any()
+        or (heads["channel"] != pairs.channels).any()
+        or (heads["log_time"] != pairs.times).any()
     ):
         raise UnreadableError(NOT_THERE)
     return heads
@@ -484,25 +484,36 @@ def decompressed_chunk(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> 
 
 def decompressed_prefix(head: ChunkHead, compressed: bytes, limit: SizeLimit) -> bytes:
     """Decompresses the front of a chunk that its file ends in."""
+    max_bytes, take_turn = limit
     if head.compression == "zstd":
-        data = limit.front(partial(zstd_front, compressed))
-    else:
-        data = _decompressed(head.compression, compressed, limit)
-    return data[: limit.max_bytes]
+        data = zstd_front(compressed, min(LARGE_BYTES, max_bytes))
+        if len(data) < LARGE_BYTES:
+            return data
+        take_turn()
+        return zstd_front(compressed, max_bytes)
+    return _decompressed(head.compression, compressed, limit)[:max_bytes]
 
 
 def _decompressed(compression: str, compressed: bytes, limit: SizeLimit) -> bytes:
+    """Returns at most one byte more than allowed, so that the caller sees the excess."""
+    max_bytes, take_turn = limit
+    if not compression:
+        if len(compressed) > LARGE_BYTES:
+            take_turn()
+        return compressed
     if compression == "zstd":
         return decompress_zstd(compressed, limit)
     if compression == "lz4":
-        return limit.front(
-            lambda size: bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, size))
-        )
-    if compression:
-        raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
-    if len(compressed) > LARGE_BYTES:
-        limit.take_turn()
-    return compressed
+        data = _lz4_front(compressed, min(LARGE_BYTES, max_bytes) + 1)
+        if LARGE_BYTES < len(data) <= max_bytes:
+            take_turn()
+            data = _lz4_front(compressed, max_bytes + 1)
+        return data
+    raise UnreadableError(f"its compression {compression!r} is not read (zstd and lz4 are)")
+
+
+def _lz4_front(compressed: bytes, size: int) -> bytes:
+    return bytes(lz4.frame.LZ4FrameDecompressor().decompress(compressed, size))
 
 
 class OpenedChunk(NamedTuple):
