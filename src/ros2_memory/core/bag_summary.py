@@ -10,9 +10,9 @@ from __future__ import annotations
 import json
 import struct
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import starmap
+from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -39,7 +39,6 @@ _NUMBERS: Final = struct.Struct("<qqq")
 _COUNT_BYTES: Final = 3
 _TIME_BYTES: Final = 5
 """Of a count, and of a time since the first one, in packed numbers: for bags of up to 18 min."""
-_PACKED_BYTES: Final = _COUNT_BYTES + 2 * _TIME_BYTES
 _BASE: Final = struct.Struct("<q")
 
 _CACHED_SCHEMAS: Final = 1024
@@ -98,6 +97,11 @@ class SummarySchema:
             positions[header.topic] = (*positions.get(header.topic, ()), position)
         return positions
 
+    @cached_property
+    def numbers(self) -> struct.Struct:
+        """The layout of a bag's numbers in bytes."""
+        return struct.Struct(f"<{3 * len(self.topics)}q")
+
     def to_json(self) -> str:
         """Returns the schema as JSON; equal ones give equal texts."""
         topics = [[*header] for header in self.topics]
@@ -117,15 +121,13 @@ class SummarySchema:
             TopicHeader(topic, type_name, encoding, bool(latched))
             for topic, type_name, encoding, latched in topics
         )
-        return shared(
-            SummarySchema(
-                headers,
-                tuple(silent),
-                bool(complete),
-                tuple(notes),
-                set_back and (int(set_back[0]), int(set_back[1])),
-                tuple((int(start), int(end)) for start, end in pauses),
-            )
+        return shared_schema(
+            headers,
+            tuple(silent),
+            bool(complete),
+            tuple(notes),
+            set_back=set_back and (int(set_back[0]), int(set_back[1])),
+            pauses=tuple((int(start), int(end)) for start, end in pauses),
         )
 
 
@@ -141,32 +143,17 @@ DOUBTS: Final = (
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
-def packed_numbers(numbers: Sequence[tuple[int, Ns, Ns]]) -> bytes:
-    """Returns count, first and last of topics in about half of the bytes, where they fit."""
-    base = min((first for _, first, _ in numbers), default=0)
-    try:
-        parts = [
-            count.to_bytes(_COUNT_BYTES, "little")
-            + (first - base).to_bytes(_TIME_BYTES, "little")
-            + (last - base).to_bytes(_TIME_BYTES, "little")
-            for count, first, last in numbers
-        ]
-    except OverflowError:
-        return b"".join(starmap(_NUMBERS.pack, numbers))
-    return b"".join((_BASE.pack(base), *parts)) if parts else b""
-
-
 def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     """Returns count, first and last of each topic of summaries that share one schema.
 
     Of the shape (summaries, topics, 3).
     """
     topics = len(summaries[0].schema.topics)
-    stored = [summary.packed for summary in summaries]
-    size = _BASE.size + topics * _PACKED_BYTES
+    stored = [summary._numbers for summary in summaries]
+    size = _BASE.size + topics * (_COUNT_BYTES + 2 * _TIME_BYTES)
     if any(len(numbers) != size for numbers in stored):
-        whole = np.array([summary.numbers for summary in summaries], np.int64)
-        return whole.reshape(len(stored), topics, 3)
+        whole = b"".join([summary.numbers for summary in summaries])
+        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
     packed = np.frombuffer(b"".join(stored), np.uint8).reshape(-1, size)
     base = np.ascontiguousarray(packed[:, : _BASE.size]).view("<i8")
     fields = packed[:, _BASE.size :].reshape(len(stored), topics, -1)
@@ -184,14 +171,25 @@ def set_back_while_written(by: Ns) -> str:
 
 
 @lru_cache(maxsize=_CACHED_SCHEMAS)
-def shared(schema: SummarySchema) -> SummarySchema:
+def shared_schema(
+    topics: tuple[TopicHeader, ...],
+    silent: tuple[str, ...],
+    complete: bool,
+    notes: tuple[str, ...],
+    *,
+    set_back: SetBack = None,
+    pauses: Pauses = (),
+) -> SummarySchema:
     """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
     headers = tuple(
-        TopicHeader(intern(topic), intern(type_name), intern(encoding), latched)
-        for topic, type_name, encoding, latched in schema.topics
+        TopicHeader(
+            intern(header.topic), intern(header.type), intern(header.encoding), header.latched
+        )
+        for header in topics
     )
-    return replace(schema, topics=headers, silent=tuple(map(intern, schema.silent)))
+    names = tuple(intern(name) for name in silent)
+    return SummarySchema(headers, names, complete, notes, set_back, pauses)
 
 
 class BagSummary:
@@ -208,13 +206,12 @@ class BagSummary:
 
     Attributes:
         schema: the summary without its numbers.
-        packed: count, first and last of each topic; `decoded` takes them.
     """
 
-    __slots__ = ("packed", "schema")
+    __slots__ = ("_numbers", "schema")
 
     schema: SummarySchema
-    packed: bytes
+    _numbers: bytes
 
     def __init__(
         self,
@@ -229,37 +226,65 @@ class BagSummary:
         headers = (
             TopicHeader(topic.topic, topic.type, topic.encoding, topic.latched) for topic in topics
         )
-        self.schema = shared(
-            SummarySchema(tuple(headers), silent, complete, notes, set_back, pauses)
+        self.schema = shared_schema(
+            tuple(headers), silent, complete, notes, set_back=set_back, pauses=pauses
         )
-        self.packed = packed_numbers([(topic.count, topic.first, topic.last) for topic in topics])
+        numbers = (part for topic in topics for part in (topic.count, topic.first, topic.last))
+        self._numbers = self.schema.numbers.pack(*numbers)
 
     @classmethod
-    def decoded(cls, schema: SummarySchema, packed: bytes) -> Self:
-        """Returns the summary of these packed numbers, as many as the schema has."""
+    def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
+        """Returns the summary of these numbers, packed or not, as many as the schema has."""
         summary = cls.__new__(cls)
         summary.schema = schema
-        summary.packed = packed
+        summary._numbers = numbers
         return summary
 
     @property
-    def numbers(self) -> list[tuple[int, Ns, Ns]]:
+    def numbers(self) -> bytes:
         """Count, first and last of each topic, in the order of the schema."""
-        return [*map(self._numbers_at, range(len(self.schema.topics)))]
+        if not self._is_packed:
+            return self._numbers
+        numbers = map(self._numbers_at, range(len(self.schema.topics)))
+        return self.schema.numbers.pack(*chain.from_iterable(numbers))
 
-    def _numbers_at(self, position: int) -> tuple[int, Ns, Ns]:
+    @property
+    def _is_packed(self) -> bool:
+        return len(self._numbers) != self.schema.numbers.size
+
+    def _numbers_at(self, position: int) -> tuple[int, int, int]:
         """Returns count, first and last of the topic at a position, without unpacking others."""
-        packed = self.packed
-        if len(packed) == len(self.schema.topics) * _NUMBERS.size:  # they did not fit
-            count, first, last = _NUMBERS.unpack_from(packed, position * _NUMBERS.size)
+        if not self._is_packed:
+            count, first, last = _NUMBERS.unpack_from(self._numbers, position * _NUMBERS.size)
             return count, first, last
-        at = _BASE.size + position * _PACKED_BYTES
+        packed = self._numbers
+        at = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
         begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
         (base,) = _BASE.unpack_from(packed)
         count = int.from_bytes(packed[at:begin], "little")
         first = base + int.from_bytes(packed[begin:end], "little")
         last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
         return count, first, last
+
+    def pack(self) -> None:
+        """Takes about half of the memory from now on, and some microseconds for each look."""
+        self._numbers = self.packed
+
+    @property
+    def packed(self) -> bytes:
+        """The numbers in about half of the bytes, where they fit; `decoded` takes them, too."""
+        numbers = self._unpacked()
+        base = min(numbers[1::3], default=0)
+        parts = [_BASE.pack(base)]
+        try:
+            for at in range(0, len(numbers), 3):
+                count, first, last = numbers[at : at + 3]
+                parts.append(count.to_bytes(_COUNT_BYTES, "little"))
+                parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
+                parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
+        except OverflowError:
+            return self.numbers
+        return b"".join(parts) if numbers else b""
 
     def replaced(
         self,
@@ -271,7 +296,7 @@ class BagSummary:
         """Returns this summary with some fields replaced."""
         return BagSummary(
             self.topics if topics is None else topics,
-            self.schema.silent,
+            self.silent,
             self.complete if complete is None else complete,
             self.notes if notes is None else notes,
             set_back=self.schema.set_back,
@@ -281,12 +306,16 @@ class BagSummary:
     @property
     def topics(self) -> tuple[TopicSummary, ...]:
         """Each topic under each of its types, computed again."""
-        return tuple(map(self.at, range(len(self.schema.topics))))
+        return tuple(
+            _topic_of(header, numbers)
+            for header, numbers in zip(
+                self.schema.topics, _NUMBERS.iter_unpack(self.numbers), strict=True
+            )
+        )
 
     def at(self, position: int) -> TopicSummary:
         """Returns the topic at a position of the schema."""
-        topic, type_name, encoding, latched = self.schema.topics[position]
-        return TopicSummary(topic, type_name, encoding, *self._numbers_at(position), latched)
+        return _topic_of(self.schema.topics[position], self._numbers_at(position))
 
     def of(self, topic: str) -> tuple[TopicSummary, ...]:
         """Returns one topic under each of its types."""
@@ -299,6 +328,11 @@ class BagSummary:
             self._numbers_at(position) for topic in topics for position in positions.get(topic, ())
         ]
         return min(first for _, first, _ in numbers), max(last for _, _, last in numbers)
+
+    @property
+    def silent(self) -> tuple[str, ...]:
+        """The topics that are declared without a message."""
+        return self.schema.silent
 
     @property
     def complete(self) -> bool:
@@ -318,7 +352,7 @@ class BagSummary:
     @property
     def count(self) -> int:
         """Messages on all topics."""
-        return sum(count for count, _, _ in self.numbers)
+        return sum(self._unpacked()[0::3])
 
     @property
     def empty(self) -> bool:
@@ -328,20 +362,29 @@ class BagSummary:
     @property
     def start(self) -> Ns:
         """Log time of the earliest message. Only for a bag that is not empty."""
-        return min(first for _, first, _ in self.numbers)
+        return min(self._unpacked()[1::3])
 
     @property
     def end(self) -> Ns:
         """Log time of the latest message (inclusive). Only for a bag that is not empty."""
-        return max(last for _, _, last in self.numbers)
+        return max(self._unpacked()[2::3])
+
+    def _unpacked(self) -> tuple[int, ...]:
+        return self.schema.numbers.unpack(self.numbers)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, BagSummary):
             return NotImplemented
-        return self.packed == other.packed and self.schema == other.schema
+        return self.numbers == other.numbers and self.schema == other.schema
 
     def __hash__(self) -> int:
-        return hash((self.schema, self.packed))
+        return hash((self.schema, self.numbers))
 
     def __repr__(self) -> str:
         return f"BagSummary(topics={self.topics!r}, schema={self.schema!r})"
+
+
+def _topic_of(header: TopicHeader, numbers: tuple[int, ...]) -> TopicSummary:
+    topic, type_name, encoding, latched = header
+    count, first, last = numbers
+    return TopicSummary(topic, type_name, encoding, count, first, last, latched)

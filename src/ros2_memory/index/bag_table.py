@@ -85,6 +85,7 @@ class BagTable:
         known: returns, by path, closed files that were read earlier: they are not read again while
             they are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
+        packs: whether the summaries of bags that will not change are packed.
         setting: the one that names the directory, for sentences.
     """
 
@@ -95,8 +96,10 @@ class BagTable:
         *,
         known: Callable[[], Mapping[str, BagFile]] | None,
         only: str | None = None,
+        packs: bool = False,
         setting: str = BAG_DIR_SETTING,
     ) -> None:
+        self._packs = packs
         self._reader = reader
         self._known = known
         self._bag_dir = bag_dir
@@ -278,6 +281,8 @@ class BagTable:
 
     def _add_unchanged(self, path: str, classification: Classification) -> None:
         if classification.bag is not None:
+            if self._packs:
+                classification.bag.summary.pack()
             stamp = self._files.pop(path).stamp
             self._unchanged[path] = classification.bag, stamp.inode, stamp.ctime_ns
 

@@ -336,7 +336,7 @@ def _classify_readable(notes: FileNotes, summary: BagSummary) -> Classification:
     is_closed = notes.closing is Closing.CLOSED and summary.complete
     if summary.empty:
         if is_closed and not summary.notes:
-            return Classification(FileState.EMPTY, silent=summary.schema.silent)
+            return Classification(FileState.EMPTY, silent=summary.silent)
         if is_closed:
             return _set_aside(FileState.DAMAGED, notes, "; ".join(summary.notes))
         closes = _RECOVER if notes.kind == ".mcap" else ""

@@ -59,6 +59,8 @@ class IndexManager:
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
         setting: the one that names the bag directory, for sentences.
         large: the turn to hold much of a bag, for which no scan waits.
+        packs: whether summaries are packed: who deletes bags looks at few of them, and who answers
+            looks at all.
 
     Attributes:
         bag_dir: the bag directory.
@@ -79,6 +81,7 @@ class IndexManager:
         only: str | None = None,
         setting: str = BAG_DIR_SETTING,
         large: LargeReads | None = None,
+        packs: bool = False,
     ) -> None:
         self._large = large or LargeReads()
         self._trusts_mtime = trusts_mtime
@@ -91,7 +94,7 @@ class IndexManager:
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
         self._new_table = partial(
-            BagTable, bag_dir, reader, known=known, only=only, setting=setting
+            BagTable, bag_dir, reader, known=known, only=only, packs=packs, setting=setting
         )
         self._table = self._new_table()
 

@@ -18,14 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import (
-    OUT_OF_ORDER_NS,
-    BagSummary,
-    SummarySchema,
-    TopicHeader,
-    packed_numbers,
-    shared,
-)
+from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.pauses import noteworthy
 from ros2_memory.core.text import counted
@@ -564,21 +557,21 @@ def summarize_channels(
         by_topic[key] = total if other is None else _together(other, total)
     silent = {channel.topic for channel in declared} - {topic for topic, _ in by_topic}
     headers: list[TopicHeader] = []
-    numbers: list[tuple[int, Ns, Ns]] = []
+    numbers: list[int] = []
     # Encoded at once, without an object for each topic: an index makes thousands of summaries.
-    for (topic, type_name), total in sorted(by_topic.items(), key=itemgetter(0)):
-        headers.append(TopicHeader(topic, type_name, total.channel.encoding, total.channel.latched))
-        numbers.append(total[1:])
-    counts, firsts, lasts = zip(*numbers, strict=True) if numbers else ((), (0,), (0,))
-    schema = SummarySchema(
+    for (topic, type_name), (channel, *stated) in sorted(by_topic.items(), key=itemgetter(0)):
+        headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
+        numbers += stated
+    length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
+    schema = shared_schema(
         tuple(headers),
         tuple(sorted(silent)),
         complete,
         notes,
-        set_back if set_back[0] > OUT_OF_ORDER_NS else None,
-        noteworthy(pauses, counts, max(lasts) - min(firsts)),
+        set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
+        pauses=noteworthy(pauses, numbers[::3], length),
     )
-    return BagSummary.decoded(shared(schema), packed_numbers(numbers))
+    return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 
 
 def _together(total: ChannelTotal, other: ChannelTotal) -> ChannelTotal:

@@ -95,7 +95,7 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     snapshot = Snapshot(timeline)
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)
-    assert timeline.silent == {name for bag in bags for name in bag.summary.schema.silent}
+    assert timeline.silent == {name for bag in bags for name in bag.summary.silent}
     assert timeline.transient_local == {topic.topic for _, topic in held if topic.latched}
     assert timeline.types == {
         name: tuple(sorted({topic.type for _, topic in held if topic.topic == name}))

@@ -188,7 +188,7 @@ def test_topics_without_messages_are_declared_and_silent(shelf: Shelf, tmp_path:
     reader, path = shelf.stocked(tmp_path, [text(1, "x")], declared=silent)
     summary = reader.summarize(path)
     assert [topic.topic for topic in summary.topics] == ["/chatter"]
-    assert summary.schema.silent == ("/quiet", "/still")
+    assert summary.silent == ("/quiet", "/still")
     channels = reader.channels(path)
     assert {(c.topic, c.type) for c in channels} == {("/chatter", STRING), *silent}
     assert read(reader, path, ["/quiet"]) == []

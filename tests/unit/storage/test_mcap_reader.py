@@ -388,7 +388,7 @@ class TestWhatAWriterMayDo:
         footer = FOOTER.pack(Opcode.FOOTER, 20, len(front), 0, 0)
         path.write_bytes(front + summary.end() + footer + data[-8:])
         reader = McapReader()
-        assert reader.summarize(path).schema.silent == ("/chatter",)
+        assert reader.summarize(path).silent == ("/chatter",)
         assert reader.summarize(path).notes == ()
         assert read(reader, path) == []
 
