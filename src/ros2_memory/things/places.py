@@ -37,7 +37,7 @@ from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from ros2_memory.analysis.sights import Flags, Floats, Ints
+    from ros2_memory.analysis.sights import Floats
     from ros2_memory.storage.base import Mask
 
 _CELL_MM: Final = 100

@@ -61,7 +61,7 @@ def record_argv(
         directory: where to record, absolute; it must not exist yet.
         topics: what is recorded.
         split_duration_s: length of one bag file in whole seconds.
-        qos_file: QoS overrides, see `reception.profiles`.
+        qos_file: QoS overrides, see `Reception` in `reception.py`.
         storage_file: how MCAP is written, see `storage_config`.
         node_name: the name of the recorder's node, if the distribution can set it.
         cache_bytes: size of each of the two buffers in which messages wait for the disk. rosbag2's
