@@ -40,7 +40,7 @@ _LATEST_TIME: Final = 4.2e9
 """Replies have times as floats of Unix seconds; hardly anything else lies between 2001 and 2103."""
 _MINUTES_FROM_S: Final = 120.0
 _RATES: Final = ("_m_s", "_deg_s", "_rad_s", "_per_s")
-"""Ends of keys of what is by the second."""
+"""How keys of speeds and rates end: their values are no durations."""
 _HOURS_FROM_S: Final = 7200.0
 _DAYS_FROM_S: Final = 172_800.0
 _NO_AGE_BELOW_S: Final = 0.05

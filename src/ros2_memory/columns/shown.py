@@ -76,7 +76,7 @@ class TruthValues(NamedTuple):
 
 
 def nowhere(size: int) -> TruthValues:
-    """Returns that a value stands in none of so many rows or elements."""
+    """Returns that so many rows or elements do not have a value."""
     return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
 
 

@@ -181,7 +181,7 @@ class Tombstone:
         return cls(robot, forgetting.start, forgetting.stop, forgetting.topics, tuple(ids))
 
     def rows(self, first: str, last: str) -> BooleanExpression:
-        """Returns the condition on rows of what is forgotten; two columns have their span."""
+        """Returns the condition on the rows to delete, by their columns of first and last time."""
         if self.bags:
             return of_ids(self.robot, self.bags)
         return overlapping(self.robot, (first, last), self.window, self.topics)

@@ -83,7 +83,7 @@ def rounded(message: object, definition: Definition | None, path: str = "") -> o
 
 
 def fields_in(node: object) -> Iterator[tuple[str, object]]:
-    """Yields the fields of a decoded message, by name; none of what is no message."""
+    """Yields the fields of a decoded message, by name; none of an object that is no message."""
     if is_dataclass(node) and not isinstance(node, type):
         for member in fields(node):
             yield member.name, getattr(node, member.name)

@@ -189,7 +189,7 @@ _BIAS_MM: Final = 40.0
 _LOOK_MM: Final = 50.0
 """Usual standard deviation of one look, which the looks at a thing correct."""
 _VISIT_MM: Final = 40.0
-"""Usual standard deviation of what the looks of a visit share, which all visits correct."""
+"""Usual standard deviation of the error that the looks of a visit share; visits correct it."""
 _LEAST_VISIT_MM: Final = 20.0
 """That of a thing is taken for no less: a few visits may agree by chance."""
 _AT_ONCE: Final = 8_192

@@ -223,7 +223,7 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
 
 
 def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
-    """Returns an answer with the notes of what it consists of, each once."""
+    """Returns an answer with the notes of its parts, without repetitions."""
     match answer:
         case results.Match(found=found) if found is not None:
             return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
