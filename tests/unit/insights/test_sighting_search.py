@@ -111,11 +111,14 @@ def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit
 # One split, all of which is stored.
 @example(seed=4, part=1.0)
 def test_messages_of_one_log_time_are_told_apart(seed: int, part: float) -> None:
-    """With simulated time many share one; stored numbers are rounded, which bags have to settle."""
+    """With simulated time many share one; stored numbers are rounded, which bags have to settle.
+
+    Publish times differ: equal messages of one of these are copies where recordings overlap.
+    """
     draw = Random(seed)
     thirds = [draw.randint(0, 8) / 3 for _ in range(draw.randint(2, 40))]
     messages = [
-        Msg("/load", FLOAT, BEGIN + nth // 3 * S, make(FLOAT, data=third))
+        Msg("/load", FLOAT, BEGIN + nth // 3 * S, make(FLOAT, data=third), BEGIN + nth)
         for nth, third in enumerate(thirds)
     ]
     with TemporaryDirectory() as folder:
