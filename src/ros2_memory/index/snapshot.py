@@ -151,10 +151,7 @@ class Snapshot:
         return shortest_silence((presence and usual_period(presence)) or 0)
 
     def longest_silence(self, topic: str) -> Ns:
-        """Returns for how long others were recorded, at most, between two messages of a topic.
-
-        From bag to bag: what is silent within one is not known.
-        """
+        """Returns for how long others were recorded, at most, between two messages of a topic."""
         presence = self._presences.get(topic)
         pauses = () if presence is None else pairwise(presence.runs)
         return max(
