@@ -595,6 +595,7 @@ def trajectory_summary(
     if frame_id is not None:
         moved = placed_waypoints(view, name, drawn.waypoints, path.frames[0], frame_id)
         drawn = replace(drawn, waypoints=moved)
+        view.notes.retract_outside(window)
     ends = [(window.start, window.stop - 1)]
     away = None if farthest is None else farthest_from(view, farthest, name, ends, frame_id)
     return results.TrajectorySummary(

@@ -1,7 +1,7 @@
 """Silences: a topic with a usual rate has no message although the robot is on. Pure decisions.
 
-All is decided from when bags hold a topic, never from messages, so a silence is found where it
-reaches over a bag's end. What counts is one rule over the whole memory:
+All is decided from when bags hold a topic, as their summaries state, never from messages. What
+counts is one rule over the whole memory:
 
 - A topic has a usual rate if bags that hold it hold messages all along. Its period is the mean
   period of the bags around the median. What is published when something happens has none.
@@ -25,14 +25,15 @@ from itertools import accumulate
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+from ros2_memory.core.pauses import SHORTEST_SILENCE_NS, SILENT_PERIODS
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-SHORTEST_NS: Final[Ns] = 30 * NS_PER_S
-PERIODS: Final = 20
+SHORTEST_NS: Final[Ns] = SHORTEST_SILENCE_NS
+PERIODS: Final = SILENT_PERIODS
 SELDOM: Final = 2
 HABIT_NS: Final[Ns] = 3600 * NS_PER_S
 UNUSUAL: Final = 10

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.pauses import Pauses
+    from ros2_memory.core.pauses import Absences, Pauses
 
     IntArray = NDArray[np.int64]
 
@@ -80,6 +80,7 @@ class SummarySchema:
     notes: tuple[str, ...] = ()
     set_back: SetBack = None
     pauses: Pauses = ()
+    absences: Absences = ()
 
     @cached_property
     def remarks(self) -> tuple[str, ...]:
@@ -105,7 +106,7 @@ class SummarySchema:
     def to_json(self) -> str:
         """Returns the schema as JSON; equal ones give equal texts."""
         topics = [[*header] for header in self.topics]
-        stated = [self.silent, self.complete, self.notes, self.set_back, self.pauses]
+        stated = [self.silent, self.complete, self.notes, self.set_back, self.pauses, self.absences]
         return json.dumps([topics, *stated])
 
     @staticmethod
@@ -116,7 +117,7 @@ class SummarySchema:
             ValueError: the text is not valid.
             TypeError: likewise.
         """
-        topics, silent, complete, notes, set_back, pauses = json.loads(text)
+        topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
         headers = tuple(
             TopicHeader(topic, type_name, encoding, bool(latched))
             for topic, type_name, encoding, latched in topics
@@ -128,6 +129,10 @@ class SummarySchema:
             tuple(notes),
             set_back=set_back and (int(set_back[0]), int(set_back[1])),
             pauses=tuple((int(start), int(end)) for start, end in pauses),
+            absences=tuple(
+                (topic, tuple((int(start), int(end), int(sent)) for start, end, sent in listed))
+                for topic, listed in absences
+            ),
         )
 
 
@@ -179,6 +184,7 @@ def shared_schema(
     *,
     set_back: SetBack = None,
     pauses: Pauses = (),
+    absences: Absences = (),
 ) -> SummarySchema:
     """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
@@ -189,7 +195,7 @@ def shared_schema(
         for header in topics
     )
     names = tuple(intern(name) for name in silent)
-    return SummarySchema(headers, names, complete, notes, set_back, pauses)
+    return SummarySchema(headers, names, complete, notes, set_back, pauses, absences)
 
 
 class BagSummary:
@@ -203,6 +209,7 @@ class BagSummary:
         set_back: where the log times of a topic go back most in the order of writing, if they do
             so by a second.
         pauses: where no topic has a message for a while, though some usually have.
+        absences: where one topic has none for long, each with how many it has before.
 
     Attributes:
         schema: the summary without its numbers.
@@ -222,12 +229,19 @@ class BagSummary:
         *,
         set_back: SetBack = None,
         pauses: Pauses = (),
+        absences: Absences = (),
     ) -> None:
         headers = (
             TopicHeader(topic.topic, topic.type, topic.encoding, topic.latched) for topic in topics
         )
         self.schema = shared_schema(
-            tuple(headers), silent, complete, notes, set_back=set_back, pauses=pauses
+            tuple(headers),
+            silent,
+            complete,
+            notes,
+            set_back=set_back,
+            pauses=pauses,
+            absences=absences,
         )
         numbers = (part for topic in topics for part in (topic.count, topic.first, topic.last))
         self._numbers = self.schema.numbers.pack(*numbers)
@@ -301,6 +315,8 @@ class BagSummary:
             self.notes if notes is None else notes,
             set_back=self.schema.set_back,
             pauses=self.schema.pauses,
+            # Of other messages they are not known.
+            absences=self.schema.absences if topics is None else (),
         )
 
     @property

@@ -1,4 +1,7 @@
-"""Pauses of a bag: from one message to the next, of any topic, nothing was logged for a while."""
+"""Pauses of a bag: from one message to the next, of any topic, nothing was logged for a while.
+
+And those of one topic alone, which are much longer: they may be silences.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +20,13 @@ Pauses: TypeAlias = "tuple[tuple[Ns, Ns], ...]"
 """From the log time of the last message before each to that of the first after it, in order."""
 CountedPause: TypeAlias = "tuple[Ns, Ns, int]"
 """A pause, and how many messages the bag has before it."""
+Absences: TypeAlias = "tuple[tuple[str, tuple[CountedPause, ...]], ...]"
+"""By topic, the pauses of that topic which may be silences, in order."""
 
 SHORTEST_PAUSE_NS: Final[Ns] = NS_PER_S // 2
+SHORTEST_SILENCE_NS: Final[Ns] = 30 * NS_PER_S
+SILENT_PERIODS: Final = 20
+"""A topic is silent after so many of its periods without a message."""
 _PERIODS: Final = 1.5
 """Half of those of a gap: in a bag with long pauses the mean period is longer than the usual."""
 _CHAINED: Final = 3
@@ -28,12 +36,16 @@ _MOST: Final = 64
 
 
 def pauses_among(
-    firsts: NDArray[np.int64], lasts: NDArray[np.int64], counts: NDArray[np.int64]
+    firsts: NDArray[np.int64],
+    lasts: NDArray[np.int64],
+    counts: NDArray[np.int64],
+    *,
+    longer_than: Ns = SHORTEST_PAUSE_NS,
 ) -> list[CountedPause]:
     """Returns the pauses between spans of log time (inclusive), in any order, of some messages."""
     order = np.argsort(firsts, kind="stable")
     begins, reach = firsts[order][1:], np.maximum.accumulate(lasts[order])[:-1]
-    apart = begins - reach > SHORTEST_PAUSE_NS
+    apart = begins - reach > longer_than
     columns = (reach, begins, np.cumsum(counts[order])[:-1])
     return [*zip(*(column[apart].tolist() for column in columns), strict=True)]
 
@@ -65,6 +77,16 @@ def noteworthy(pauses: Sequence[CountedPause], counts: Sequence[int], length: Ns
     ]
     longer.sort(key=lambda pause: pause[0] - pause[1])  # the longest first
     return tuple(sorted(longer[:_MOST]))
+
+
+def absences_of(pauses: Sequence[CountedPause], count: int, length: Ns) -> tuple[CountedPause, ...]:
+    """Returns the longest pauses of a topic that are far longer than its mean period in a bag.
+
+    `count` and `length`: how many messages of it the bag has, and from the first to the last.
+    """
+    limit = SILENT_PERIODS * length // max(count - 1, 1)
+    longer = [pause for pause in pauses if pause[1] - pause[0] > limit]
+    return tuple(sorted(sorted(longer, key=lambda pause: pause[0] - pause[1])[:_MOST]))
 
 
 def _usual(chain: Sequence[CountedPause]) -> Ns:

@@ -24,10 +24,12 @@ from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ra
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from ros2_memory.core.pauses import CountedPause
 
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -348,8 +350,12 @@ class Segment:
         """By topic, when the bags hold it and how often."""
         columns = _topic_columns(self)
         lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
+        absences: dict[str, dict[int, Sequence[CountedPause]]] = {}
+        for row, bag in enumerate(self.bags):
+            for topic, pauses in bag.summary.schema.absences:
+                absences.setdefault(topic, {})[row] = pauses
         return {
-            topic: _presence_of(column, lengths)
+            topic: _presence_of(column, lengths, absences.get(topic, {}))
             for topic in sorted(columns.topics)
             if (column := columns.of(topic)) is not None
         }
@@ -466,16 +472,37 @@ def _topic_columns(segment: Segment) -> _TopicColumns:
     return _TopicColumns(segment.bags)
 
 
-def _presence_of(column: TopicColumn, lengths: _Times) -> Presence:
-    """Returns when bags hold a topic, and how often; given the lengths of all bags (ns)."""
+def _presence_of(
+    column: TopicColumn, lengths: _Times, absences: Mapping[int, Sequence[CountedPause]]
+) -> Presence:
+    """Returns when bags hold a topic, and how often.
+
+    `lengths` (ns) are those of all bags, `absences` where some of them hold none of the topic.
+    """
     bags, firsts, lasts, counts = column
     if (bags[1:] == bags[:-1]).any():  # the types of a topic count together
         bags, rows = np.unique(bags, return_index=True)
         counts = np.add.reduceat(counts, rows)
         firsts, lasts = np.minimum.reduceat(firsts, rows), np.maximum.reduceat(lasts, rows)
-    spacings = _spacings(counts, lasts - firsts)
     length = int(lengths[bags].sum())
+    if absences:
+        parts = list(_parts(zip(bags.tolist(), firsts, lasts, counts, strict=True), absences))
+        firsts, lasts, counts = np.array(parts, np.int64).T
+        length -= sum(end - start for pauses in absences.values() for start, end, _ in pauses)
+    spacings = _spacings(counts, lasts - firsts)
     return Presence(_runs(firsts, lasts), spacings, int(counts.sum()), length)
+
+
+def _parts(
+    rows: Iterable[tuple[int, Ns, Ns, int]], absences: Mapping[int, Sequence[CountedPause]]
+) -> Iterator[tuple[Ns, Ns, int]]:
+    """Yields first and last time and count of each bag, or of its parts between absences."""
+    for bag, first, last, count in rows:
+        begin, before = first, 0
+        for start, end, sent in absences.get(bag, ()):
+            yield begin, start, sent - before
+            begin, before = end, sent
+        yield begin, last, count - before
 
 
 def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:

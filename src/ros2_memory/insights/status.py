@@ -251,7 +251,8 @@ def _fallen_silent(memory: Memory, snapshot: Snapshot) -> Iterator[SilentTopic]:
         if messages < _MIN_MESSAGES or last < begin:
             continue
         first = min(totals.first for totals in totals_by_type)
-        usual = (last - first) // (messages - 1)
+        recorded = last - first - length_in(snapshot.gaps, first, last)
+        usual = recorded // (messages - 1)
         longest = max(_SILENT_PERIODS * usual, snapshot.longest_silence(topic))
         is_long = latest - last > max(SILENT_AFTER_NS, longest)
         since = TimeWindow(last + 1, latest + 1)

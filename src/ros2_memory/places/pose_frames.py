@@ -149,7 +149,8 @@ def placed_waypoints(
     """Returns waypoints of a topic's poses in another frame, each by the transforms of its time.
 
     At both ends of a recording its first and last transforms hold for 2 s more, as for tracks.
-    Waypoints that no transform places are left out, with a note.
+    Waypoints that no transform places are left out, with a note. No drawn way leads across a jump
+    of the frame.
 
     Raises:
         InvalidArgumentsError: no transform places any of them.
@@ -181,7 +182,23 @@ def placed_waypoints(
     if len(moved) < len(waypoints):
         left_out = counted(len(waypoints) - len(moved), "waypoint")
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
-    return tuple(moved)
+    if not moved or own_frame == frame_id or topic != resolve_path_topic(view):
+        return tuple(moved)
+    try:
+        track = RobotTracks(view, frame_id).over(TimeWindow(moved[0].time, moved[-1].time + 1))
+    except QueryTimeoutError:
+        view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
+        return tuple(moved)
+    jumped = track.track.times[1:][jumps(track.track)[:-1]]
+    reached = np.searchsorted(jumped, [waypoint.time for waypoint in moved], side="right")
+    is_after = np.diff(reached, prepend=reached[0]) > 0
+    if is_after.any():
+        across = counted(int(is_after.sum()), "waypoint")
+        view.notes.add(f"{frame_id} jumped before {across}: nobody drove there from the one before")
+    return tuple(
+        replace(waypoint, jump=waypoint.jump or after)
+        for waypoint, after in zip(moved, is_after.tolist(), strict=True)
+    )
 
 
 def _unreachable(frame_id: str, own_frame: str) -> str:

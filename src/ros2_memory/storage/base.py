@@ -20,7 +20,7 @@ import numpy as np
 
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicHeader, shared_schema
 from ros2_memory.core.errors import BagError, UndecodableError
-from ros2_memory.core.pauses import noteworthy
+from ros2_memory.core.pauses import absences_of, noteworthy
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
@@ -532,12 +532,16 @@ class BagWriter(ABC):
 
 
 class ChannelTotal(NamedTuple):
-    """The messages of one channel: how many (at least one), the earliest and the latest."""
+    """The messages of one channel: how many (at least one), the earliest and the latest.
+
+    `pauses` are those of more than `SHORTEST_SILENCE_NS`.
+    """
 
     channel: Channel
     messages: int
     first: Ns
     last: Ns
+    pauses: Sequence[CountedPause] = ()
 
 
 def summarize_channels(
@@ -559,9 +563,15 @@ def summarize_channels(
     headers: list[TopicHeader] = []
     numbers: list[int] = []
     # Encoded at once, without an object for each topic: an index makes thousands of summaries.
-    for (topic, type_name), (channel, *stated) in sorted(by_topic.items(), key=itemgetter(0)):
+    absences: dict[str, tuple[CountedPause, ...]] = {}
+    for (topic, type_name), total in sorted(by_topic.items(), key=itemgetter(0)):
+        channel, count, first, last, own_pauses = total
         headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
-        numbers += stated
+        numbers += count, first, last
+        # Where it has several types, a pause of one is none of the topic.
+        is_other_type = topic in absences
+        found = absences_of(own_pauses, count, last - first) if own_pauses else ()
+        absences[topic] = () if is_other_type else found
     length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
     schema = shared_schema(
         tuple(headers),
@@ -570,6 +580,7 @@ def summarize_channels(
         notes,
         set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
         pauses=noteworthy(pauses, numbers[::3], length),
+        absences=tuple((topic, found) for topic, found in absences.items() if found),
     )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
 

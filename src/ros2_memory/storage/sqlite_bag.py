@@ -24,7 +24,7 @@ from typing import IO, TYPE_CHECKING, Final
 
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, SHORTEST_SILENCE_NS
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
@@ -61,6 +61,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.pauses import CountedPause
 
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
@@ -82,6 +83,15 @@ _PAUSES: Final = """
         WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
         WINDOW ordered AS (ORDER BY timestamp)
     ) WHERE timestamp - before > ?
+"""
+_ABSENCES: Final = """
+    SELECT topic_id, before, timestamp, number - 1 FROM (
+        SELECT topic_id, timestamp, lag(timestamp) OVER ordered AS before,
+            row_number() OVER ordered AS number
+        FROM messages NOT INDEXED
+        WHERE timestamp BETWEEN 0 AND ?
+        WINDOW ordered AS (PARTITION BY topic_id ORDER BY timestamp)
+    ) WHERE timestamp - before > ? ORDER BY timestamp
 """
 _SET_BACK: Final = """
     SELECT max(before - timestamp, 0), timestamp FROM (
@@ -174,13 +184,21 @@ class SqliteBags:
             is_right = self._is_indexed_right(base, topics)
             asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
             pauses = base.execute(_PAUSES, asked).fetchall()
+            absences: dict[int, list[CountedPause]] = {}
+            possible = [(first, last) for _, _, first, last, _, is_not in stored if not is_not]
+            firsts, lasts = zip(*possible, strict=True) if possible else ((0,), (0,))
+            if max(lasts) - min(firsts) > SHORTEST_SILENCE_NS:
+                for number, start, end, sent in base.execute(
+                    _ABSENCES, (_LAST_NS, SHORTEST_SILENCE_NS)
+                ):
+                    absences.setdefault(number, []).append((start, end, sent))
             set_back = base.execute(_SET_BACK, asked[:2]).fetchone() or (0, 0)
         if any(undecodable for *_, undecodable, _ in stored):
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
         totals = [
-            ChannelTotal(topics.channels[number], count, first, last)
+            ChannelTotal(topics.channels[number], count, first, last, absences.get(number, ()))
             for number, count, first, last, _, is_impossible in stored
             if number in topics.channels and not is_impossible
         ]

@@ -1,13 +1,26 @@
 from __future__ import annotations
 
 import random
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+import pytest
 
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
+from tests.support.bags import (
+    McapLayout,
+    Msg,
+    boolean,
+    text,
+    write_db3,
+    write_mcap,
+    write_splits,
+)
+from tests.support.memories import asked, each_way, memory_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -76,3 +89,36 @@ def test_bags_that_a_wrong_clock_dated_show_no_silence() -> None:
     unset = TopicSummary("/odom", "std_msgs/msg/Bool", "cdr", 3000, 0, 60 * S)
     dated = [*bags, split(0, [unset], "early")]
     assert Snapshot(Timeline.of(dated), scanned_at=BEGIN + 10**6 * S).silences == ()
+
+
+def published() -> Iterator[Msg]:
+    """Twenty minutes, for two of which a topic is silent; another one has two types in turn."""
+    for second in range(1200):
+        ns = BEGIN + second * S
+        yield boolean(ns, True, "/on")
+        if not 400 <= second < 520:
+            yield boolean(ns + S // 3, True, "/seen")
+        body = text(ns, "a") if second // 200 % 2 else boolean(ns, True)
+        yield replace(body, topic="/mixed")
+        if second % 70 == 0:
+            yield text(ns, "b", "/slow")
+
+
+@each_way
+@pytest.mark.parametrize("form", ["splits", "indexed", "scanned", "sqlite3"])
+def test_a_silence_within_a_long_bag_is_found_as_one_across_splits(
+    tmp_path: Path, form: str, recalls: bool
+) -> None:
+    messages = [*published()]
+    whole = tmp_path / "rec" / "rec_0.mcap"
+    if form == "splits":
+        write_splits(tmp_path, messages)
+    elif form == "sqlite3":
+        write_db3(whole.with_suffix(".db3"), messages)
+    else:
+        write_mcap(whole, messages, McapLayout(chunk_size=None if form == "scanned" else 20_000))
+    storage = "rosbag2" if form == "sqlite3" else "mcap"
+    memory = memory_of(tmp_path, storage=storage, recalls=recalls)
+    [silence] = asked(memory, tmp_path, "data_time_range")["silences"]
+    assert (silence["topic"], silence["silent_s"]) == ("/seen", 121)
+    assert silence["start"] == pytest.approx(BEGIN / S + 399.333, abs=1e-3)

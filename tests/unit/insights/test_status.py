@@ -294,6 +294,15 @@ def test_a_topic_that_was_heard_often_and_then_no_more_fell_silent(tmp_path: Pat
     assert answer.fell_silent == (SilentTopic("/bumper", BEGIN + 79 * S),)
 
 
+def test_how_often_a_topic_comes_leaves_out_when_the_robot_was_off(tmp_path: Path) -> None:
+    days = [BEGIN + day * 86_400 * S for day in range(3)]
+    messages = [odom(day + t * S, 0.0, 0.0) for day in days for t in range(600)]
+    heard = [boolean(day + t * S, True) for day in days for t in range(550)]
+    memory = remembering(tmp_path, [*messages, *heard[:-10]])
+    fallen = SilentTopic("/bumper", days[2] + 539 * S)
+    assert memory_status(memory, Call()).fell_silent == (fallen,)
+
+
 @pytest.mark.parametrize(("docked_s", "fell"), [(190, []), (260, ["/odom"])])
 def test_what_a_docked_robot_does_not_say_did_not_fall_silent(
     tmp_path: Path, docked_s: int, fell: list[str]

@@ -20,7 +20,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import TimeRange
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.queries import trajectory_summary
-from tests.support.bags import odom, write_mcap
+from tests.support.bags import odom, tf, transform, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import asked, each_way, memory_of, with_store
 from tests.support.moving_map import BEGIN, MovingMap, S, write_moving_map
@@ -105,6 +105,32 @@ def test_waypoints_are_in_the_own_frame_of_poses_or_in_the_one_asked_for(tmp_pat
     assert all(-1.1 <= each["x"] <= 2.1 for each in inside["waypoints"])
     with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         trajectory_summary(memory, Call(), ALL, frame_id="moon")
+
+
+@each_way
+def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bool) -> None:
+    """Drives straight on in odometry, while the map is corrected by 10 m to the side, once."""
+    messages = []
+    for step in range(600):
+        at, off_m = BEGIN + step * S // 10, 0.0 if step < 300 else 10.0
+        pose = transform(at, "odom", "base_link", (step * 0.03, 0.0, 0.0))
+        messages += [
+            odom(at, step * 0.03, 0.0, vx=0.3),
+            tf(at, transform(at, "map", "odom", (0.0, off_m, 0.0)), pose),
+        ]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    memory = memory_of(tmp_path, recalls=recalls)
+    span = {"start": BEGIN / S, "end": BEGIN / S + 100}
+    own = asked(memory, tmp_path, "trajectory_summary", **span)
+    moved = asked(memory, tmp_path, "trajectory_summary", frame_id="map", **span)
+    assert [each.get("jump", False) for each in own["waypoints"]] == [False, False]
+    assert [(each["y"], each.get("jump", False)) for each in moved["waypoints"]] == [
+        (0.0, False),
+        (10.0, True),
+    ]
+    note = "map jumped before 1 waypoint: nobody drove there from the one before"
+    assert note in moved["notes"]
+    assert note not in own["notes"]
 
 
 def test_the_metres_of_a_stop_are_none_and_speeds_are_those_inside(tmp_path: Path) -> None:

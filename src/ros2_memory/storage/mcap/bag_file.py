@@ -148,7 +148,13 @@ class McapBags:
         with OpenFile(path) as file:
             index = self._verified(file, self._index(file))
         totals = [
-            ChannelTotal(index.channels[number], total.count, total.first, total.last)
+            ChannelTotal(
+                index.channels[number],
+                total.count,
+                total.first,
+                total.last,
+                index.absences.get(number, ()),
+            )
             for number, total in index.totals.items()
         ]
         return summarize_channels(

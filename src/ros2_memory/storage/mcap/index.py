@@ -20,7 +20,12 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.bag_summary import MESSAGES_MISSING, WRONG_STATISTICS
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, CountedPause, pauses_among
+from ros2_memory.core.pauses import (
+    SHORTEST_PAUSE_NS,
+    SHORTEST_SILENCE_NS,
+    CountedPause,
+    pauses_among,
+)
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
@@ -216,6 +221,7 @@ class McapIndex(NamedTuple):
         set_back: by how much the log times of a channel go back at most, from one chunk to a later
             one or from one message to the next, and the first one after that.
         pauses: where no channel has a message for more than `SHORTEST_PAUSE_NS`.
+        absences: by channel, where it has none for more than `SHORTEST_SILENCE_NS`.
         seams: where the times of chunks do not go on from one to the next; empty after a scan.
         contradiction: how the indexes of the file contradict its messages, if that was found after
             they had been used; else empty.
@@ -231,6 +237,7 @@ class McapIndex(NamedTuple):
     notes: tuple[str, ...] = ()
     set_back: tuple[Ns, Ns] = (0, 0)
     pauses: Sequence[CountedPause] = ()
+    absences: Mapping[int, Sequence[CountedPause]] = MappingProxyType({})
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
@@ -271,6 +278,7 @@ class Contents:
         self.totals: dict[int, Extent] = {}
         self.back: tuple[Ns, Ns] = (0, 0)  # as `set_back` of `McapIndex`
         self._held: list[tuple[IntArray, IntArray, IntArray]] = []
+        self._spans: list[tuple[IntArray, IntArray, IntArray, IntArray]] = []  # by channel
 
     def add(self, pairs: Pairs) -> tuple[IntArray, IntArray]:
         """Adds all messages of chunks, which follow those before in the file.
@@ -294,14 +302,22 @@ class Contents:
         back[parts] = 0
         most = int(back.argmax())
         self.back = max(self.back, (int(back[most]), int(times[most])))
-        rows = zip(
-            numbers[parts].tolist(),
-            np.diff(parts, append=numbers.size).tolist(),
-            np.minimum.reduceat(times, parts).tolist(),
-            np.maximum.reduceat(times, parts).tolist(),
-            strict=True,
+        spans = (
+            numbers[parts],
+            np.minimum.reduceat(times, parts),
+            np.maximum.reduceat(times, parts),
+            np.diff(parts, append=numbers.size),
         )
-        for number, count, first, last in rows:
+        is_long = spans[2] - spans[1] > SHORTEST_SILENCE_NS
+        if is_long.any():
+            of_long = np.repeat(is_long, spans[3])
+            long_times = times[of_long]
+            ones = np.ones_like(long_times)
+            self._spans.append((numbers[of_long], long_times, long_times, ones))
+        short_numbers, *short = (column[~is_long] for column in spans)
+        self._spans.append((short_numbers, short[0], short[1], short[2]))
+        rows = zip(*(column.tolist() for column in spans), strict=True)
+        for number, first, last, count in rows:
             total = self.totals.get(number)
             if total is not None:
                 self.back = max(self.back, (total.last - first, first))
@@ -314,6 +330,7 @@ class Contents:
             self._count(number, extent)
         self.back = max(self.back, other.back)
         self._held += other._held
+        self._spans += other._spans
 
     def _count(self, number: int, extent: Extent) -> None:
         total = self.totals.setdefault(number, extent)
@@ -327,6 +344,22 @@ class Contents:
         """As `pauses` of `McapIndex`."""
         held = self._held or [(_NONE, _NONE, _NONE)]
         return pauses_among(*map(np.concatenate, zip(*held, strict=True)))
+
+    @property
+    def absences(self) -> Mapping[int, Sequence[CountedPause]]:
+        """As `absences` of `McapIndex`."""
+        last = max((total.last for total in self.totals.values()), default=0)
+        first = min((total.first for total in self.totals.values()), default=0)
+        if last - first <= SHORTEST_SILENCE_NS:  # as most splits
+            return {}
+        numbers, *spans = map(np.concatenate, zip(*self._spans, strict=True))
+        by_channel = {
+            number: pauses_among(
+                *(column[numbers == number] for column in spans), longer_than=SHORTEST_SILENCE_NS
+            )
+            for number in self.totals
+        }
+        return {number: pauses for number, pauses in by_channel.items() if pauses}
 
 
 def _begins_of_groups(*columns: IntArray) -> IntArray:
@@ -398,6 +431,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         notes=disagreements(stated, contents.totals),
         set_back=contents.back,
         pauses=contents.pauses,
+        absences=contents.absences,
         seams=_seams(index.chunks),
     )
 

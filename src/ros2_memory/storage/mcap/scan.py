@@ -187,6 +187,7 @@ class _Scan:
             notes=tuple(notes),
             set_back=self.contents.back,
             pauses=self.contents.pauses,
+            absences=self.contents.absences,
         )
 
     def _notes(self, totals: dict[int, Extent], *, complete: bool) -> list[str]:
