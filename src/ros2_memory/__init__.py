@@ -6,7 +6,8 @@ Two programs share a directory of bags and nothing else. The **recorder**
 
 Modules at the top::
 
-    server          entry point of the query server
+    programs        where the three programs begin
+    server          the query server
     bootstrap       composition root; bootstrap_fleet: of many robots and of a lake
     config          the configuration: models, loading, errors, sources
     queries         one function for each tool of the specification

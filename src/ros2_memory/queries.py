@@ -102,6 +102,7 @@ from ros2_memory.insights.status import (
 )
 from ros2_memory.places.driven_inside import farthest_from
 from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
+from ros2_memory.things.labels import as_it_stands
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -669,6 +670,7 @@ def _notes_on_never(
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
         *unasked_limit(condition, min_score),
+        *as_it_stands(condition),
     )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()

@@ -59,11 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     0: stopped by SIGTERM, SIGINT or the end of stdin; 1: the address cannot be listened on; 2: the
     configuration or the command line is refused, or a token is missing where there must be one.
     """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: sys.exit(0))
     given = _parser().parse_args(argv)
     share_one_arena()
     gc.disable()  # until the server is built: imports make many objects, and no garbage
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: sys.exit(0))
     try:
         _run(given.overrides, given.page)
     except CannotListenError as error:

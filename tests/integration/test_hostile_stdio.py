@@ -18,6 +18,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 GARBAGE = (b"", b"\x00", b"\xff\xff", b'"x"', b"[]", b"7", b"{", b"[" * 100_000)
+DEEP = '{"timestamp": ' + "[" * 3_000 + "]" * 3_000 + "}"
+UNPARSED = (
+    call("find_things", '{"label": "\\ud800 \\"id\\": 7"}', 50),
+    call("get_position_at", DEEP, 51),
+    b'{"method": "ping", "params": {"name": "\\ud800", "id": 7}, "jsonrpc": "2.0", "id": "a"}',
+    b'{"jsonrpc": "2.0", "id": 52, "method": "tools/call", "params": [1]}',
+)
 LAST = 99
 
 
@@ -25,7 +32,7 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     write_run(tmp_path / "bags")
     ours = ("MEMORY_", "MCP_", "ROS_")
     env = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
-    bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE)
+    bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE, *UNPARSED)
     lines = (*bodies, call("data_time_range", "{}", LAST))
     process = subprocess.Popen(
         [sys.executable, "-m", "ros2_memory.server", "data.now=latest"],
@@ -61,6 +68,10 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
         for each in replies[1:-1]
         if "content" in each.get("result", {})
     ]
+    refused = {each["id"]: each["error"]["message"] for each in replies if "error" in each}
+    assert {50, 51, "a", 52} <= refused.keys()
+    assert "hex escape" in refused[50]
+    assert "recursion limit" in refused[51]
     assert len(errors) >= 15
     assert set(errors) == {"invalid_arguments"}
 

@@ -62,6 +62,16 @@ OTHER_ROBOTS: Final = {
     "apriltag_msgs/msg/AprilTagDetectionArray": (
         "std_msgs/Header header\nAprilTagDetection[] detections\n"
     ),
+    "aruco_opencv_msgs/msg/MarkerPose": "uint16 marker_id\ngeometry_msgs/Pose pose\n",
+    "aruco_opencv_msgs/msg/ArucoDetection": "std_msgs/Header header\nMarkerPose[] markers\n",
+    "radar_msgs/msg/RadarReturn": "float32 range\nfloat32 azimuth\nfloat32 amplitude\n",
+    "radar_msgs/msg/RadarScan": "std_msgs/Header header\nRadarReturn[] returns\n",
+    "unitree_go/msg/IMUState": "float32[4] quaternion\n",
+    "unitree_go/msg/SportModeState": (
+        "uint32 error_code\nIMUState imu_state\nuint8 mode\nuint8 gait_type\nfloat32[3] position\n"
+        "float32 body_height\nfloat32[3] velocity\nfloat32 yaw_speed\n"
+        "float32[4] range_obstacle\nint16[4] foot_force\n"
+    ),
     "px4_msgs/msg/ManyFlags": "".join(f"bool flag_{nth:03}\n" for nth in range(600)),
 }
 """Types that carry a pose in ways of their own, many booleans, or detections without a label."""

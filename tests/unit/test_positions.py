@@ -98,6 +98,24 @@ def local(ns: int, x: float, y: float) -> Msg:
     return Msg("/fmu/out/vehicle_local_position", kind, ns, body)
 
 
+def walking(ns: int, x: float, y: float) -> Msg:
+    turn = np.array([math.cos(YAW / 2), 0.0, 0.0, math.sin(YAW / 2)], np.float32)
+    body = make(
+        "unitree_go/msg/SportModeState",
+        error_code=0,
+        imu_state=make("unitree_go/msg/IMUState", quaternion=turn),
+        mode=3,
+        gait_type=1,
+        position=np.array([x, y, 0.3], np.float32),
+        body_height=0.3,
+        velocity=np.array([0.5, 0.0, 0.0], np.float32),
+        yaw_speed=0.0,
+        range_obstacle=np.zeros(4, np.float32),
+        foot_force=np.zeros(4, np.int16),
+    )
+    return Msg("/sportmodestate", "unitree_go/msg/SportModeState", ns, body)
+
+
 def tracked(ns: int, x: float, y: float) -> Msg:
     body = transform(ns, "world", "robot", (x, y, 0.0), YAW)
     return Msg("/vicon/robot", "geometry_msgs/msg/TransformStamped", ns, body)
@@ -123,6 +141,7 @@ CARRIERS = {
     "/turtle1/pose": (turtle, None, 0.0),
     "/fmu/out/vehicle_odometry": (vehicle, "NED", -2.0),
     "/fmu/out/vehicle_local_position": (local, None, -2.0),
+    "/sportmodestate": (walking, None, 0.3),
     "/vicon/robot": (tracked, "world", 0.0),
 }
 

@@ -1,4 +1,4 @@
-"""`python -m ros2_memory.cli`, and the entry point of `ros2-memory`."""
+"""`python -m ros2_memory.cli`, and `ros2-memory`."""
 
 import gc
 import os

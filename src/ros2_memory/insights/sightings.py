@@ -55,6 +55,7 @@ from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
+from ros2_memory.things.labels import as_it_stands
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -136,7 +137,7 @@ def find_matches(
     note_unread(view, searched, nothing=total == 0, search=True)
     if total == 0:
         silences = describe_silences(view, topics, searched)
-        view.notes.add(*silences, *unasked_limit(condition, min_score))
+        view.notes.add(*silences, *unasked_limit(condition, min_score), *as_it_stands(condition))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     total = total if scope.since is None else None

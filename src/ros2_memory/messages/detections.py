@@ -36,9 +36,16 @@ POSITIONS: Final = (
     ("pose",),
     ("bbox", "center", "position"),
     ("bbox3d", "center", "position"),
+    (),  # x, y and z of the object itself
 )
-_SHOWN: Final = frozenset({"box"}.union(path[0] for path in POSITIONS))
+_SHOWN: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
 """What has a score and one of these is something that was seen, and named as such things are."""
+_NAMED_IN_TYPES: Final = {
+    frozenset({"family", "id"}): "id",  # apriltag_msgs, isaac_ros_apriltag_interfaces
+    frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
+    frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
+}
+"""The name of an object that has these fields, for types that tell what was seen by no label."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
 """Lists, objects and texts that are JSON around a detection, and it."""
@@ -76,8 +83,9 @@ def naming(fields: Collection[str]) -> tuple[str, ...]:
     """
     if not NOT_LABELLED.isdisjoint(fields):
         return ()
+    names = [name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields)]
     is_seen = any(name in fields for name in SCORES) and not _SHOWN.isdisjoint(fields)
-    return (*LABELS, "name", "id") if is_seen else LABELS
+    return (*LABELS, *names, *(("name", "category", "id") if is_seen else ()))
 
 
 def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPTH) -> JsonValue:

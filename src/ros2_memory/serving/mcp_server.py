@@ -45,6 +45,7 @@ from starlette.requests import Request
 
 from ros2_memory.serving import page
 from ros2_memory.serving.auth import robots_of
+from ros2_memory.serving.stdio import stdio_messages
 from ros2_memory.tools.instructions import prompt
 
 if TYPE_CHECKING:
@@ -179,6 +180,12 @@ class EpisodicServer(MCPServer[object]):
         self._resources = {tool: row for tool, row in RESOURCES.items() if tool in offered}
         self._templates = {prefix: row for prefix, row in _TEMPLATES.items() if row[1] in offered}
         self._prompt = f"{instructions}\n{prompt(additions=has_status)}"
+
+    async def run_stdio_async(self) -> None:
+        """Serves stdin and stdout until stdin ends."""
+        server = self._lowlevel_server
+        async with stdio_messages() as (messages, replies):
+            await server.run(messages, replies, server.create_initialization_options())
 
     async def list_tools(self) -> list[ListedTool]:
         """Returns the tools, in the order of their declaration."""

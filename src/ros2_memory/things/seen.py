@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
-VERSION: Final = 4
+VERSION: Final = 5
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS

@@ -66,7 +66,7 @@ LONGEST_REASON_S: Final = 60.0
 """How far before a time `recap` looks for changes (`around`)."""
 
 
-_RELATIVE: Final = re.compile(r".*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
+_RELATIVE: Final = re.compile(r"-.*|.*(?:ago|now)|\d+(?:\.\d+)? ?[smhd][a-z]*")
 """Times before now, as people write them."""
 _WITHOUT_DATE: Final = re.compile(r"today|yesterday|\d{1,2}:\d\d")
 _END_OF_DAY: Final = re.compile(r"24(?::?00){1,2}")

@@ -75,7 +75,7 @@ UNMAPPED: Final = {
         "geometry_msgs/Point[] points\ngeometry_msgs/Pose2D flat\ngeometry_msgs/Pose[] poses\n"
         "Nested[] nested\nAxis[] axes\nSeen seen\nstd_msgs/Empty empty\nstring class\n"
     ),
-    "own_msgs/msg/Label": "string label\nfloat32 score\nfloat64 x\nfloat64 y\n",
+    "own_msgs/msg/Label": "string label\nfloat32 score\nfloat64 x\nfloat64 y\nfloat64 z\n",
     "own_msgs/msg/Posed": (
         "int32 class_id\nstring id\nfloat32 score\ngeometry_msgs/PoseStamped pose\n"
     ),
@@ -111,6 +111,7 @@ OTHERS: Final = (
     "own_msgs/msg/Nested",
     "own_msgs/msg/Label",
     "own_msgs/msg/PosedArray",
+    "aruco_opencv_msgs/msg/ArucoDetection",
     "sensor_msgs/msg/MagneticField",
     "nav_msgs/msg/OccupancyGrid",
     "visualization_msgs/msg/MarkerArray",

@@ -30,6 +30,7 @@ SETTLED = (
     "ros2_vision_interfaces/msg/StampedString",
     "own_msgs/msg/Label",
     "own_msgs/msg/PosedArray",
+    "aruco_opencv_msgs/msg/ArucoDetection",
 )
 
 

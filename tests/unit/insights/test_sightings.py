@@ -131,6 +131,17 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
     assert note in queries.find_last_match(*asked).notes
 
 
+def test_never_of_a_plural_says_that_the_singular_was_not_searched(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["coffee mug"])])
+    memory = memory_of(tmp_path)
+    note = '"coffee mugs" was searched as it stands, not "coffee mug"'
+    for kind in ("contains", "equals"):
+        asked = (memory, Call(), OBJECTS, kind, "coffee mugs")
+        assert find_matches(*asked).notes == (note,)
+        assert queries.find_last_match(*asked).notes == (note,)
+    assert find_matches(memory, Call(), OBJECTS, "contains", "cup").notes == ()
+
+
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
     memory = memory_of(tmp_path)

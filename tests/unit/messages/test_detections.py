@@ -100,6 +100,11 @@ AT: JsonValue = {"position": {"x": 1.0, "y": 2.0, "z": 3.0}}
             *("cup", "camera"),
             id="JSON of ultralytics",
         ),
+        pytest.param(
+            {"category": "cup", "confidence": 0.5, "x": 1, "y": 2, "z": 3},
+            *("cup", "camera"),
+            id="JSON with a flat place",
+        ),
     ],
 )
 def test_detections_are_named_and_placed_as_common_packages_do(
@@ -110,6 +115,32 @@ def test_detections_are_named_and_placed_as_common_packages_do(
     wrapped = {"payload": {"frame_id": "camera", "detections": [value]}}
     assert detections_of({"data": json.dumps(wrapped)}) == (expected,)
     assert detections_of(without_low_scores({"detections": [value]}, 0.6)) == ()
+
+
+@pytest.mark.parametrize(
+    ("value", "expected"),
+    [
+        pytest.param(
+            {"family": "tag36h11", "id": 7, "pose": {"pose": {"pose": AT}}},
+            Detection("7", (1.0, 2.0, 3.0), "camera"),
+            id="isaac_ros_apriltag_interfaces",
+        ),
+        pytest.param(
+            {"marker_id": 7, "pose": AT},
+            Detection("7", (1.0, 2.0, 3.0), "camera"),
+            id="aruco_opencv_msgs",
+        ),
+        pytest.param(
+            {"Class": "cup", "probability": 0.5, "xmin": 1, "id": 41},
+            Detection("cup", None, "camera", 0.5),
+            id="darknet_ros_msgs of ROS 1",
+        ),
+    ],
+)
+def test_detections_of_types_without_a_label_have_the_name_that_the_type_gives(
+    value: JsonValue, expected: Detection
+) -> None:
+    assert detections_of([value], "camera") == (expected,)
 
 
 def test_a_point_that_nobody_filled_in_is_no_place() -> None:

@@ -25,6 +25,7 @@ from tests.support.bags import (
     make,
     odom,
     point,
+    quaternion,
     text,
     tf,
     transform,
@@ -146,16 +147,34 @@ def test_without_a_detector_it_is_said_that_nothing_is_known(tmp_path: Path) -> 
 def test_of_detections_without_a_label_it_is_said_that_none_is_known(
     tmp_path: Path, *, recalls: bool
 ) -> None:
-    kind = "apriltag_msgs/msg/AprilTagDetection"
-    tag = make(kind, family="36h11", id=7, decision_margin=40.0)
+    echo = make("radar_msgs/msg/RadarReturn", range=2.0, azimuth=0.1, amplitude=40.0)
     messages = [each for each in looked(0, 3, HERE) if "vision" not in each.topic]
     for at in (BEGIN * S, (BEGIN + 1) * S):
-        body = make(f"{kind}Array", header=header(at, "base_link"), detections=[tag])
-        messages.append(Msg("/tags", f"{kind}Array", at, body))
+        body = make("radar_msgs/msg/RadarScan", header=header(at, "base_link"), returns=[echo])
+        messages.append(Msg("/radar", "radar_msgs/msg/RadarScan", at, body))
     write_splits(tmp_path, messages)
     reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
     [note] = reply["notes"]
     assert "no message has a detection" in note
+
+
+@each_way
+def test_markers_are_found_by_their_number(tmp_path: Path, *, recalls: bool) -> None:
+    april, aruco = "apriltag_msgs/msg/AprilTagDetection", "aruco_opencv_msgs/msg/ArucoDetection"
+    pose = make("geometry_msgs/msg/Pose", position=point(2.0, 0.0, 0.5), orientation=quaternion(0))
+    messages = [each for each in looked(0, 20, HERE) if "vision" not in each.topic]
+    for at in range(BEGIN * S, (BEGIN + 20) * S, S):
+        tag = make(april, family="36h11", id=7, decision_margin=40.0)
+        marker = make("aruco_opencv_msgs/msg/MarkerPose", marker_id=11, pose=pose)
+        tags = make(f"{april}Array", header=header(at, "base_link"), detections=[tag])
+        markers = make(aruco, header=header(at, "base_link"), markers=[marker])
+        messages += [Msg("/tags", f"{april}Array", at, tags), Msg("/markers", aruco, at, markers)]
+    write_splits(tmp_path, messages)
+    reply = asked(memory_of(tmp_path, recalls=recalls), tmp_path, "find_things")
+    [thing] = reply["things"]
+    assert (thing["label"], thing["place"]) == ("11", {"x": 3.0, "y": 0.0, "z": 0.5})
+    [note] = reply["notes"]
+    assert note.startswith("detected, but could not be placed: 7 (20 times")
 
 
 CUP_AS_JSON = json.dumps(

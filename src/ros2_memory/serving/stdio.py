@@ -1,0 +1,82 @@
+"""MCP over stdin and stdout, where a line that is no message is answered, too.
+
+MCP's SDK passes over a request that its parser refuses (a lone surrogate, 200 lists in each other),
+and the client would wait for ever.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING, Final
+
+import anyio
+from mcp.server.stdio import stdio_server
+from mcp.shared.message import SessionMessage
+from mcp.types import INVALID_REQUEST, PARSE_ERROR, ErrorData, JSONRPCError
+from pydantic import ValidationError
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncIterator
+
+    from mcp.shared._stream_protocols import ReadStream, WriteStream
+
+_TOKENS: Final = re.compile(r'"(?:[^"\\]|\\.)*+"?|[\[\]{}]')
+_ID: Final = re.compile(r'\s*:\s*(?:(-?\d{1,18})|"([\w.:/+-]{1,100})")\s*[,}]', re.ASCII)
+
+
+@asynccontextmanager
+async def stdio_messages() -> AsyncIterator[
+    tuple[ReadStream[SessionMessage | Exception], WriteStream[SessionMessage]]
+]:
+    """Serves stdin and stdout as the SDK does; what is no message is answered here."""
+    async with stdio_server() as (lines, replies):
+        sent, messages = anyio.create_memory_object_stream[SessionMessage | Exception]()
+
+        async def relay() -> None:
+            async with sent:
+                async for line in lines:
+                    if not isinstance(line, Exception):
+                        await sent.send(line)
+                    elif refusal := refusal_of(line):
+                        await replies.send(SessionMessage(refusal))
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(relay)
+            yield messages, replies
+            tasks.cancel_scope.cancel()
+
+
+def refusal_of(error: Exception) -> JSONRPCError | None:
+    """Returns the reply to a line that is no message; None where the line is blank.
+
+    Its `id` is that of the request, or null where none is found.
+    """
+    if not isinstance(error, ValidationError):
+        return _refusal(None, INVALID_REQUEST, str(error))
+    errors = error.errors(include_url=False)
+    inputs = [given["input"] for given in errors]
+    reason = errors[0]["msg"]
+    if isinstance(inputs[0], str):
+        is_blank = not inputs[0].strip()
+        return None if is_blank else _refusal(request_id(inputs[0]), PARSE_ERROR, reason)
+    # Of a request that is wrong inside, another kind of message would need a field of the whole.
+    known = [given["id"] for given in inputs if isinstance(given, dict) and "id" in given]
+    number = known[0] if known and isinstance(known[0], int | str) else None
+    return _refusal(number, INVALID_REQUEST, reason)
+
+
+def _refusal(number: int | str | None, code: int, reason: str) -> JSONRPCError:
+    message = f"this is no JSON-RPC message: {reason}"
+    return JSONRPCError(jsonrpc="2.0", id=number, error=ErrorData(code=code, message=message))
+
+
+def request_id(text: str) -> int | str | None:
+    """Returns the id in a JSON-RPC request that no parser takes; None where none is found."""
+    depth = 0
+    for token in _TOKENS.finditer(text):
+        found = _ID.match(text, token.end()) if depth == 1 and token[0] == '"id"' else None
+        if found:
+            return found[2] if found[1] is None else int(found[1])
+        depth += (token[0] in "[{") - (token[0] in "]}")
+    return None
