@@ -504,7 +504,7 @@ def data_time_range(
         view.notes.add(snapshot.dating.note)
     # Except crashes and wrong clocks.
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
-    odd += memory.columns.damaged_parts(snapshot.bags)
+    odd += memory.scanner.damaged_parts(snapshot.bags)
     view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
     thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
     if thinned and (since is None or thinned[0].start < since):

@@ -337,7 +337,7 @@ def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
 
 def check_columns(robot: Examined) -> Iterator[Finding]:
     """Checks that columns can be stored, and names topics that are beyond their share."""
-    store = robot.memory.columns.store
+    store = robot.memory.scanner.store
     if store is None:
         return
     if store.trouble is not None:

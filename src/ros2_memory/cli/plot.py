@@ -55,7 +55,7 @@ from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.places.local_map import east_north, fixes_in, local_frame
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
 
@@ -473,7 +473,7 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         # Waypoints leave out what is within 5 cm of a line: a curve would have corners.
         limits = replace(asked.view.limits, pose_topic=summary.topic)
         view = View(replace(asked.view.memory, limits=limits), Call())
-        poses = RobotTracks(view, summary.frame_id).poses(asked.window)
+        poses = TrackReader(view, summary.frame_id).poses(asked.window)
         placed = np.isfinite(poses.x) & np.isfinite(poses.y)
         times, xs, ys = poses.times[placed], poses.x[placed], poses.y[placed]
     if not len(times):

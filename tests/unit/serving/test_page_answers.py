@@ -195,7 +195,7 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
     poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
     plain = memory_of(tmp_path)
-    for asked_of in (plain, replace(plain, columns=stored_columns(plain, tmp_path))):
+    for asked_of in (plain, replace(plain, scanner=stored_columns(plain, tmp_path))):
         signal = "/odom:pose.pose.position.x"
         [found] = shown(asked_of, f"last=1000&signal={signal}")["signals"]
         assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))

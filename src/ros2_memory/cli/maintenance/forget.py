@@ -65,7 +65,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.places.where import parse_where, times_in_region
+from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
@@ -185,9 +185,10 @@ class _Forget:
         if where is not None:
             with spinner(f"looking when the robot was in {where}"):
                 view = open_view(self._memory, Call(), None)
-                inside = times_in_region(view, parse_where(self._memory.limits, where), window)
+                place = parse_where(self._memory.limits, where)
+                stays = known_track_for(view, place, window).inside(place.region, window)
             margin = PLACE_MARGIN_NS
-            around = [TimeWindow(time.start - margin, time.stop + margin + 1) for time in inside]
+            around = [TimeWindow(stay.start - margin, stay.stop + margin + 1) for stay in stays]
             windows = [time.intersect(window) for time in around]
             unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
         with spinner("looking which topics there are"):
