@@ -300,6 +300,26 @@ def packed_messages(
     return compressed(b"".join(parts))
 
 
+@dataclass
+class _PlaneReader:
+    """Reads columns of `count` numbers, as of `byte_planes`, one after the other from `at` on."""
+
+    content: bytes
+    at: int
+    count: int
+
+    def numbers(self, width: int) -> IntArray:
+        """Returns the next column, whose numbers have so many bytes."""
+        column = from_planes(self.content, self.at, self.count, width)
+        self.at += width * self.count
+        return np.asarray(column, np.int64)
+
+    @property
+    def rest(self) -> bytes:
+        """What follows."""
+        return self.content[self.at :]
+
+
 def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     """Returns the messages that were packed so; all payloads are empty where none were packed.
 
@@ -315,22 +335,16 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
         raise ValueError(
             f"messages are packed in format {form}; this program reads {_PLAIN}, {_PLACED}"
         )
-    at = _HEAD.size
-    logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
-    published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
-    at += 16 * count
-    places = np.arange(count)
-    if form == _PLACED:
-        places = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
-        at += 8 * count
+    planes = _PlaneReader(content, _HEAD.size, count)
+    logged = np.cumsum(planes.numbers(8))
+    published = logged + planes.numbers(8)
+    places = np.cumsum(planes.numbers(8)) if form == _PLACED else np.arange(count)
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
-        sizes = from_planes(content, at, count, 4).astype(np.int64)
-        payloads = content[at + 4 * count :]
+        sizes, payloads = planes.numbers(4), planes.rest
         if len(payloads) != sizes.sum():
             raise ValueError("packed messages are cut short")
         if count and (sizes == sizes[0]).all():
-            planes = np.frombuffer(payloads, np.uint8).reshape(-1, count)
-            payloads = planes.T.tobytes()
+            payloads = np.frombuffer(payloads, np.uint8).reshape(-1, count).T.tobytes()
     starts = np.cumsum(sizes) - sizes
     return Batch(channel, logged, published, places, payloads, starts, sizes)
