@@ -393,7 +393,9 @@ def _checked_request(out: Path, bags: Bags, when: Times | str | None) -> Asked:
         kinds = ", ".join(FORMATS)
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
     memory = bags.memory()
-    return opened(memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when))
+    return asked_in(
+        memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when)
+    )
 
 
 def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
@@ -404,7 +406,7 @@ def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
         print_notes(notes)
 
 
-def opened(memory: Memory, window: TimeWindow) -> Asked:
+def asked_in(memory: Memory, window: TimeWindow) -> Asked:
     """Returns what is asked for, as far as the memory spans it.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
@@ -281,6 +281,10 @@ class Call:
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""
         return self.rows_in is None or self.rows_in.contains(row_end)
+
+    def within(self, budget_s: float) -> Call:
+        """Returns the same call with no more than `budget_s` seconds left."""
+        return replace(self, deadline=self.deadline.within(budget_s))
 
     def partial_after(self, budget_s: float) -> Deadline:
         """Returns when an answer is given with what was read until then, `budget_s` from now.

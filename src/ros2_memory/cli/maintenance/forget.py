@@ -292,15 +292,21 @@ class _Forget:
                 else:
                     going.append(bag)
         deleted_too = {other_form(bag.file) for bag in going}
-        for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
-            reason, span = aside.reason, self._written.get(aside.path, span)  # noqa: PLW2901
-            if span is None:
-                reason = f"when it was recorded is unknown ({reason})"
-            elif aside.until is not None or not span.overlaps(window.start, window.stop - 1):
-                continue
-            if str(aside.path) not in deleted_too:
-                kept.append(f"{self._name(aside)}: {reason}")
+        kept += (
+            f"{self._name(aside)}: {reason}"
+            for aside, reason in self._unread_in(window, snapshot)
+            if str(aside.path) not in deleted_too
+        )
         return going, kept
+
+    def _unread_in(self, window: TimeWindow, snapshot: Snapshot) -> Iterator[tuple[SetAside, str]]:
+        """Yields the files that may have messages in a window and are not read, each with why."""
+        for aside, bounds in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
+            span = self._written.get(aside.path, bounds)
+            if span is None:
+                yield aside, f"when it was recorded is unknown ({aside.reason})"
+            elif aside.until is None and span.overlaps(window.start, window.stop - 1):
+                yield aside, aside.reason
 
     def _may_hold(self, aside: SetAside, snapshot: Snapshot) -> TimeWindow | None:
         """Returns what a file may hold that is being written, from the first message in it."""

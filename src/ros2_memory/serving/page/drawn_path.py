@@ -7,7 +7,6 @@ a pixel of the screen.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -64,7 +63,7 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
         NoDataError: no topic places the robot.
         QueryTimeoutError: the call's time is over before its track is known.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    view = View(memory, call.within(_QUICK_S), window.stop)
     places, tracks = robot_places(view, window), None
     if places is not None:
         tracks = TrackReader(view, places.map_frame)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -272,7 +272,7 @@ def _united_parts(
         if request.first:
             budget_s = max(whole.left_s(), 0.0) / 2
         try:
-            known = part(replace(call, deadline=call.deadline.within(budget_s)))
+            known = part(call.within(budget_s))
         except QueryTimeoutError as error:
             known = Shown({}, (f"the {name} are not known yet: {error}",))
         shown |= known.keys
@@ -372,7 +372,7 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
     Raises:
         QueryTimeoutError: it is not known within the time of a quick answer.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    view = View(memory, call.within(_QUICK_S), window.stop)
     places = robot_places(view, window)
     if places is None:
         return None
