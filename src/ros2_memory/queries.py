@@ -703,7 +703,7 @@ def _newest_at(
         if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
             stored = pose
     if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
-        newest = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
+        newest = view.stream.last(topic, window.stop)
         if newest is None:
             tolerance = None
         elif latching.holds(view.snapshot, newest):
@@ -746,7 +746,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
         for type_name in types
     ):
         return
-    newest = view.stream.newest(topic, TimeWindow.everything())
+    newest = view.stream.last(topic)
     if newest is not None:
         raise InvalidArgumentsError(describe_lack(view, what, newest))
 

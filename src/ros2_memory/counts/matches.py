@@ -234,7 +234,7 @@ def _in_scope(spans: _TrueSpans, scope: Scope) -> tuple[_TrueSpans, Ns | None]:
 
 def _has_lists(view: View, topic: str) -> bool:
     """Returns whether the newest message of a topic has a list, which may hold booleans."""
-    message = view.stream.newest(topic, TimeWindow.everything())
+    message = view.stream.last(topic)
     values = [None if message is None else view.value(message)]
     while values:
         value = values.pop()

@@ -118,7 +118,7 @@ class HeldValues:
         self._require_single_value(asked, until)
 
     def _require_single_value(self, asked: str, until: Ns) -> None:
-        newest = self._view.stream.newest(self._topic, TimeWindow(MIN_NS, until))
+        newest = self._view.stream.last(self._topic, until)
         message = None if newest is None else self._view.bags.decode(newest)
         if newest is None or message is None:
             return
@@ -329,7 +329,7 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     """Returns the message before a moment that still held then, on a latched topic."""
     if not is_latched(view, topic):
         return None
-    before = view.stream.first([topic], TimeWindow(MIN_NS, moment), newest_first=True)
+    before = view.stream.last(topic, moment)
     breaks = _breaks(view, topic)
     if before is None or any(before.time <= at < moment for at in breaks):
         return None

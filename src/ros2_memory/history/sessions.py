@@ -304,13 +304,13 @@ class Sessions:
         bags = self.bags_of(session, (topic,), window)
         if newest is not None and newest.bag in {span.bag for span in bags}:
             return newest
-        return self._view.stream.first((topic,), window, newest_first=True, among=bags)
+        return self._view.stream.newest_among(bags, topic, window)
 
     def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
         """Returns the moving transforms that a session received in a window, in log-time order."""
         stream, topics = self._view.stream, self._view.moving_topics
         bags = self.bags_of(session, topics, window)
-        merged = stream.merged(bags, topics, window, newest_first=False)
+        merged = stream.merged(bags, topics, window)
         tracked = self._view.bags.track_sources(merged)
         of_session = (stored for stored in tracked if self.has(session, stored))
         return [*decoded_transforms(self._view, of_session)]

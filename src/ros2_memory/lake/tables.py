@@ -300,26 +300,6 @@ def packed_messages(
     return compressed(b"".join(parts))
 
 
-@dataclass
-class _PlaneReader:
-    """Reads columns of `count` numbers, as of `byte_planes`, one after the other from `at` on."""
-
-    content: bytes
-    at: int
-    count: int
-
-    def numbers(self, width: int) -> IntArray:
-        """Returns the next column, whose numbers have so many bytes."""
-        column = from_planes(self.content, self.at, self.count, width)
-        self.at += width * self.count
-        return np.asarray(column, np.int64)
-
-    @property
-    def rest(self) -> bytes:
-        """What follows."""
-        return self.content[self.at :]
-
-
 def unpacked_messages(data: bytes, channel: Channel) -> Batch:
     """Returns the messages that were packed so; all payloads are empty where none were packed.
 
@@ -335,13 +315,19 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
         raise ValueError(
             f"messages are packed in format {form}; this program reads {_PLAIN}, {_PLACED}"
         )
-    planes = _PlaneReader(content, _HEAD.size, count)
-    logged = np.cumsum(planes.numbers(8))
-    published = logged + planes.numbers(8)
-    places = np.cumsum(planes.numbers(8)) if form == _PLACED else np.arange(count)
+    at = _HEAD.size
+
+    def column(width: int) -> IntArray:
+        nonlocal at
+        at += width * count
+        return np.asarray(from_planes(content, at - width * count, count, width), np.int64)
+
+    logged = np.cumsum(column(8))
+    published = logged + column(8)
+    places = np.cumsum(column(8)) if form == _PLACED else np.arange(count)
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
-        sizes, payloads = planes.numbers(4), planes.rest
+        sizes, payloads = column(4), content[at:]
         if len(payloads) != sizes.sum():
             raise ValueError("packed messages are cut short")
         if count and (sizes == sizes[0]).all():

@@ -108,9 +108,7 @@ def visits(
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
         frame_id=placement.frame_id,
-        x=None if circle is None else circle.x,
-        y=None if circle is None else circle.y,
-        radius_m=None if circle is None else circle.radius_m,
+        circle=circle,
         visits=shown,
         more=len(all_visits) > len(shown),
         total=len(all_visits),
@@ -141,11 +139,6 @@ def _visits_of_places(
     note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
     return Visits(
         frame_id=placement.frame_id,
-        x=None,
-        y=None,
-        radius_m=None,
-        visits=(),
-        more=False,
         total=sum(row.entries for row in places),
         now=now,
         places=places,
@@ -211,7 +204,7 @@ def _newest_pose_time(
     view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns
 ) -> Ns | None:
     """Returns the time of the newest pose until `last`, where the window reaches as far."""
-    message = view.stream.newest(topic, TimeWindow(MIN_NS, last + 1))
+    message = view.stream.last(topic, last + 1)
     if message is None or window.stop <= message.time:
         return None
     times = track.times[track.times <= last]

@@ -267,7 +267,7 @@ def _binned(times: NDArray[np.int64], window: TimeWindow) -> NDArray[np.int64]:
 
 def _numbers(view: View, topic: str) -> list[str]:
     """Returns the fields of a topic's newest message that are numbers, as dot-paths."""
-    newest = view.stream.newest(topic, TimeWindow.everything())
+    newest = view.stream.last(topic)
     if newest is None or len(newest.record.payload) > _LARGEST_BYTES:
         return []
     message = view.bags.decode(newest)
