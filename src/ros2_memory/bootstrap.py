@@ -612,7 +612,7 @@ def build_backfill(settings: Settings, memory: Memory, *, are_files: bool = True
             delete_catalogues(settings)
     except BagError as error:
         log.warning("old_catalogue_not_deleted", path=error.path, reason=error.reason)
-    scanner, store = memory.columns, settings.store
+    scanner, store = memory.scanner, settings.store
     if scanner.store is None:
         return Backfill(memory, None)
     return Backfill(

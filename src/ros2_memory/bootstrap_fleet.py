@@ -158,7 +158,7 @@ def build_fleet(settings: Settings) -> Fleet | None:
     robots = [_build_robot(settings, name, shared, lake) for name in settings.fleet.robots]
     join = None if lake is None else partial(_robots_of, lake, settings, shared)
     fleet = Fleet(robots, WallClock(), shared_map=settings.fleet.shared_map, join=join)
-    fleet.joined()
+    fleet.add_shipped()
     if lake is not None and not lake.days("bags"):
         log.warning(
             "lake_empty",

@@ -579,9 +579,11 @@ class PlacesFile:
 class KeepRule:
     """When what was recorded is kept as a moment, and how much of it.
 
-    `topic`, `condition_type`, `value`, `field` and `min_score` as in `find_matches`; `for_s` is how
-    long the condition, or a silence, must hold. A moment has `before_s` before the match began and
-    `after_s` after the rule fired. All moments of the rule together take `max_gb` at most.
+    `kind` is checked against the rest, which shows it too: without `topic` a rule is of restarts,
+    without a condition of silences. `topic`, `condition_type`, `value`, `field` and `min_score` as
+    in `find_matches`; `for_s` is how long the condition, or a silence, must hold. A moment has
+    `before_s` before the match began and `after_s` after the rule fired. All moments of the rule
+    together take `max_gb` at most.
     """
 
     kind: Literal["message", "silent", "recorder_restart"] = "message"
@@ -716,9 +718,7 @@ def load_explained(
     return settings, sources
 
 
-def is_deployment_chosen(
-    overrides: Sequence[str] = (), env: Mapping[str, str] | None = None
-) -> bool:
+def is_deployment_chosen(overrides: Sequence[str]) -> bool:
     """Returns whether someone chose a configuration directory, or an option of a group.
 
     It composes nothing.
@@ -726,7 +726,7 @@ def is_deployment_chosen(
     Raises:
         ConfigError: a variable or an override is refused.
     """
-    given = given_variables(os.environ if env is None else env)
+    given = given_variables(os.environ)
     parsed = parse_overrides(overrides, given, config_dir(given))
     return "MEMORY_CONFIG_DIR" in given or any(override.key in GROUPS for override in parsed)
 

@@ -184,7 +184,7 @@ def parse_overrides(
     ]
     assignments += [(text, "by MEMORY_CONFIG_OVERRIDES") for text in _split_variable(given)]
     assignments += [(text, "on the command line") for text in command_line]
-    return [_parsed(text, source, options) for text, source in assignments]
+    return [_override_of(text, source, options) for text, source in assignments]
 
 
 def _split_variable(given: Mapping[str, str]) -> list[str]:
@@ -211,7 +211,7 @@ def _may_hold_secret(text: str) -> bool:
     return re.search(named, text, re.IGNORECASE) is not None
 
 
-def _parsed(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
+def _override_of(text: str, source: str, options: Mapping[str, Sequence[str]]) -> Override:
     if _names_token(text):
         raise ConfigError(
             f"a token has no place among the settings (set {source}), where others can read it; "

@@ -505,7 +505,7 @@ def data_time_range(
         view.notes.add(snapshot.dating.note)
     # Except crashes and wrong clocks.
     odd = [(bag, "; ".join(bag.summary.notes)) for bag in bags_with_remarks(snapshot)]
-    odd += memory.columns.damaged_parts(snapshot.bags)
+    odd += memory.scanner.damaged_parts(snapshot.bags)
     view.notes.add(*by_remark(odd, _MAX_ODD_BAGS))
     thinned, since = view.timeline.thinned, read_thinned(view.bag_dir).since
     if thinned and (since is None or thinned[0].start < since):
@@ -706,7 +706,7 @@ def _newest_at(
         if pose is not None and is_thinned(pose.bag.file) and _holds_until_next(view, pose):
             stored = pose
     if stored is None and tolerance_s is None and latching.may_hold(view.snapshot, topic):
-        newest = view.stream.newest(topic, TimeWindow(MIN_NS, window.stop))
+        newest = view.stream.last(topic, window.stop)
         if newest is None:
             tolerance = None
         elif latching.holds(view.snapshot, newest):
@@ -749,7 +749,7 @@ def _require_kind(view: View, topic: str, what: str, *or_else: str) -> None:
         for type_name in types
     ):
         return
-    newest = view.stream.newest(topic, TimeWindow.everything())
+    newest = view.stream.last(topic)
     if newest is not None:
         raise InvalidArgumentsError(describe_lack(view, what, newest))
 

@@ -324,16 +324,16 @@ async def keep_fleet_fresh(fleet: Fleet, every_s: float, lake_s: float = _LAKE_L
                 return
             await anyio.sleep(lake_s)
             robots = await anyio.to_thread.run_sync(
-                partial(_joined_logged, fleet), abandon_on_cancel=True, limiter=limiter
+                partial(_add_shipped_logged, fleet), abandon_on_cancel=True, limiter=limiter
             )
 
 
-def _joined_logged(fleet: Fleet) -> Sequence[Robot]:
-    """Returns the robots that have joined, and logs what keeps the lake from being looked at."""
+def _add_shipped_logged(fleet: Fleet) -> Sequence[Robot]:
+    """Adds robots that were shipped; logs what keeps the lake from being looked at."""
     from ros2_memory.core.errors import EpisodicError
 
     try:
-        robots = fleet.joined()
+        robots = fleet.add_shipped()
     except EpisodicError as error:
         log.warning("lake_not_looked_at", reason=str(error))
         return ()

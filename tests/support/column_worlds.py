@@ -60,9 +60,9 @@ class World:
         memory = memory_of(bag_dir, clock=clock, reader=reader)
         paths = [file or store_file(bag_dir)]
         store = ColumnStore(paths, reader.definition, definitions=definitions)
-        memory = replace(memory, columns=Scanner(store, bag_dir))
-        assert memory.columns is not None
-        filling = Filling(memory.columns, reader, bag_dir, memory.clock, limits or StoreLimits())
+        memory = replace(memory, scanner=Scanner(store, bag_dir))
+        assert memory.scanner is not None
+        filling = Filling(memory.scanner, reader, bag_dir, memory.clock, limits or StoreLimits())
         return cls(bag_dir, memory, filling)
 
     @property
@@ -103,7 +103,7 @@ class World:
     def unstored(self) -> World:
         """The same world without a store: everything is read from bags."""
         columns = Scanner(None, self.bag_dir)
-        return replace(self, memory=replace(self.memory, columns=columns))
+        return replace(self, memory=replace(self.memory, scanner=columns))
 
     def topics(self) -> list[str]:
         timeline = self.memory.index.snapshot().timeline

@@ -170,7 +170,7 @@ def lake_robot(folder: Path, engine: LakeEngine, **how: Any) -> Memory:
 def store_columns(memory: Memory) -> Filling:
     """Fills the store of a lake's robot, as a server does; returns what filled it."""
     bag_dir, limits = memory.index.bag_dir, StoreLimits(max_share=1.0)
-    filling = Filling(memory.columns, memory.reader, bag_dir, memory.clock, limits, are_files=False)
+    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits, are_files=False)
     timeline = memory.index.snapshot().timeline
     for batch in filling.batches(timeline):
         assert filling.fill(batch, timeline) == len(batch.bags)

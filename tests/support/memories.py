@@ -89,7 +89,7 @@ def memory_of(
     )
     settings = limits or QuerySettings()
     columns = Scanner(None, bag_dir)
-    memory = Memory(index, reader, extractor(), timed, settings, columns=columns)
+    memory = Memory(index, reader, extractor(), timed, settings, scanner=columns)
     return with_store(memory, bag_dir) if recalls else memory
 
 
@@ -99,7 +99,7 @@ each_way = pytest.mark.parametrize("recalls", [False, True], ids=["plain", "cata
 
 def with_store(memory: Memory, bag_dir: Path, *, part: float = 1.0, share: float = 1.0) -> Memory:
     """The memory with a store of columns of the first `part` of the closed bags."""
-    return replace(memory, columns=stored_columns(memory, bag_dir, part=part, share=share))
+    return replace(memory, scanner=stored_columns(memory, bag_dir, part=part, share=share))
 
 
 def stored_columns(
@@ -124,7 +124,7 @@ def stored_columns(
     for batch in filling.batches(timeline):
         if not {*batch.bags} & {*left_out}:
             filling.fill(batch, timeline)
-    make_fragments(replace(memory, columns=scanner), filling.whole_since())
+    make_fragments(replace(memory, scanner=scanner), filling.whole_since())
     filling.thin()
     return scanner
 

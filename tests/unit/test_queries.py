@@ -143,7 +143,7 @@ def test_the_clock_is_read_once_for_each_call(tmp_path: Path) -> None:
         memory.extractor,
         Counting(T0 + 9 * S),
         memory.limits,
-        memory.columns,
+        memory.scanner,
     )
     answer = queries.find_last_match(counted, Call(), "/odom", "near_position", {"x": 0, "y": 0})
     assert answer.found is not None

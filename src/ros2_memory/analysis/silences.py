@@ -130,6 +130,12 @@ def usual_period(presence: Presence) -> Ns | None:
     return period if 2 * presence.messages * period >= presence.length else None
 
 
+def usual_periods(presences: Mapping[str, Presence]) -> dict[str, Ns]:
+    """Returns the usual period of each topic that has one."""
+    periods = ((topic, usual_period(presence)) for topic, presence in presences.items())
+    return {topic: period for topic, period in periods if period is not None}
+
+
 def silences(
     presences: Mapping[str, Presence],
     together: Iterable[Iterable[str]],
@@ -142,24 +148,21 @@ def silences(
         together: the topics of each bag; of bags with the same topics once is enough.
         gaps: when nothing was recorded, in order: also pauses of less than `SHORTEST_NS`.
     """
-    periods = {
-        topic: period
-        for topic, presence in presences.items()
-        if (period := usual_period(presence)) is not None
-    }
+    periods = usual_periods(presences)
     companions: dict[str, set[str]] = {}
     for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
             companions.setdefault(topic, set()).update(names)
-    on: dict[frozenset[str], list[Span]] = {}
+    robot_on: dict[frozenset[str], list[Span]] = {}
     reported: list[Silence] = []
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
-        if others not in on:
-            on[others] = _heard([presences[other].runs for other in sorted(others)])
+        if others not in robot_on:
+            robot_on[others] = _heard([presences[other].runs for other in sorted(others)])
         limit = shortest_silence(period)
         runs = united(presences[topic].runs, limit)
-        reported += _without_habit([*_silences_of(topic, runs, on[others], limit, gaps)], runs)
+        found = _silences_of(topic, runs, robot_on[others], limit, gaps)
+        reported += _without_habit([*found], runs)
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))
 
 
@@ -181,19 +184,19 @@ def _heard(topics: Sequence[Sequence[Span]]) -> list[Span]:
 
 
 def _silences_of(
-    topic: str, runs: Sequence[Span], on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
+    topic: str, runs: Sequence[Span], robot_on: Sequence[Span], limit: Ns, gaps: Sequence[Span]
 ) -> Iterator[Silence]:
     """Yields where a topic is absent for longer than a limit while the robot is on."""
     _, last_heard = runs[-1]
-    end = max(last_heard, on[-1][1] if on else last_heard)
+    end = max(last_heard, robot_on[-1][1] if robot_on else last_heard)
     nexts = [first for first, _ in runs[1:]]
     past = 0
     for (_, start), stop in zip(runs, [*nexts, end], strict=True):
-        while past < len(on) and on[past][1] <= start:
+        while past < len(robot_on) and robot_on[past][1] <= start:
             past += 1
         missed: list[Span] = []
         length, until, is_parted = 0, start, False
-        for on_from, on_to in on[past:]:
+        for on_from, on_to in robot_on[past:]:
             # What follows so long a time is another robot's, perhaps.
             is_parted = on_from - until > LONGEST_OFF_NS
             if on_from >= stop or is_parted:

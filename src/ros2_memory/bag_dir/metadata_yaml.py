@@ -197,12 +197,12 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
         for topic in summary.topics:
             counts[topic.topic, topic.type] += topic.count
     info["message_count"] = counts.total()
-    _describe_files(info, files)
-    _describe_topics(info, channels, counts, version)
+    _set_files(info, files)
+    _set_topics(info, channels, counts, version)
     return _dumped(content)
 
 
-def _describe_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
+def _set_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
     """Sets times, paths and the description of each file, in order of time."""
     paths = {bare_name(path): str(path) for path in _list(info, "relative_file_paths")}
     spans = {
@@ -225,7 +225,7 @@ def _describe_files(info: dict[object, object], files: Mapping[str, Contents]) -
     ]
 
 
-def _describe_topics(
+def _set_topics(
     info: dict[object, object],
     channels: Sequence[Channel],
     counts: Counter[tuple[str, str]],

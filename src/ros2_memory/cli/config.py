@@ -62,7 +62,9 @@ def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[st
     Raises:
         ConfigError: there is no such section or key.
     """
-    chosen = {} if named else values
+    if not named:
+        return values
+    chosen: set[str] = set()
     for name in named:
         keys = [key for key in values if f"{key}.".startswith(f"{name}.")]
         if not keys:
@@ -71,8 +73,8 @@ def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[st
                 f"{name}: there is no such section or key; the sections are {sections} "
                 "(to change a setting, write key=value)"
             )
-        chosen = {key: values[key] for key in values if key in chosen or key in keys}
-    return chosen
+        chosen.update(keys)
+    return {key: value for key, value in values.items() if key in chosen}
 
 
 def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Iterable[str]) -> None:

@@ -5,7 +5,6 @@ One function for each concern; each yields findings, and changes nothing.
 
 import getpass
 import http.client
-import json
 import os
 import shutil
 import time
@@ -39,7 +38,7 @@ from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reaso
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
 from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
-from ros2_memory.core.model import JsonValue, SetAside
+from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
@@ -61,14 +60,13 @@ from ros2_memory.recorder.process.topics import TopicSelection, load_topics
 from ros2_memory.results import Undecodable
 from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
+from ros2_memory.serving.health import read_health
 from ros2_memory.storage.base import Closing
 
 T = TypeVar("T")
 
 _RECENT_NS: Final[Ns] = 3600 * NS_PER_S
 """A topic without a message in the newest data of this length is not being recorded."""
-_HEALTH_TIMEOUT_S: Final = 5.0
-_MAX_HEALTH_BYTES: Final = 1 << 20
 _COMMANDS_OF_EXTRAS: Final = (
     ("export --parquet", "pyarrow", "parquet"),
     ("plot", "matplotlib", "plot"),
@@ -337,7 +335,7 @@ def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
 
 def check_columns(robot: Examined) -> Iterator[Finding]:
     """Checks that columns can be stored, and names topics that are beyond their share."""
-    store = robot.memory.columns.store
+    store = robot.memory.scanner.store
     if store is None:
         return
     if store.trouble is not None:
@@ -607,7 +605,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     if server.transport == "stdio":
         yield ok("server.transport=stdio: each client starts its own server")
         with suppress(OSError, http.client.HTTPException, ValueError, EpisodicError):
-            _, reply = _health(server.host, server.port)  # it may be another program
+            _, reply = read_health(server.host, server.port)  # it may be another program
             yield ok(
                 f"one that was started otherwise answers on {address}: {reply['status']}",
                 "to examine it, give this command its settings, such as deployment=robot",
@@ -616,7 +614,9 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     start = time.monotonic()
     try:
         token = api_token(os.environ)
-        status, reply = _health(server.host, server.port, token.get_secret_value() if token else "")
+        status, reply = read_health(
+            server.host, server.port, token.get_secret_value() if token else ""
+        )
     except (OSError, http.client.HTTPException) as problem:
         do = "start it: ros2-memory-server, or systemctl start ros2-memory-server"
         yield error(f"nothing answers on {address}: {problem}", do)
@@ -636,31 +636,6 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
         seen = f"{reply.get('status', f'HTTP {status}')}: {why or 'it gives no reason'}"
         yield warning(seen, "the findings above and its log have the cause")
-
-
-def _health(host: str, port: int, token: str = "") -> tuple[int, dict[str, JsonValue]]:
-    """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
-
-    Linux connects to the loopback address where `host` is that of all interfaces.
-
-    Raises:
-        OSError: nothing answers.
-        HTTPException: the reply is not HTTP.
-        ValueError: the reply is not a JSON object with a status.
-    """
-    headers = {"Authorization": f"Bearer {token}"} if token else {}
-    connection = http.client.HTTPConnection(host, port, timeout=_HEALTH_TIMEOUT_S)
-    try:
-        connection.request("GET", "/health", headers=headers)
-        response = connection.getresponse()
-        if response.status == http.HTTPStatus.UNAUTHORIZED and token:
-            return response.status, {}
-        reply: JsonValue = json.loads(response.read(_MAX_HEALTH_BYTES))
-    finally:
-        connection.close()
-    if not isinstance(reply, dict) or "status" not in reply:
-        raise ValueError("it gives no status")
-    return response.status, reply
 
 
 _OF_BAGS: Final = {

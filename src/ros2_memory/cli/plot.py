@@ -55,7 +55,7 @@ from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.places.local_map import east_north, fixes_in, local_frame
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.queries import trajectory_summary
 from ros2_memory.results import Event, Recap
 
@@ -393,7 +393,9 @@ def _checked_request(out: Path, bags: Bags, when: Times | str | None) -> Asked:
         kinds = ", ".join(FORMATS)
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
     memory = bags.memory()
-    return opened(memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when))
+    return asked_in(
+        memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when)
+    )
 
 
 def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
@@ -404,7 +406,7 @@ def _finish(out: Path, notes: Sequence[str], *, as_json: bool) -> None:
         print_notes(notes)
 
 
-def opened(memory: Memory, window: TimeWindow) -> Asked:
+def asked_in(memory: Memory, window: TimeWindow) -> Asked:
     """Returns what is asked for, as far as the memory spans it.
 
     Raises:
@@ -473,7 +475,7 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
         # Waypoints leave out what is within 5 cm of a line: a curve would have corners.
         limits = replace(asked.view.limits, pose_topic=summary.topic)
         view = View(replace(asked.view.memory, limits=limits), Call())
-        poses = RobotTracks(view, summary.frame_id).poses(asked.window)
+        poses = TrackReader(view, summary.frame_id).poses(asked.window)
         placed = np.isfinite(poses.x) & np.isfinite(poses.y)
         times, xs, ys = poses.times[placed], poses.x[placed], poses.y[placed]
     if not len(times):

@@ -255,7 +255,7 @@ def _answer(settings: Settings, memory: Memory, words: Sequence[str]) -> JsonVal
     Raises:
         InvalidArgumentsError: the tool refuses the question, or cannot answer it in time.
     """
-    memory = replace(memory, columns=Scanner(None, memory.index.bag_dir))
+    memory = replace(memory, scanner=Scanner(None, memory.index.bag_dir))
     dispatcher = build_dispatcher(settings, memory)
     tool, *given = words
     tools = {tool.name: tool for tool in dispatcher.tools}

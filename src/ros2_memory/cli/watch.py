@@ -141,7 +141,7 @@ def watch(
     screen = Live(console=console, auto_refresh=False) if is_screen else nullcontext()
     with suppress(KeyboardInterrupt), screen as live:
         for number in itertools.count(1):
-            seen = _observed(memory)
+            seen = _observe(memory)
             if as_json:
                 print_json(_as_object(seen))
             elif live is not None:
@@ -154,7 +154,7 @@ def watch(
             memory.index.refresh()
 
 
-def _observed(memory: Memory) -> Observation:
+def _observe(memory: Memory) -> Observation:
     """Returns the current state.
 
     Where `data.now=latest`, as in a simulation, the age of the newest data says nothing on whether

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
-from ros2_memory.analysis.motion.robot_track import TrackPart, united_parts
+from ros2_memory.analysis.motion.robot_track import PartialTrack, end_to_end
 from ros2_memory.analysis.motion.standstills import Blocks, SpeedDrop, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import FrameCodes, Poses
@@ -37,11 +37,11 @@ def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
     return [] if whole is None else [whole]
 
 
-def _joined_tracks(parts: Sequence[TrackPart]) -> Sequence[TrackPart]:
-    by_recording: dict[str, list[TrackPart]] = {}
+def _joined_tracks(parts: Sequence[PartialTrack]) -> Sequence[PartialTrack]:
+    by_recording: dict[str, list[PartialTrack]] = {}
     for part in parts:
         by_recording.setdefault(part.recording, []).append(part)
-    return [*map(united_parts, by_recording.values())]
+    return [*map(end_to_end, by_recording.values())]
 
 
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
@@ -53,5 +53,5 @@ EVENTS: Final = FragmentKind(
     "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
 )
 """What came into view, changed or failed on a topic in a part."""
-TRACKS: Final = FragmentKind("track", (TrackPart,), _joined_tracks)
+TRACKS: Final = FragmentKind("track", (PartialTrack,), _joined_tracks)
 """Where the poses of a part have the robot in a frame; joined, those of a recording."""

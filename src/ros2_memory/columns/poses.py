@@ -254,8 +254,7 @@ def rounded(values: NDArray[np.float64], step: Step) -> NDArray[np.float64]:
     if not step.per_unit:
         return values
     with np.errstate(all="ignore"):
-        whole = np.rint(values * step.per_unit) / step.per_unit
-        return np.where(np.abs(values) < _MOST_STEPPED, whole, values)
+        return np.where(np.abs(values) < _MOST_STEPPED, step.nearest(values), values)
 
 
 def _read(rows: _RoundedRows, columns: _Columns, times: IntArray) -> Poses:

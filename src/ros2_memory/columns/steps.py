@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from ros2_memory.columns.plan import fields_at
 from ros2_memory.storage.base import Definition
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 MOST_RELATIVE: Final = 1e-6
 
@@ -29,6 +34,10 @@ class Step:
         if self.per_unit:
             return f"1/{self.per_unit}"
         return "relative" if self.relative else "exact"
+
+    def nearest(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Returns the nearest multiples of an absolute step."""
+        return np.rint(values * self.per_unit) / self.per_unit
 
     @classmethod
     def parse(cls, text: str) -> Step:

@@ -166,5 +166,4 @@ def _coded_pairs(transforms: Elements) -> tuple[list[Pair], IntArray]:
 
 def _rounded_rows(transforms: Elements, paths: tuple[str, ...], step: Step) -> Floats:
     columns = [np.asarray(transforms.columns[path], np.float64) for path in paths]
-    rounded: Floats = np.rint(np.stack(columns, axis=1) * step.per_unit) / step.per_unit
-    return rounded
+    return step.nearest(np.stack(columns, axis=1))

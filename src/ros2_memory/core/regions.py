@@ -30,7 +30,7 @@ class Steps(NamedTuple):
     to_y: Floats
 
 
-class Parts(NamedTuple):
+class ClippedSteps(NamedTuple):
     """Parts of steps: which step, and from which share of it to which (0 to 1)."""
 
     step: NDArray[np.intp]
@@ -56,7 +56,7 @@ class Circle:
         x, y, radius = self.x, self.y, self.radius_m
         return x - radius, x + radius, y - radius, y + radius
 
-    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+    def shares_inside(self, steps: Steps) -> tuple[Floats, Floats]:
         """Returns from and to which share each step is inside; reversed where it never is."""
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
         px, py = steps.x - self.x, steps.y - self.y
@@ -92,7 +92,7 @@ class Rectangle:
         """The least and greatest x, and the least and greatest y."""
         return self.min_x, self.max_x, self.min_y, self.max_y
 
-    def parts(self, steps: Steps) -> tuple[Floats, Floats]:
+    def shares_inside(self, steps: Steps) -> tuple[Floats, Floats]:
         """Returns from and to which share each step is inside; reversed where it never is."""
         start, stop = np.zeros(len(steps.x)), np.ones(len(steps.x))
         for at, to, low, high in (
@@ -125,7 +125,7 @@ class Polygon:
         xs, ys = zip(*self.corners, strict=True)
         return min(xs), max(xs), min(ys), max(ys)
 
-    def crossings(self, steps: Steps) -> Parts:
+    def clipped(self, steps: Steps) -> ClippedSteps:
         """Returns the parts of steps inside: between the crossings of the polygon's sides."""
         cuts = self._cuts(steps)
         dx, dy = steps.to_x - steps.x, steps.to_y - steps.y
@@ -137,7 +137,9 @@ class Polygon:
         inside[:, still] = False
         inside[0, still] = _inside(self.corners, steps.x[still], steps.y[still])
         step, part = np.nonzero(inside.T)
-        return Parts(step, cuts[part, step], np.where(still[step], 1.0, cuts[part + 1, step]))
+        return ClippedSteps(
+            step, cuts[part, step], np.where(still[step], 1.0, cuts[part + 1, step])
+        )
 
     def _cuts(self, steps: Steps) -> Floats:
         """Returns the shares at which each step (a column) meets a side, ascending, with 0 and 1.
@@ -174,19 +176,19 @@ class AnyOf:
         low_x, high_x, low_y, high_y = zip(*(region.bounds for region in self.regions), strict=True)
         return min(low_x), max(high_x), min(low_y), max(high_y)
 
-    def crossings(self, steps: Steps) -> Parts:
+    def clipped(self, steps: Steps) -> ClippedSteps:
         """Returns the parts of steps inside; what lies in two regions is one part."""
-        parts = [parts_inside(region, steps) for region in self.regions]
+        parts = [clipped(region, steps) for region in self.regions]
         step, start, stop = (np.concatenate(columns) for columns in zip(*parts, strict=True))
         if not len(step):
-            return Parts(step, start, stop)
+            return ClippedSteps(step, start, stop)
         order = np.lexsort((start, step))
         step, start, stop = step[order], start[order], stop[order]
         # Steps are whole numbers: so far along the path.
         reached = np.maximum.accumulate(step + stop)
         new = (step[1:] != step[:-1]) | (step[1:] + start[1:] > reached[:-1])
         begins = np.flatnonzero(np.append([True], new))
-        return Parts(step[begins], start[begins], np.maximum.reduceat(stop, begins))
+        return ClippedSteps(step[begins], start[begins], np.maximum.reduceat(stop, begins))
 
 
 Region: TypeAlias = "Circle | Rectangle | Polygon | AnyOf"
@@ -201,7 +203,7 @@ def _inside(corners: tuple[Point, ...], x: Floats, y: Floats) -> NDArray[np.bool
     return inside
 
 
-def parts_inside(region: Region, steps: Steps) -> Parts:
+def clipped(region: Region, steps: Steps) -> ClippedSteps:
     """Returns the parts of steps that are inside of a region, in order."""
     low_x, high_x, low_y, high_y = region.bounds
     near = np.flatnonzero(
@@ -212,12 +214,12 @@ def parts_inside(region: Region, steps: Steps) -> Parts:
     )
     nearby = Steps(*(column[near] for column in steps))
     if isinstance(region, Polygon | AnyOf):
-        parts = region.crossings(nearby)
-        return Parts(near[parts.step], parts.start, parts.stop)
-    start, stop = region.parts(nearby)
+        parts = region.clipped(nearby)
+        return ClippedSteps(near[parts.step], parts.start, parts.stop)
+    start, stop = region.shares_inside(nearby)
     start, stop = np.maximum(start, 0.0), np.minimum(stop, 1.0)
     meets = start <= stop
-    return Parts(near[meets], start[meets], stop[meets])
+    return ClippedSteps(near[meets], start[meets], stop[meets])
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ from ros2_memory.history.coverage import (
 )
 from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import no_data_between
-from ros2_memory.places.pose_frames import joined_in, map_placement, placed_times, places_in
+from ros2_memory.places.pose_frames import known_track, map_placement, placed_times, places_in
 from ros2_memory.places.where import Where, places_setting
 from ros2_memory.results import BinColumn, Bins, Usual
 
@@ -250,7 +250,7 @@ def place_bins(
         united((visit.start, visit.stop + 1) for visit in joined.inside(place.region, window))
         for place, joined in places
     ]
-    placed_spans = placed_times(joined_in(view, placement.frame_id, counted).track, [])
+    placed_spans = placed_times(known_track(view, placement.frame_id, counted).track, [])
     edges = _edges_at_spans(window, [*spans_inside, placed_spans])
     in_places = np.array([_lies_in_spans(edges, spans) for spans in spans_inside]).T
     if (np.diff(edges)[in_places.sum(axis=1) > 1] > NS_PER_S).any():

@@ -186,21 +186,31 @@ def _held_by_events(
 
     None where the condition is on neither.
     """
-    view, topic = binned.view, topics[0]
-    types = {name for topic in topics for name in view.timeline.types_of(topic)}
+    types = {name for topic in topics for name in binned.view.timeline.types_of(topic)}
+    wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if not any(map(has_events, types)):
         return None, None
-    wanted = value if isinstance(value, bool) else _TRUTHS.get(str(value).strip().casefold())
     if wanted is None:
-        if condition.field is not None or not isinstance(value, str) or any(map(has_errors, types)):
-            return None, None
-        return _label_held(binned, topics, condition, scope)
-    # What texts say of a topic that had them before is no event, nor are booleans in lists.
-    if len(types) > 1 or len(topics) > 1 or (not condition.field and _has_lists(view, topic)):
+        may_be_label = isinstance(value, str) and condition.field is None
+        if may_be_label and not any(map(has_errors, types)):
+            return _label_held(binned, topics, condition, scope)
+        return None, None
+    # What texts say of a topic that had them before is no event.
+    if len(types) > 1 or len(topics) > 1:
+        return None, None
+    return _boolean_held(binned, topics[0], condition, scope, wanted=wanted)
+
+
+def _boolean_held(
+    binned: BinnedWindow, topic: str, condition: Condition, scope: Scope, *, wanted: bool
+) -> tuple[_TrueSpans | None, Ns | None]:
+    """Returns when a boolean of a topic held; None where it is not clear which one is meant."""
+    view = binned.view
+    if not condition.field and _has_lists(view, topic):  # booleans in them are no events
         return None, None
     parts, since = _events_in_order(view, topic, binned.counted)
     before = _met_before(binned, topic, condition) if since is None else None
-    spans = _flag_held(binned, topic, parts, condition, before, wanted=wanted)
+    spans = _flag_spans(binned, topic, parts, condition, before, wanted=wanted)
     if spans is None:
         return None, None
     _note_uncounted(view, topic, parts)
@@ -224,7 +234,7 @@ def _in_scope(spans: _TrueSpans, scope: Scope) -> tuple[_TrueSpans, Ns | None]:
 
 def _has_lists(view: View, topic: str) -> bool:
     """Returns whether the newest message of a topic has a list, which may hold booleans."""
-    message = view.stream.newest(topic, TimeWindow.everything())
+    message = view.stream.last(topic)
     values = [None if message is None else view.value(message)]
     while values:
         value = values.pop()
@@ -305,7 +315,7 @@ def _label_held(
     return [(first, last, True) for first, last in united_spans(of_any, FLICKER_NS)], since
 
 
-def _flag_held(
+def _flag_spans(
     binned: BinnedWindow,
     topic: str,
     parts: Sequence[TopicEvents],

@@ -21,14 +21,14 @@ from ros2_memory.history.view import TimeRange, clamped, open_span, open_view, s
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
-    joined_in,
+    known_track,
     map_placement,
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Inside, robot_inside
-from ros2_memory.places.visits import RegionVisits, asked_place
-from ros2_memory.places.where import joined_in_region, note_other_frame, parse_where
+from ros2_memory.places.robot_tracks import Stay, stays_within
+from ros2_memory.places.visits import ConfirmedStays, asked_place
+from ros2_memory.places.where import known_track_for, note_other_frame, parse_where
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -74,8 +74,8 @@ def count_path(
     total_m = path.totals.distance_m
     edges = binned.bins.edges[1:-1]
     if place_asked is not None and by != "place":
-        track = joined_in_region(view, place_asked, binned.counted).track
-        inside = robot_inside(track, place_asked.region, binned.counted)
+        track = known_track_for(view, place_asked, binned.counted).track
+        inside = stays_within(track, place_asked.region, binned.counted)
         total_m = totals_inside(path.line, inside).distance_m
         metres_before = _metres_before(path.line, inside, edges)
     else:
@@ -87,7 +87,7 @@ def count_path(
     return binned.answer()
 
 
-def _metres_before(line: Line, inside: Sequence[Inside], edges: Ints) -> NDArray[np.float64]:
+def _metres_before(line: Line, inside: Sequence[Stay], edges: Ints) -> NDArray[np.float64]:
     """Returns how many metres were driven in some times before each edge."""
     metres = np.zeros(len(edges))
     for stay in inside:
@@ -141,7 +141,7 @@ def count_visits(
     binned = BinnedWindow(view, asked, by, (topic,), place)
     # All that asks about this window shares its track, and what there was time to know of it.
     window = binned.counted
-    joined = joined_in(view, placement.frame_id, window)
+    joined = known_track(view, placement.frame_id, window)
     binned.count_since(joined.since)
     placed_spans = placed_times(joined.track, mixed_spans)
     binned.add_lengths("placed_s", "duration", placed_spans)
@@ -170,12 +170,12 @@ def count_visits(
     return binned.answer()
 
 
-def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Inside]:
+def _stays(view: View, frame_id: str, region: Region, window: TimeWindow) -> list[Stay]:
     """Returns when robots were in a region, as `visits` counts them, in order."""
-    return sorted(visit.inside for visit in RegionVisits(view, frame_id, region, window).every)
+    return sorted(visit.inside for visit in ConfirmedStays(view, frame_id, region, window).every)
 
 
-def _add_visits(binned: BinnedWindow, stays: Sequence[Inside]) -> None:
+def _add_visits(binned: BinnedWindow, stays: Sequence[Stay]) -> None:
     """Adds the visits to one place."""
     entries = _entry_times(stays)
     exits = np.array([stay.stop for stay in stays if stay.left], np.int64)
@@ -188,7 +188,7 @@ def _add_visits(binned: BinnedWindow, stays: Sequence[Inside]) -> None:
     binned.usual_exit = binned.usual_of(exits)
 
 
-def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Inside]]) -> None:
+def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequence[Stay]]) -> None:
     """Adds the visits to each named place in the bin of that place."""
     rest: list[None] = [None] * (len(binned.bins.names) - len(stays_of_places))
     entries = [sum(stay.entered for stay in stays) for stays in stays_of_places]
@@ -200,9 +200,9 @@ def _add_visits_by_place(binned: BinnedWindow, stays_of_places: Sequence[Sequenc
     binned.add("minutes", "minutes", [*lengths, *rest], sum(lengths))
 
 
-def _entry_times(stays: Sequence[Inside]) -> Ints:
+def _entry_times(stays: Sequence[Stay]) -> Ints:
     return np.array([stay.start for stay in stays if stay.entered], np.int64)
 
 
-def _stay_spans(stays: Sequence[Inside]) -> list[tuple[int, int]]:
+def _stay_spans(stays: Sequence[Stay]) -> list[tuple[int, int]]:
     return [(stay.start, stay.stop) for stay in stays]

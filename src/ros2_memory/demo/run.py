@@ -32,6 +32,7 @@ from ros2_memory.demo.questions import QUESTIONS, CallContext, Exchange, Questio
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S, ROOMS
 from ros2_memory.recorder.process.child import LAUNCHER
+from ros2_memory.serving.health import read_health
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -120,7 +121,6 @@ _UP_WITHIN_S: Final = 300.0
 _SAID_AFTER_S: Final = 5.0
 _DOWN_WITHIN_S: Final = 5.0
 _LOG_LINES_SHOWN: Final = 8
-_LONGEST_REPORT: Final = 1_000_000
 _ANOTHER_PORT: Final = "choose another with --port, or --port 0 for any"
 
 
@@ -236,17 +236,14 @@ def _answering(port: int) -> int | None:
 
     Returns None if no server answers.
     """
-    connection = http.client.HTTPConnection(HOST, port, timeout=2.0)
     try:
-        connection.request("GET", "/health")
-        report = json.loads(connection.getresponse().read(_LONGEST_REPORT))
-        return int(report["pid"])
+        _, report = read_health(HOST, port)
     except (OSError, http.client.HTTPException):
         return None
-    except (ValueError, KeyError, TypeError):
+    except ValueError:
         return 0
-    finally:
-        connection.close()
+    pid = report.get("pid")
+    return pid if isinstance(pid, int) else 0
 
 
 SPLIT_DURATION_S: Final = 5.0

@@ -225,8 +225,8 @@ class Fleet:
         self.clock, self.shared_map, self.join = clock, shared_map, join
         self._lock = threading.Lock()
 
-    def joined(self) -> Sequence[Robot]:
-        """Returns the robots that were shipped to the lake for the first time since; adds them.
+    def add_shipped(self) -> Sequence[Robot]:
+        """Adds the robots that were shipped to the lake for the first time since; returns them.
 
         Raises:
             EpisodicError: the lake cannot be read.
@@ -254,7 +254,7 @@ class Fleet:
         """
         name = name.strip() if isinstance(name, str) else name
         if isinstance(name, str) and name not in self.robots and call.robots is None:
-            self.joined()
+            self.add_shipped()
         allowed = self.allowed(call)
         for robot in allowed:
             if robot.name == name:
@@ -295,7 +295,7 @@ class FanOut:
 
         def ask_one(robot: Robot) -> tuple[T | EpisodicError, Call]:
             own_s = min(limit_s, begun_s + left_s * _OF_ALL - time.monotonic())
-            own = replace(call, deadline=call.deadline.within(own_s), stages=Stages())
+            own = replace(call.within(own_s), stages=Stages())
             own.used_active = own.used_thinned = False
             if refused := self._refused(robot, call, own_s):
                 return refused, own

@@ -139,7 +139,7 @@ def fleet_tools(
     """
     fan_out = FanOut(at_once)
 
-    def asking(tool: Tool, given: Mapping[str, object]) -> Question:
+    def question_of(tool: Tool, given: Mapping[str, object]) -> Question:
         own = {name: value for name, value in given.items() if name != ROBOT}
         asked = _FleetQuestion(tool, fleet, fan_out, max_chars, tool.question(own), own)
         return lambda _, call: asked.ask(given.get(ROBOT), call)
@@ -150,7 +150,7 @@ def fleet_tools(
             describe=partial(_described, tool),
             # One robot that is slow must not keep a quick tool's thread.
             blocking=tool.blocking or tool.name in ANSWER_FOR_ALL | TABLE_FOR_ALL,
-            question=partial(asking, tool),
+            question=partial(question_of, tool),
         )
         for tool in tools
         if not tool.writes

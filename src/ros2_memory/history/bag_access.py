@@ -80,7 +80,7 @@ class BagAccess:
         Others are read for every question, which takes long where there are many. Empty where that
         is less than 1 % of them: then it is not the cause.
         """
-        coverage = self.memory.columns.coverage(self.snapshot.timeline)
+        coverage = self.memory.scanner.coverage(self.snapshot.timeline)
         if coverage is None:
             return ""
         bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.timeline.bags)
@@ -139,7 +139,7 @@ class BagAccess:
 
     def _note_unreadable(self, bag: BagFile, error: BagError, window: TimeWindow) -> None:
         """Notes that a bag, or a part of it, is not in the answer; unless it is of no such time."""
-        self.memory.columns.met_damage(bag, error)
+        self.memory.scanner.met_damage(bag, error)
         is_whole = isinstance(error, BagContradictionError)
         first, until = (bag.start, bag.end) if is_whole or error.lost is None else error.lost
         if not window.overlaps(first, until):
@@ -221,7 +221,7 @@ class BagAccess:
         """
         self.check_deadline()
         part = _indexed_part(bag, TimeWindow.everything() if around else window)
-        remembered = self.memory.columns.caches.decoded
+        remembered = self.memory.scanner.caches.decoded
         key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         remembered_tables = remembered.get(key) if is_lasting else None

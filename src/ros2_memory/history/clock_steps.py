@@ -193,7 +193,7 @@ def _steps_of_pause(view: View, pause: Pause) -> tuple[ClockStep, ...]:
     bags = view.timeline.overlapping(around)
     topic = view.pose_topic if view.pose_topic in view.timeline.topics() else None
     key = (topic, pause.start, pause.end, *[bag.identity for bag in bags])
-    remembered = view.memory.columns.caches.clock_steps
+    remembered = view.memory.scanner.caches.clock_steps
     steps = remembered.get(key)
     if steps is None:
         with view.notes.isolated():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from contextlib import AbstractContextManager, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, Protocol, TypeAlias
 
@@ -116,7 +116,7 @@ class SnapshotSource(Protocol):
 class Memory:
     """The robot's recorded past: an index of bags, what reads and decodes them, and a clock.
 
-    `columns` scans topics, from its store where that has the bags; every answer is the same without
+    `scanner` scans topics, from its store where that has the bags; every answer is the same without
     the store. `large` is the turn to hold much of a bag, which the reader takes. `memo` has what
     was found out about the bags and stays true.
     """
@@ -126,7 +126,7 @@ class Memory:
     extractor: SchemaExtractor
     clock: Clock
     limits: QuerySettings
-    columns: Scanner
+    scanner: Scanner
     large: LargeReads = field(default_factory=LargeReads)
     memo: Memo = field(default_factory=Memo)
 
@@ -147,7 +147,7 @@ class Memory:
 
     def store_listings(self, snapshot: Snapshot) -> None:
         """Stores what metadata.yaml of each recording lists, for the programs that start later."""
-        store = self.columns.store
+        store = self.scanner.store
         if store is None:
             return
         self.absent_splits(snapshot)
@@ -165,7 +165,7 @@ class Memory:
 
         def stored() -> Listings:
             listings: Listings = {}
-            texts = {} if self.columns.store is None else self.columns.store.listings()
+            texts = {} if self.scanner.store is None else self.scanner.store.listings()
             for folder, text in texts.items():
                 with suppress(ValueError, TypeError, OverflowError):
                     listings[str(self.index.bag_dir / folder)] = listing_from_json(text)
@@ -281,6 +281,10 @@ class Call:
     def wants(self, row_end: Ns) -> bool:
         """Returns whether a row that ends then may not be left out."""
         return self.rows_in is None or self.rows_in.contains(row_end)
+
+    def within(self, budget_s: float) -> Call:
+        """Returns the same call with no more than `budget_s` seconds left."""
+        return replace(self, deadline=self.deadline.within(budget_s))
 
     def partial_after(self, budget_s: float) -> Deadline:
         """Returns when an answer is given with what was read until then, `budget_s` from now.

@@ -135,5 +135,5 @@ def _with_times(
         latency = log_times - stamps
         is_of_this_clock = (latency >= -AGREEMENT_NS) & (latency <= _LONGEST_LATENCY_NS)
         times = np.where(is_of_this_clock, stamps, log_times)
-    places = np.rint(detections.places * METRES.per_unit) / METRES.per_unit
+    places = METRES.nearest(detections.places)
     return Detected(log_times, times, detections._replace(places=places), frames)

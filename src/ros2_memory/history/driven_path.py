@@ -315,7 +315,7 @@ def note_left_out(view: View, error: UndecodableError) -> None:
     )
 
 
-def pose_frame(view: View, topic: str) -> str:
+def frame_of_newest_pose(view: View, topic: str) -> str:
     """Returns the frame of the newest pose that can be decoded; empty without a pose.
 
     Raises:

@@ -115,17 +115,20 @@ class HeldValues:
         self._reading = view.call.partial_after(READING_S)
         self.reached: Ns = MAX_NS
         self.known: list[Held] = []
-        newest = view.stream.newest(topic, TimeWindow(MIN_NS, until))
-        message = None if newest is None else view.bags.decode(newest)
-        if newest is not None and message is not None:
-            value = self._said(message, newest.type)
-            if isinstance(value, list | dict | None):
-                of_field = "" if field is None else f"field {field} of "
-                raise InvalidArgumentsError(
-                    f"{asked}: {of_field}{topic} ({newest.type}) is no text, number or "
-                    "boolean, which holds until the next one: ask about a topic that has one, such "
-                    "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
-                )
+        self._require_single_value(asked, until)
+
+    def _require_single_value(self, asked: str, until: Ns) -> None:
+        newest = self._view.stream.last(self._topic, until)
+        message = None if newest is None else self._view.bags.decode(newest)
+        if newest is None or message is None:
+            return
+        if isinstance(self._said(message, newest.type), list | dict | None):
+            of_field = "" if self._field is None else f"field {self._field} of "
+            raise InvalidArgumentsError(
+                f"{asked}: {of_field}{self._topic} ({newest.type}) is no text, number or "
+                "boolean, which holds until the next one: ask about a topic that has one, such "
+                "as std_msgs/msg/String, or name one of its fields where the tool takes fields"
+            )
 
     def back(self, until: Ns) -> Iterator[Held]:
         """Yields the values that were said before a moment, newest first.
@@ -326,7 +329,7 @@ def held_at(view: View, topic: str, moment: Ns) -> StoredMessage | None:
     """Returns the message before a moment that still held then, on a latched topic."""
     if not is_latched(view, topic):
         return None
-    before = view.stream.first([topic], TimeWindow(MIN_NS, moment), newest_first=True)
+    before = view.stream.last(topic, moment)
     breaks = _breaks(view, topic)
     if before is None or any(before.time <= at < moment for at in breaks):
         return None

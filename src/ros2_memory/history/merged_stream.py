@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.model import BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
-from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.duplicates import (
     BagSpan,
     Copy,
@@ -64,18 +64,15 @@ class MergedStream:
         window: TimeWindow,
         *,
         newest_first: bool = False,
-        among: Sequence[BagSpan] | None = None,
     ) -> Iterator[StoredMessage]:
         """Returns the messages of the topics in the window in log-time order, each one once.
-
-        `among` restricts the search to some bags.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        parts = self._segment_windows(topics, window) if among is None else [window]
+        parts = self._segment_windows(topics, window)
         return chain.from_iterable(
-            self._messages_in(topics, part, among, newest_first=newest_first)
+            self._messages_in(topics, part, newest_first=newest_first)
             for part in (reversed(parts) if newest_first else parts)
         )
 
@@ -85,14 +82,23 @@ class MergedStream:
         window: TimeWindow,
         *,
         newest_first: bool = False,
-        among: Sequence[BagSpan] | None = None,
     ) -> StoredMessage | None:
         """Returns what `messages` yields first."""
-        return next(self.messages(topics, window, newest_first=newest_first, among=among), None)
+        return next(self.messages(topics, window, newest_first=newest_first), None)
 
     def newest(self, topic: str, window: TimeWindow) -> StoredMessage | None:
         """Returns the newest message of the topic in the window."""
         return self.first([topic], window, newest_first=True)
+
+    def last(self, topic: str, before: Ns = MAX_NS) -> StoredMessage | None:
+        """Returns the newest message of the topic before a log time."""
+        return self.newest(topic, TimeWindow(MIN_NS, before))
+
+    def newest_among(
+        self, bags: Sequence[BagSpan], topic: str, window: TimeWindow
+    ) -> StoredMessage | None:
+        """Returns the newest message that some bags alone have of the topic in the window."""
+        return next(self._messages_in([topic], window, bags, newest_first=True), None)
 
     def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""
@@ -111,7 +117,7 @@ class MergedStream:
         self,
         topics: Sequence[str],
         window: TimeWindow,
-        among: Sequence[BagSpan] | None,
+        among: Sequence[BagSpan] | None = None,
         *,
         newest_first: bool,
     ) -> Iterator[StoredMessage]:
@@ -143,7 +149,7 @@ class MergedStream:
         topic, window = stored.topic, _since_published(stored)
         if stored.record.may_be_relatched and self.may_be_relatched([topic]):
             bags = self.overlapping_bags([topic], window)
-            copies = self.merged(bags, [topic], window, newest_first=False)
+            copies = self.merged(bags, [topic], window)
             key = copy_key(stored.record)
             next((copy for copy in copies if copy_key(copy.record) == key), None)
 
@@ -171,7 +177,7 @@ class MergedStream:
         for start, stop in missing:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
-            for message in self.merged(bags, [topic], part, newest_first=False, since=window.start):
+            for message in self.merged(bags, [topic], part, since=window.start):
                 key, first = copy_key(message.record), (message.time, message.bag.recording)
                 self._first_copies[key] = min(first, self._first_copies.get(key, first))
         self._searched[topic] = united([*searched, *missing])
@@ -182,7 +188,7 @@ class MergedStream:
         topics: Sequence[str],
         window: TimeWindow,
         *,
-        newest_first: bool,
+        newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
         """Yields all messages in order, duplicates too; opens a bag when the stream reaches it.

@@ -199,7 +199,7 @@ def _frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
 def _frames_of_newest(view: View, topic: str) -> list[str]:
     """Returns the frames of the positions in a topic's newest message; none where not known."""
     try:
-        stored = view.stream.newest(topic, TimeWindow.everything())
+        stored = view.stream.last(topic)
     except QueryTimeoutError:
         return []
     message = None if stored is None else view.bags.decode(stored)
@@ -391,7 +391,7 @@ class CandidateRows:
 
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
     """Notes when arrays at or below some fields were too long to be more than summarised."""
-    newest = view.stream.newest(topic, TimeWindow.everything())
+    newest = view.stream.last(topic)
     value = None if newest is None else view.value(newest)
     try:
         for condition in chain(*(summarising(field, value) for field in fields)):
@@ -503,7 +503,7 @@ class ReverseSearch:
 
     def _refusal(self, topic: str) -> str | None:
         """Returns why no message of a topic can match, by the newest one that shows its fields."""
-        newest = self._view.stream.newest(topic, TimeWindow.everything())
+        newest = self._view.stream.last(topic)
         value = None if newest is None else self._view.value(newest)
         if newest is None or value is None:
             return None

@@ -247,7 +247,7 @@ def _static_parents(view: View, bags: Sequence[BagFile]) -> dict[str, str]:
     window = TimeWindow.everything()
     for topic in view.limits.tf_static_topics:
         spans = _bag_spans(bags, topic)
-        merged = view.stream.merged(spans, [topic], window, newest_first=False) if spans else ()
+        merged = view.stream.merged(spans, [topic], window) if spans else ()
         for stored in islice(merged, _MAX_STATIC):
             message = view.bags.decode(stored)
             if message is not None:
@@ -536,4 +536,4 @@ def _merged_messages(
     view: View, topic: str, bags: Sequence[BagSpan], window: TimeWindow
 ) -> Iterator[StoredMessage]:
     inside = [span for span in bags if window.overlaps(span.first, span.last)]
-    return view.stream.merged(inside, [topic], window, newest_first=False)
+    return view.stream.merged(inside, [topic], window)

@@ -104,7 +104,7 @@ def open_scan(
     asked = ScanRequest(
         topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted
     )
-    return Scan(view.memory.columns, asked)
+    return Scan(view.memory.scanner, asked)
 
 
 def joined_back(
@@ -173,7 +173,7 @@ def remembered(
     That is remembered unless something could not be read; see `joined_back`. A key of None stands
     for what may still change. `also_before`: see `Fragments.get`.
     """
-    fragments = view.memory.columns.fragments(kind)
+    fragments = view.memory.scanner.fragments(kind)
     fragment = None if key is None else fragments.get(key, also_before)
     if fragment is None:
         before = trouble(), view.notes.added

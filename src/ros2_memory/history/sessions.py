@@ -304,13 +304,13 @@ class Sessions:
         bags = self.bags_of(session, (topic,), window)
         if newest is not None and newest.bag in {span.bag for span in bags}:
             return newest
-        return self._view.stream.first((topic,), window, newest_first=True, among=bags)
+        return self._view.stream.newest_among(bags, topic, window)
 
     def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
         """Returns the moving transforms that a session received in a window, in log-time order."""
         stream, topics = self._view.stream, self._view.moving_topics
         bags = self.bags_of(session, topics, window)
-        merged = stream.merged(bags, topics, window, newest_first=False)
+        merged = stream.merged(bags, topics, window)
         tracked = self._view.bags.track_sources(merged)
         of_session = (stored for stored in tracked if self.has(session, stored))
         return [*decoded_transforms(self._view, of_session)]
@@ -331,7 +331,7 @@ class Sessions:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        view, caches = self._view, self._view.memory.columns.caches
+        view, caches = self._view, self._view.memory.scanner.caches
         if session not in self._static:
             key = (session, view.static_topics)
             timeline, static = caches.statics.get(key) or (None, ())
@@ -356,7 +356,7 @@ class Sessions:
     def _find_all_static(self) -> None:
         """Finds the static transforms of all sessions that are stored, unless some are carried."""
         view = self._view
-        coverage = view.memory.columns.coverage(view.timeline)
+        coverage = view.memory.scanner.coverage(view.timeline)
         recordings = chain.from_iterable(map(view.timeline.recordings, view.static_topics))
         if coverage is None or any(map(self.holds_carried, recordings)):
             return
@@ -448,7 +448,7 @@ class Sessions:
 
     def _pairs_in(self, rows: Rows, session: Session | None) -> frozenset[Pair]:
         """Returns the pairs in some rows; with a `session` those that are of it."""
-        view, known_pairs = self._view, self._view.memory.columns.caches.pairs
+        view, known_pairs = self._view, self._view.memory.scanner.caches.pairs
         part = rows.part if session is None else None
         pairs = None if part is None else known_pairs.get(part)
         if pairs is not None:

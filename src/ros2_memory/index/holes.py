@@ -11,7 +11,7 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.silences import Presence, usual_period
+from ros2_memory.analysis.silences import Presence, usual_periods
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -81,11 +81,7 @@ class Rhythm:
     """
 
     def __init__(self, presences: Mapping[str, Presence]) -> None:
-        self._periods = {
-            topic: period
-            for topic, presence in presences.items()
-            if (period := usual_period(presence)) is not None
-        }
+        self._periods = usual_periods(presences)
 
     def gaps(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses that are gaps."""

@@ -44,8 +44,8 @@ from ros2_memory.places.pose_frames import (
     MapPlacement,
     changing_origin,
     is_one_run,
-    joined_in,
     known_placement,
+    known_track,
     places_in,
 )
 from ros2_memory.places.two_paths import FarPoint, farthest_apart, placed_standstills, stood_at
@@ -413,7 +413,7 @@ def _path_differences(
         return unknown
     region = None if where is None else where.region
     places = places_asked(view.limits, where, (frame,))
-    tracks = [joined_in(view, frame, window).track for window in windows]
+    tracks = [known_track(view, frame, window).track for window in windows]
     stands = [
         [
             *placed_standstills(
@@ -468,7 +468,7 @@ def _minutes_in_places(
         else:
             frame = placement.frame_id
             asked = [
-                (place.title, place.region, joined_in(view, place.frame_id or frame, window))
+                (place.title, place.region, known_track(view, place.frame_id or frame, window))
                 for place in where.each
             ]
         minutes: dict[str, float | None] = {}

@@ -52,7 +52,7 @@ from ros2_memory.insights.topic_events import (
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 from ros2_memory.places.driven_inside import totals_inside
 from ros2_memory.places.pose_frames import RobotPlaces, robot_places
-from ros2_memory.places.where import parse_where, times_in_region
+from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.results import Before, Event, PastChange, Recap
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.places.robot_tracks import Inside
+    from ros2_memory.places.robot_tracks import Stay
 
 MOST_EVENTS: Final = 25
 
@@ -144,9 +144,10 @@ def recap(
     places = robot_places(view, window, frame_id)
     drive = drive_in(view, window)
     elapsed = drive.elapsed
-    region_stays = (
-        None if region is None else _RegionStays(times_in_region(view, region, window), elapsed)
-    )
+    region_stays = None
+    if region is not None:
+        stays = known_track_for(view, region, window).inside(region.region, window)
+        region_stays = _RegionStays(stays, elapsed)
     events_of_topics = found_events(view, window)
     least = memory.limits.min_score if min_score is None else min_score
     reported = _reported_events(view, window, events_of_topics, region_stays)
@@ -239,7 +240,7 @@ def _note_foxglove_logs(view: View, window: TimeWindow) -> None:
 class _RegionStays:
     """The times at which the robot was in a region, in order."""
 
-    def __init__(self, spans: Sequence[Inside], elapsed: Elapsed) -> None:
+    def __init__(self, spans: Sequence[Stay], elapsed: Elapsed) -> None:
         self.spans = spans
         self._elapsed = elapsed
 

@@ -311,7 +311,7 @@ def _latched_notes(view: View, search: ReverseSearch, window: TimeWindow) -> Ite
 def _newest_match(view: View, search: ReverseSearch, run: Run) -> StoredMessage | None:
     """Returns the last match, or what held without one; None where its bag was deleted since."""
     if not run.messages:
-        return view.stream.newest(run.topic, TimeWindow(MIN_NS, run.last + 1))
+        return view.stream.last(run.topic, run.last + 1)
     at = TimeWindow(run.last, run.last + 1)
     at_once = view.stream.messages([run.topic], at, newest_first=True)
     return next(islice(filter(search.matches, at_once), run.later, None), None)
@@ -395,7 +395,7 @@ def _goes_on_until(view: View, goal: GoalRun, scope: Scope) -> Ns:
 
 def _goal_sighting(view: View, goal: GoalRun, scope: Scope, frame_id: str | None) -> Sighting:
     """Returns a goal of an action as a sighting, with where the robot was when it ended."""
-    message = view.stream.newest(goal.topic, TimeWindow(MIN_NS, goal.last + 1))
+    message = view.stream.last(goal.topic, goal.last + 1)
     return Sighting(
         topic=goal.topic,
         first=goal.first,

@@ -216,7 +216,7 @@ def missing_data(view: View) -> Iterator[str]:
     if odd := len(bags_with_remarks(snapshot)):
         bags = counted(odd, "bag is", "bags are")
         yield f"{bags} incomplete or contradictory; data_time_range has the details"
-    if broken := len(view.memory.columns.damaged_parts(snapshot.bags)):
+    if broken := len(view.memory.scanner.damaged_parts(snapshot.bags)):
         bags = counted(broken, "bag")
         yield f"{bags} could not be read whole; data_time_range names what is damaged"
     if misdated := len(snapshot.dating.misdated):
@@ -342,7 +342,7 @@ def undecodable_types(view: View, topic: str) -> dict[str, str]:
 
 
 def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
-    timeline, columns = view.timeline, view.memory.columns
+    timeline, columns = view.timeline, view.memory.scanner
     bag = timeline.first_with(topic, type_name)
     channels = columns.channels(timeline, bag)
     reasons = [

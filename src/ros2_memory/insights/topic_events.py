@@ -31,9 +31,8 @@ from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import Reason, counted
-from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.timebase import Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.scan import (
     blocks,
@@ -49,7 +48,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
@@ -275,7 +274,7 @@ def goals_in(
         if events is None or GOALS not in view.timeline.types_of(topic):
             continue
         # Which goals it listed before: what a window's first message lists need not be new.
-        message_before = view.stream.newest(topic, TimeWindow(MIN_NS, window.start))
+        message_before = view.stream.last(topic, window.start)
         earlier = None if message_before is None else events_of_messages(view, [message_before])
         listed = [] if earlier is None else earlier.of_kind(GOAL)[0]
         statuses_before = {goal.name: goal.last for goal in listed}

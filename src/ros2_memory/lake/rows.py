@@ -42,7 +42,7 @@ from ros2_memory.insights.topic_events import events_of_bag, toggled
 from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
 from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import robot_places
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
@@ -193,7 +193,7 @@ class _BagRows:
         if places is None:
             return []
         tracks = [
-            (frame, cut(RobotTracks(self._view, frame).over(window).track, window))
+            (frame, cut(TrackReader(self._view, frame).over(window).track, window))
             for frame in dict.fromkeys((places.map_frame, places.pose_frame))
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]

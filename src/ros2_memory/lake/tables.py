@@ -316,21 +316,21 @@ def unpacked_messages(data: bytes, channel: Channel) -> Batch:
             f"messages are packed in format {form}; this program reads {_PLAIN}, {_PLACED}"
         )
     at = _HEAD.size
-    logged = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
-    published = logged + from_planes(content, at + 8 * count, count, 8).astype(np.int64)
-    at += 16 * count
-    places = np.arange(count)
-    if form == _PLACED:
-        places = np.cumsum(from_planes(content, at, count, 8).astype(np.int64))
-        at += 8 * count
+
+    def column(width: int) -> IntArray:
+        nonlocal at
+        at += width * count
+        return np.asarray(from_planes(content, at - width * count, count, width), np.int64)
+
+    logged = np.cumsum(column(8))
+    published = logged + column(8)
+    places = np.cumsum(column(8)) if form == _PLACED else np.arange(count)
     sizes, payloads = np.zeros(count, np.int64), b""
     if is_whole:
-        sizes = from_planes(content, at, count, 4).astype(np.int64)
-        payloads = content[at + 4 * count :]
+        sizes, payloads = column(4), content[at:]
         if len(payloads) != sizes.sum():
             raise ValueError("packed messages are cut short")
         if count and (sizes == sizes[0]).all():
-            planes = np.frombuffer(payloads, np.uint8).reshape(-1, count)
-            payloads = planes.T.tobytes()
+            payloads = np.frombuffer(payloads, np.uint8).reshape(-1, count).T.tobytes()
     starts = np.cumsum(sizes) - sizes
     return Batch(channel, logged, published, places, payloads, starts, sizes)

@@ -30,13 +30,13 @@ from ros2_memory.history.robots import require_one_robot
 from ros2_memory.history.view import TimeRange, open_span
 from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
-    joined_in,
+    known_track,
     map_placement,
     newest_pose,
     placed_waypoints,
 )
-from ros2_memory.places.robot_tracks import Inside, RobotTracks, robot_inside
-from ros2_memory.places.where import joined_in_region, parse_where
+from ros2_memory.places.robot_tracks import Stay, TrackReader, stays_within
+from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.results import DrivenInside, FarthestPose
 
 if TYPE_CHECKING:
@@ -87,8 +87,8 @@ def driven_inside(
     if path is None or not path.poses:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    track = joined_in_region(view, region, window).track
-    inside = robot_inside(track, region.region, window)
+    track = known_track_for(view, region, window).track
+    inside = stays_within(track, region.region, window)
     totals = totals_inside(path.line, inside)
     waypoints = way_inside(path.line, inside, max_waypoints)
     waypoints = tuple(
@@ -132,7 +132,7 @@ class InsideTotals(NamedTuple):
     max_speed: float | None
 
 
-def totals_inside(line: Line, spans: Sequence[Inside]) -> InsideTotals:
+def totals_inside(line: Line, spans: Sequence[Stay]) -> InsideTotals:
     """Returns what was driven along a line in some times."""
     metres, speeds = 0.0, [] if spans else [0.0]
     for start, stop in united((span.start, span.stop) for span in spans):
@@ -159,7 +159,7 @@ def _fastest(line: Line, start: Ns, stop: Ns, driven_m: float) -> float | None:
     return float(np.minimum(driven, np.sqrt((moved * moved).sum(axis=1))).max())
 
 
-def way_inside(line: Line, spans: Sequence[Inside], at_most: int) -> tuple[Waypoint, ...]:
+def way_inside(line: Line, spans: Sequence[Stay], at_most: int) -> tuple[Waypoint, ...]:
     """Returns the drawn way in some times; `jump` marks where another time begins.
 
     `at_most` 0 asks for none, 1 for the last.
@@ -191,7 +191,7 @@ def _with_measured_heading(view: View, topic: str, line: Line, waypoint: Waypoin
     return waypoint
 
 
-def _part(line: Line, span: Inside) -> Line:
+def _part(line: Line, span: Stay) -> Line:
     """Returns the line in a time: its first vertex is where that begins, as after a jump."""
     inner = np.flatnonzero((line.times > span.start) & (line.times < span.stop))
     ends = [span.start, span.stop] if span.stop > span.start else [span.start]
@@ -229,8 +229,8 @@ def farthest_from(
     if not spans:
         return None
     window = TimeWindow(spans[0][0], spans[-1][1] + 1)
-    track = joined_in(view, frame, window).track
-    pose = _farthest_pose(RobotTracks(view, frame), track, spans, (x, y))
+    track = known_track(view, frame, window).track
+    pose = _farthest_pose(TrackReader(view, frame), track, spans, (x, y))
     if pose is None:
         return None
     inside = places_at(view.limits.places, frame, pose.x, pose.y)
@@ -247,7 +247,7 @@ class _DistantPose(NamedTuple):
 
 
 def _farthest_pose(
-    tracks: RobotTracks,
+    tracks: TrackReader,
     track: RobotTrack,
     spans: Sequence[tuple[Ns, Ns]],
     point: tuple[float, float],

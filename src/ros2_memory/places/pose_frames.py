@@ -37,8 +37,8 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.driven_path import (
     body_by_transforms,
     body_of,
+    frame_of_newest_pose,
     newest_of_body,
-    pose_frame,
     resolve_path_topic,
 )
 from ros2_memory.history.robots import recordings_apart
@@ -47,7 +47,7 @@ from ros2_memory.history.transforms import (
     connects_in_time,
     transform_at,
 )
-from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
+from ros2_memory.places.robot_tracks import KnownTrack, TrackReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -251,7 +251,7 @@ def map_placement(view: View, topic: str, frame_id: str | None = None) -> MapPla
         QueryTimeoutError: the time is over before it is known whether they are in `frame_id`.
         UndecodableError: no pose can be decoded.
     """
-    target, frame = view.limits.map_frame, pose_frame(view, topic)
+    target, frame = view.limits.map_frame, frame_of_newest_pose(view, topic)
     body = body_of(view, topic)
     above = () if body is None else body.above
     if frame_id in (frame, *above):
@@ -323,13 +323,13 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
         )
 
 
-def joined_in(view: View, frame_id: str, window: TimeWindow) -> JoinedTrack:
+def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:
     """Returns the robot's track in a window; a note says how far back it reaches, if not all.
 
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    joined = RobotTracks(view, frame_id).over(window)
+    joined = TrackReader(view, frame_id).over(window)
     note_runs(view, resolve_path_topic(view), frame_id, window)
     if joined.since is not None:
         view.notes.add_lack(
@@ -355,12 +355,12 @@ def make_tracks(view: View, window: TimeWindow) -> Iterator[Ns]:
     with suppress(InvalidArgumentsError, NoDataError):
         topic = resolve_path_topic(view)
         frames = map_placement(view, topic).frames
-        yield from merge(*(RobotTracks(view, frame).made(window) for frame in frames), reverse=True)
+        yield from merge(*(TrackReader(view, frame).made(window) for frame in frames), reverse=True)
 
 
 def places_in(
     view: View, places: Sequence[Place], placement: MapPlacement, window: TimeWindow
-) -> list[tuple[Place, JoinedTrack]]:
+) -> list[tuple[Place, KnownTrack]]:
     """Returns the places of the map and of the poses' own frame, each with the track in its frame.
 
     Notes name the others.
@@ -368,10 +368,10 @@ def places_in(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    tracks: list[tuple[Place, JoinedTrack]] = []
+    tracks: list[tuple[Place, KnownTrack]] = []
     for place in places:
         if place.frame_id in placement.frames:
-            tracks.append((place, joined_in(view, place.frame_id, window)))
+            tracks.append((place, known_track(view, place.frame_id, window)))
         else:
             view.notes.add(
                 f"{place.name} is left out: it is in {place.frame_id}, and where the robot was is "
@@ -420,7 +420,7 @@ class RobotPlaces:
     @cached_property
     def _track(self) -> RobotTrack:
         try:
-            joined = RobotTracks(self.view, self.map_frame).over(self.window)
+            joined = TrackReader(self.view, self.map_frame).over(self.window)
             note_runs(self.view, resolve_path_topic(self.view), self.map_frame, self.window)
         except QueryTimeoutError:
             self.view.bags.check_deadline()

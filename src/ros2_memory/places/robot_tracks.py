@@ -1,7 +1,8 @@
 """Where the robot was in one frame over many bags, and when it was inside of a region.
 
-Each table of poses gives a part of the track, by the transforms around it; parts of tables that do
-not change any more are remembered, so a week is asked again in a tenth of a second.
+Each table of poses, placed by the transforms around it, gives a `PartialTrack`; `joined_tracks`
+makes one of all. What follows from parts of the store alone is stored beside these, so a week is
+asked again in a tenth of a second.
 """
 
 from __future__ import annotations
@@ -27,12 +28,12 @@ from ros2_memory.analysis.frames import (
 from ros2_memory.analysis.intervals import FLICKER_NS, SILENCE_NS, pieces_of
 from ros2_memory.analysis.motion.robot_track import (
     TRACK_SLICE_NS,
+    PartialTrack,
     RobotTrack,
-    TrackPart,
-    joined_parts,
+    joined_tracks,
     jumps,
+    partial_track,
     track_by,
-    track_part,
 )
 from ros2_memory.analysis.poses import Poses, headings
 from ros2_memory.columns.fragments import FragmentKey
@@ -44,11 +45,16 @@ from ros2_memory.core.errors import QueryTimeoutError, UndecodableError
 from ros2_memory.core.geometry import multiply
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.regions import Parts, Region, Steps, parts_inside
+from ros2_memory.core.regions import ClippedSteps, Region, Steps, clipped
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Note
-from ros2_memory.history.driven_path import Body, body_by_transforms, note_left_out, pose_frame
+from ros2_memory.history.driven_path import (
+    Body,
+    body_by_transforms,
+    frame_of_newest_pose,
+    note_left_out,
+)
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
 from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
@@ -78,7 +84,7 @@ _READING_S: Final = 10.0
 """How long a call places poses that it does not remember, before its answer is partial."""
 
 
-class Inside(NamedTuple):
+class Stay(NamedTuple):
     """A time in which the robot was inside of a region; both ends are inclusive.
 
     `entered` and `left`: whether it was seen outside just before, and just after.
@@ -89,9 +95,9 @@ class Inside(NamedTuple):
     entered: bool
     left: bool
 
-    def within(self, window: TimeWindow) -> Inside:
+    def within(self, window: TimeWindow) -> Stay:
         """Returns the part of it in a window that it reaches into."""
-        return Inside(
+        return Stay(
             max(self.start, window.start),
             min(self.stop, window.stop - 1),
             entered=self.entered and self.start >= window.start,
@@ -100,7 +106,7 @@ class Inside(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class JoinedTrack:
+class KnownTrack:
     """The track of the robot in a window.
 
     Attributes:
@@ -126,16 +132,16 @@ class JoinedTrack:
         pieces = (zip(*each.pieces, strict=True) for each in self.tracks)
         return any(window.overlaps(start, stop) for start, stop in chain(*pieces))
 
-    def inside(self, region: Region, window: TimeWindow) -> list[Inside]:
+    def inside(self, region: Region, window: TimeWindow) -> list[Stay]:
         """Returns when any robot was inside of a region, in order; times of several may overlap."""
-        return sorted(chain(*(robot_inside(track, region, window) for track in self.tracks)))
+        return sorted(chain(*(stays_within(track, region, window) for track in self.tracks)))
 
 
-_JOINED: Final[Key[dict[tuple[str, TimeWindow], JoinedTrack]]] = Key()
+_KNOWN: Final[Key[dict[tuple[str, TimeWindow], KnownTrack]]] = Key()
 """Of a call: its tracks, by frame and window."""
 
 
-class RobotTracks:
+class TrackReader:
     """Places the robot in one frame.
 
     By its poses; where no topic has these, by the transforms of its body.
@@ -146,57 +152,60 @@ class RobotTracks:
         self._frame_id = frame_id
         self._body = body = body_by_transforms(view)
         self._topics = (view.pose_topic,) if body is None else view.limits.tf_topics
-        self._own_frame = pose_frame(view, view.pose_topic) if body is None else body.child
+        self._own_frame = (
+            frame_of_newest_pose(view, view.pose_topic) if body is None else body.child
+        )
         self._is_own = body is None and self._own_frame == frame_id
         self._failures: list[UndecodableError] = []
         self._reader = PoseReader(view, self._failures)
 
-    def over(self, window: TimeWindow) -> JoinedTrack:
+    def over(self, window: TimeWindow) -> KnownTrack:
         """Returns the track in a window, and a little beyond.
 
         Raises:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out before any result.
         """
-        tracks = self._view.memo.of(_JOINED, dict)
-        if (self._frame_id, window) not in tracks:
-            tracks[self._frame_id, window] = self._read_track(window)
-        return tracks[self._frame_id, window]
-
-    def _read_track(self, window: TimeWindow) -> JoinedTrack:
-        view = self._view
+        view, key = self._view, (self._frame_id, window)
+        known = view.memo.of(_KNOWN, dict)
+        if key in known:
+            return known[key]
         # Whole slices, so that no vertex depends on the window; and what may reach into it.
         around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
-        parts: list[TrackPart] = []
+        found: list[tuple[Ns, PartialTrack]] = []
         since: Ns | None = None
-        reading = view.call.partial_after(_READING_S)
         try:
-            for start, part in self._parts(around, reading):
-                parts.append(part)
-                since = start
+            found.extend(self._tracks_back(around, view.call.partial_after(_READING_S)))
         except QueryTimeoutError as error:
-            if not parts:
+            if not found:
                 raise QueryTimeoutError(
                     f"the question needs more time; {view.bags.filling_progress()}"
                     "ask about a shorter window"
                 ) from error
-        else:
-            since = None
+            since = found[-1][0]
         if self._failures:
             note_left_out(view, self._failures[0])
-        left_out = sum(part.left_out for part in parts)
-        apart = recordings_apart(view, self._topics, around)
-        root = str(view.bag_dir)
-        names = None if apart is None else {relative(str(path), root) for path in apart}
-        whole, numbers, is_beside = _tracks_by_robot(parts, names)
-        fastest = view.limits.max_plausible_speed_mps
+        left_out = sum(track.left_out for _, track in found)
+        track, others = self._joined([track for _, track in found], around)
+        known[key] = KnownTrack(track, since, left_out, others)
+        return known[key]
 
-        def track(index: NDArray[np.intp]) -> RobotTrack:
+    def _joined(
+        self, tracks: Sequence[PartialTrack], window: TimeWindow
+    ) -> tuple[RobotTrack, tuple[RobotTrack, ...]]:
+        """Returns the track of all recordings, and what those of other robots have beside it."""
+        apart = recordings_apart(self._view, self._topics, window)
+        root = str(self._view.bag_dir)
+        names = None if apart is None else {relative(str(path), root) for path in apart}
+        whole, numbers, is_beside = _tracks_by_robot(tracks, names)
+        fastest = self._view.limits.max_plausible_speed_mps
+
+        def track_at(index: NDArray[np.intp]) -> RobotTrack:
             return track_by(whole.some(index), numbers[index], fastest)
 
         others = np.unique(numbers[is_beside])
-        tracks = (track(np.flatnonzero(is_beside & (numbers == number))) for number in others)
-        return JoinedTrack(track(np.flatnonzero(~is_beside)), since, left_out, tuple(tracks))
+        beside = (track_at(np.flatnonzero(is_beside & (numbers == number))) for number in others)
+        return track_at(np.flatnonzero(~is_beside)), tuple(beside)
 
     def made(self, window: TimeWindow) -> Iterator[Ns]:
         """Makes the tracks of parts in a window and beside it, the newest first.
@@ -207,10 +216,12 @@ class RobotTracks:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out.
         """
-        return (at for at, _ in self._parts(window.widened(2 * PART_NS), Deadline.never()))
+        return (at for at, _ in self._tracks_back(window.widened(2 * PART_NS), Deadline.never()))
 
-    def _parts(self, window: TimeWindow, reading: Deadline) -> Iterator[tuple[Ns, TrackPart]]:
-        """Yields the track, the newest first, each part with a time that it is not earlier than."""
+    def _tracks_back(
+        self, window: TimeWindow, reading: Deadline
+    ) -> Iterator[tuple[Ns, PartialTrack]]:
+        """Yields partial tracks, the newest first, each with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
         whole = _aligned(window, PART_NS)
         around = _aligned(whole.widened(TF_CACHE_NS), PART_NS)
@@ -222,19 +233,19 @@ class RobotTracks:
                 self._view,
                 opened,
                 TRACKS,
-                partial(self._parts_in, opened, moving, window, reading),
+                partial(self._tracks_in, opened, moving, window, reading),
                 partial(self._stretch_key, opened, moving, window),
                 trouble=lambda: len(self._failures),
             )
 
-    def _parts_in(
+    def _tracks_in(
         self,
         opened: Scan,
         scans: Sequence[Scan],
         window: TimeWindow,
         reading: Deadline,
         stretch: Stretch,
-    ) -> Iterator[tuple[Ns, TrackPart]]:
+    ) -> Iterator[tuple[Ns, PartialTrack]]:
         """Yields the track table by table, of those that begin in a stretch, the newest first."""
         searched = stretch.window.intersect(window)
         for rows in opened.rows(newest_first=True, among=searched):
@@ -245,14 +256,14 @@ class RobotTracks:
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
-                yield rows.first, self._part(rows, key, lent_spans, reading)
+                yield rows.first, self._track_by(rows, key, lent_spans, reading)
                 continue
-            stored = None if key is None else self._view.memory.columns.fragments(TRACKS).get(key)
+            stored = None if key is None else self._view.memory.scanner.fragments(TRACKS).get(key)
             if stored is not None and not stored.left_out:
                 yield rows.first, stored.some(_positions_in(stored.times, window))
             elif (inside := _positions_in(rows.times, window)).size:
                 lent_spans = self._lent_spans(rows, window)
-                yield rows.first, self._part(rows.some(inside), None, lent_spans, reading)
+                yield rows.first, self._track_by(rows.some(inside), None, lent_spans, reading)
 
     def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
@@ -300,21 +311,21 @@ class RobotTracks:
         settings = repr((self._frame_id, self._topics, self._body, clock, placed_by))
         return hashlib.sha256(settings.encode()).hexdigest()
 
-    def _part(
+    def _track_by(
         self,
         rows: Rows,
         key: FragmentKey | None,
         lent_spans: Sequence[_LentSpan],
         reading: Deadline,
-    ) -> TrackPart:
+    ) -> PartialTrack:
         """Returns the track by some rows: what is stored of it, else made now."""
 
-        def make() -> TrackPart:
+        def make() -> PartialTrack:
             if reading.expired():
                 raise QueryTimeoutError("to place poses takes too long")
             placed = self._poses_of(rows, lent_spans)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
-            return track_part(*placed)._replace(recording=recording)
+            return partial_track(*placed)._replace(recording=recording)
 
         return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
 
@@ -444,7 +455,7 @@ def _in_time_order(parts: Sequence[Placed]) -> Placed:
 
 def _placed_poses(poses: Poses, frames: FrameTree | None, target: str) -> Placed:
     """Returns poses in a frame; those that no transform places are left out."""
-    turns = np.rint(poses.turns * QUATERNION.per_unit) / QUATERNION.per_unit
+    turns = QUATERNION.nearest(poses.turns)
     x, y, z = (column.copy() for column in poses.positions.T)
     valid = np.zeros(len(poses), np.bool_)
     for code, name in enumerate(poses.frames.words):
@@ -499,23 +510,23 @@ def _positions_in(times: Times, window: TimeWindow) -> Times:
 
 
 def _tracks_by_robot(
-    parts: Sequence[TrackPart], apart: Collection[str] | None
-) -> tuple[TrackPart, Times, Mask]:
+    tracks: Sequence[PartialTrack], apart: Collection[str] | None
+) -> tuple[PartialTrack, Times, Mask]:
     """Returns the tracks of all recordings, whose each vertex is, and which lie beside the track.
 
     Where several recordings place a robot at a time, that which began first is in the track; of
     those that began at one time the first by name. What the other one has then is left out, unless
     both are among those that are `apart`, as of several robots (None: all may be).
     """
-    by_recording: dict[str, list[TrackPart]] = defaultdict(list)
-    for part in parts[::-1]:
-        if len(part.times):
-            by_recording[part.recording].append(part)
+    by_recording: dict[str, list[PartialTrack]] = defaultdict(list)
+    for track in tracks[::-1]:
+        if len(track.times):
+            by_recording[track.recording].append(track)
     recordings = sorted(
         by_recording.values(),
-        key=lambda track: (min(int(part.times[0]) for part in track), track[0].recording),
+        key=lambda own: (min(int(track.times[0]) for track in own), own[0].recording),
     )
-    whole, numbers = joined_parts(recordings)
+    whole, numbers = joined_tracks(recordings)
     ends = np.searchsorted(numbers, np.arange(len(recordings) + 1))
     firsts, lasts = whole.times[ends[:-1]], whole.times[ends[1:] - 1]
     is_beside, repeats = np.zeros((2, len(whole.times)), np.bool_)
@@ -532,7 +543,7 @@ def _tracks_by_robot(
     return whole.some(own), numbers[own], is_beside[own]
 
 
-def _without_jumps(parts: Parts, are_jumps: Mask) -> Parts:
+def _without_jumps(parts: ClippedSteps, are_jumps: Mask) -> ClippedSteps:
     """Returns the parts of steps inside of a region; of a jump only those of its ends inside.
 
     Nobody drives where a robot jumps: its odometry started again, or its map was corrected.
@@ -542,19 +553,19 @@ def _without_jumps(parts: Parts, are_jumps: Mask) -> Parts:
     start = np.where(jumped & ~begins, 1.0, parts.start)
     stop = np.where(jumped & ~ends, 0.0, parts.stop)
     kept = ~jumped | begins | ends
-    return Parts(parts.step[kept], start[kept], stop[kept])
+    return ClippedSteps(parts.step[kept], start[kept], stop[kept])
 
 
-def robot_inside(track: RobotTrack, region: Region, window: TimeWindow) -> list[Inside]:
-    """Returns when the robot was inside of a region in a window, in order; see `times_inside`."""
+def stays_within(track: RobotTrack, region: Region, window: TimeWindow) -> list[Stay]:
+    """Returns when the robot was inside of a region in a window, in order; see `stays`."""
     return [
         stay.within(window)
-        for stay in times_inside(track, region)
+        for stay in stays(track, region)
         if window.overlaps(stay.start, stay.stop)
     ]
 
 
-def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
+def stays(track: RobotTrack, region: Region) -> list[Stay]:
     """Returns when the robot was inside of a region, in order, by its track.
 
     A robot that was outside for less than `FLICKER_NS` did not leave. What it did in a silence
@@ -566,7 +577,7 @@ def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
     # A piece of a single vertex is a step of no length.
     after = np.arange(count) + ~track.ends
     steps = Steps(track.x, track.y, track.x[after], track.y[after])
-    parts = parts_inside(region, steps)
+    parts = clipped(region, steps)
     lasted = track.times[after] - track.times
     jumped = jumps(track)
     if jumped[parts.step].any():
@@ -593,6 +604,6 @@ def times_inside(track: RobotTrack, region: Region) -> list[Inside]:
         strict=True,
     )
     return [
-        Inside(start, stop, entered=start > opened, left=stop < closed)
+        Stay(start, stop, entered=start > opened, left=stop < closed)
         for start, stop, opened, closed in rows
     ]

@@ -33,12 +33,12 @@ from ros2_memory.places.pose_frames import (
     NEWEST_POSE_NS,
     WHEREABOUTS,
     MapPlacement,
-    joined_in,
+    known_track,
     map_placement,
     placed_times,
     places_in,
 )
-from ros2_memory.places.robot_tracks import Inside, Placed, RobotTracks, times_inside
+from ros2_memory.places.robot_tracks import Placed, Stay, TrackReader, stays
 from ros2_memory.places.where import Where, note_other_frame, parse_where, places_setting
 from ros2_memory.results import PlaceVisits, Visit, Visits
 
@@ -88,8 +88,8 @@ def visits(
     placement = map_placement(view, topic, asked_frame)
     if place is None:
         return _visits_of_places(view, window, placement, mixed, now)
-    region_visits = RegionVisits(view, placement.frame_id, place.region, window)
-    track, all_visits = region_visits.joined.track, region_visits.every
+    region_visits = ConfirmedStays(view, placement.frame_id, place.region, window)
+    track, all_visits = region_visits.known.track, region_visits.every
     newest = _newest_pose_time(view, topic, track, window, now + FUTURE_NS)
     # A newer pose shows where the robot is now; or what else was recorded since, that none does.
     stale = now - _SPLITS * ns_from_unix(view.limits.split_duration_s)
@@ -108,9 +108,7 @@ def visits(
     circle = place.region if isinstance(place.region, Circle) and place.name is None else None
     return Visits(
         frame_id=placement.frame_id,
-        x=None if circle is None else circle.x,
-        y=None if circle is None else circle.y,
-        radius_m=None if circle is None else circle.radius_m,
+        circle=circle,
         visits=shown,
         more=len(all_visits) > len(shown),
         total=len(all_visits),
@@ -118,7 +116,7 @@ def visits(
         duration=region_visits.duration,
         entries=sum(visit.inside.entered for visit in all_visits),
         exits=sum(visit.inside.left for visit in all_visits),
-        all_counted=region_visits.joined.since is None,
+        all_counted=region_visits.known.since is None,
         where=place.name,
         unknown=_unknown(view, window, [track], mixed),
         reaches_now=newest is not None,
@@ -131,21 +129,16 @@ def _visits_of_places(
 ) -> Visits:
     """Returns how often and for how long the robot was in each named place, the longest first."""
     visited = [
-        (place, RegionVisits(view, place.frame_id, place.region, window))
+        (place, ConfirmedStays(view, place.frame_id, place.region, window))
         for place, _ in places_in(view, view.limits.places, placement, window)
     ]
     rows = (place_visits(region_visits, place.name) for place, region_visits in visited)
     places = tuple(sorted(rows, key=lambda row: (-row.duration, row.place)))
-    tracks = {place.frame_id: region_visits.joined.track for place, region_visits in visited}
+    tracks = {place.frame_id: region_visits.known.track for place, region_visits in visited}
     was_in_one = any(row.duration for row in places)
     note_unread(view, window, nothing=not was_in_one, gaps=not was_in_one)
     return Visits(
         frame_id=placement.frame_id,
-        x=None,
-        y=None,
-        radius_m=None,
-        visits=(),
-        more=False,
         total=sum(row.entries for row in places),
         now=now,
         places=places,
@@ -211,7 +204,7 @@ def _newest_pose_time(
     view: View, topic: str, track: RobotTrack, window: TimeWindow, last: Ns
 ) -> Ns | None:
     """Returns the time of the newest pose until `last`, where the window reaches as far."""
-    message = view.stream.newest(topic, TimeWindow(MIN_NS, last + 1))
+    message = view.stream.last(topic, last + 1)
     if message is None or window.stop <= message.time:
         return None
     times = track.times[track.times <= last]
@@ -247,7 +240,7 @@ def _with_restarts(view: View, topic: str, shown: tuple[Visit, ...], now: Ns) ->
     )
 
 
-class RegionVisit(NamedTuple):
+class TrackedStay(NamedTuple):
     """A visit to a region by a track.
 
     Attributes:
@@ -256,16 +249,16 @@ class RegionVisit(NamedTuple):
         track: of the robot.
     """
 
-    inside: Inside
-    whole: Inside
+    inside: Stay
+    whole: Stay
     track: RobotTrack
 
 
-class RegionVisits:
+class ConfirmedStays:
     """The visits to a region of a frame that reach into a window.
 
     Attributes:
-        joined: the tracks of the robots.
+        known: the tracks of the robots.
         every: their visits, newest first.
         elapsed: how much time passed between moments of the window.
     """
@@ -276,15 +269,15 @@ class RegionVisits:
         Raises:
             QueryTimeoutError: the call's time runs out before any result.
         """
-        self.joined = joined_in(view, frame_id, window)
+        self.known = known_track(view, frame_id, window)
         self.elapsed = elapsed_in(view, window)
         self._region, self._window = region, window
         # The poses that confirm a visit show where it begins, too.
-        self._poses = lru_cache(2 * _MOST_TRIED)(RobotTracks(view, frame_id).poses)
+        self._poses = lru_cache(2 * _MOST_TRIED)(TrackReader(view, frame_id).poses)
         by_track = [
-            RegionVisit(stay.within(window), stay, track)
-            for track in self.joined.tracks
-            for stay in self._continued(times_inside(track, region))
+            TrackedStay(stay.within(window), stay, track)
+            for track in self.known.tracks
+            for stay in self._continued(stays(track, region))
             if window.overlaps(stay.start, stay.stop)
         ]
         by_track.sort(key=lambda visit: visit.whole, reverse=True)
@@ -296,12 +289,12 @@ class RegionVisits:
         """How long they were in all, as the tracks have them."""
         return self.elapsed.among((visit.inside.start, visit.inside.stop) for visit in self.every)
 
-    def ends(self, visit: RegionVisit) -> Inside:
+    def ends(self, visit: TrackedStay) -> Stay:
         """Returns a visit from its first to its last pose inside, cut at the window's ends."""
         exact = self._by_poses(visit)
         return visit.inside if exact is None else exact.within(self._window)
 
-    def shown(self, visit: RegionVisit, newest: Ns | None) -> Visit:
+    def shown(self, visit: TrackedStay, newest: Ns | None) -> Visit:
         """Returns a visit for the reply.
 
         Its times are those of poses: of the first and the last one inside, and of the closest.
@@ -323,7 +316,7 @@ class RegionVisits:
             still_inside=not ends.left and not is_there,
         )
 
-    def _continued(self, visits: list[Inside]) -> list[Inside]:
+    def _continued(self, visits: list[Stay]) -> list[Stay]:
         """Returns visits; those as one between which the robot's poses did not leave.
 
         Along the edge of a region its track may be outside where it was inside. The newest
@@ -341,7 +334,7 @@ class RegionVisits:
             joined_visits.append(older)
         return joined_visits
 
-    def _stays(self, older: Inside, newer: Inside) -> bool:
+    def _stays(self, older: Stay, newer: Stay) -> bool:
         """Returns whether poses between two visits were never outside for as long as leaving takes.
 
         False where there is no pose inside before or after.
@@ -354,7 +347,7 @@ class RegionVisits:
             return False
         return not any(_absences(poses.times, inside))
 
-    def _confirmed(self, visit: RegionVisit) -> RegionVisit | None:
+    def _confirmed(self, visit: TrackedStay) -> TrackedStay | None:
         """Returns a visit; None where no pose in the window is inside: the line alone touches.
 
         The newest `_MOST_TRIED` visits without a vertex inside are looked at.
@@ -378,7 +371,7 @@ class RegionVisits:
                 return None
         return visit._replace(inside=visit.inside._replace(entered=cut.entered, left=cut.left))
 
-    def _by_poses(self, visit: RegionVisit) -> Inside | None:
+    def _by_poses(self, visit: TrackedStay) -> Stay | None:
         """Returns a visit from its first to its last pose inside, where it was entered and left.
 
         None where no pose is inside: the robot's line alone touches the region.
@@ -390,7 +383,7 @@ class RegionVisits:
             return None
         return whole._replace(start=min(first), stop=max(last))
 
-    def _inside_near(self, visit: RegionVisit, at: Ns) -> list[Ns]:
+    def _inside_near(self, visit: TrackedStay, at: Ns) -> list[Ns]:
         """Returns when poses of a visit near its begin or its end, and its vertices, are inside."""
         whole, poses = visit.whole, self._poses_around(visit.track, at)
         inside = [*self._poses_inside(poses)]
@@ -409,7 +402,7 @@ class RegionVisits:
         rows = zip(times.tolist(), x.tolist(), y.tolist(), strict=True)
         return (time for time, *place in rows if self._region.contains(*place))
 
-    def _vertices_inside(self, track: RobotTrack, stay: Inside) -> Iterator[Ns]:
+    def _vertices_inside(self, track: RobotTrack, stay: Stay) -> Iterator[Ns]:
         """Yields the times of a visit's vertices that are inside."""
         first = np.searchsorted(track.times, stay.start, side="left")
         last = np.searchsorted(track.times, stay.stop, side="right")
@@ -422,7 +415,7 @@ class RegionVisits:
         after = min(int(np.searchsorted(times, at, side="right")), len(times) - 1)
         return self._poses(TimeWindow(int(times[before]), int(times[after]) + 1))
 
-    def _closest(self, track: RobotTrack, stay: Inside, circle: Circle) -> tuple[float, Ns]:
+    def _closest(self, track: RobotTrack, stay: Stay, circle: Circle) -> tuple[float, Ns]:
         """Returns how near (m) a pose of a visit was to the middle of a circle, and when."""
         first = max(int(np.searchsorted(track.times, stay.start, side="right")) - 1, 0)
         last = int(np.searchsorted(track.times, stay.stop, side="left"))
@@ -459,7 +452,7 @@ def _absences(times: Times, inside: Sequence[Ns]) -> Iterator[tuple[Ns, Ns]]:
             yield left, back
 
 
-def place_visits(region_visits: RegionVisits, name: str) -> PlaceVisits:
+def place_visits(region_visits: ConfirmedStays, name: str) -> PlaceVisits:
     """Returns how often, and for how long, the robot was in a place."""
     entries = [visit for visit in region_visits.every if visit.inside.entered]
     exits = [visit for visit in region_visits.every if visit.inside.left]

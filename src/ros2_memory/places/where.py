@@ -32,7 +32,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.places.pose_frames import (
     WHEREABOUTS,
     MapPlacement,
-    joined_in,
+    known_track,
     map_placement,
     placed_times,
 )
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.history.context import QuerySettings
     from ros2_memory.history.view import View
-    from ros2_memory.places.robot_tracks import Inside, JoinedTrack
+    from ros2_memory.places.robot_tracks import KnownTrack
 
 PLACES_SETTING: Final = "data.places_file (for a fleet: fleet.places)"
 """Where places are named, for sentences."""
@@ -251,7 +251,7 @@ def note_other_frame(
     if where.frame_id is not None or pose_frame == placement.frame_id:
         return
     with suppress(QueryTimeoutError):
-        if joined_in(view, pose_frame, window).inside(where.region, window):
+        if known_track(view, pose_frame, window).inside(where.region, window):
             view.notes.add(
                 f"x and y were taken in {placement.frame_id}; the robot was at those in "
                 f"{pose_frame}, the frame of get_position_*: {ask}"
@@ -295,7 +295,7 @@ class Scope:
         self._inside: Spans | None = None
         if where is not None:
             place = parse_where(view.limits, where)
-            joined = joined_in_region(view, place, window)
+            joined = known_track_for(view, place, window)
             self.since = joined.since
             inside = joined.inside(place.region, window)
             self._inside = united((stay.start, stay.stop + 1) for stay in inside)
@@ -357,12 +357,7 @@ class Scope:
         return parts
 
 
-def times_in_region(view: View, where: Where, window: TimeWindow) -> list[Inside]:
-    """Returns when any robot was in a region, in order; raises as `joined_in_region`."""
-    return joined_in_region(view, where, window).inside(where.region, window)
-
-
-def joined_in_region(view: View, where: Where, window: TimeWindow) -> JoinedTrack:
+def known_track_for(view: View, where: Where, window: TimeWindow) -> KnownTrack:
     """Returns the robot's track in the frame of a region: the map, unless it names another.
 
     Notes say where it is not all known, and where it is in the region in another frame alone.
@@ -374,7 +369,7 @@ def joined_in_region(view: View, where: Where, window: TimeWindow) -> JoinedTrac
     """
     topic = resolve_path_topic(view)
     placement = map_placement(view, topic, where.frame_id)
-    joined = joined_in(view, where.frame_id or placement.frame_id, window)
+    joined = known_track(view, where.frame_id or placement.frame_id, window)
     if not joined.inside(where.region, window):
         ask = f'ask it with frame_id "{placement.frame_id}"'
         note_other_frame(view, where, placement, window, ask)

@@ -378,20 +378,7 @@ class Housekeeping(Housekeeper):
     def _report(self, before: Collected, collected: Collected) -> None:
         """Reports what began or ended with a pass, and what it deleted unshipped."""
         if collected.unshipped:
-            self._unshipped += len(collected.unshipped)
-            bags = counted(self._unshipped, "bag was", "bags were")
-            newest = collected.unshipped[: -MAX_NAMED - 1 : -1]
-            sentence = (
-                f"since the recorder started, {bags} deleted unshipped, to make room "
-                f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
-            )
-            self._status = self._status._replace(unshipped=sentence)
-            _log.warning(
-                "unshipped_deleted",
-                bags=len(collected.unshipped),
-                names=[*collected.unshipped],
-                reason=sentence,
-            )
+            self._report_unshipped(collected.unshipped)
         if collected.held and not before.held:
             _log.warning("age_held", bags=collected.held, reason=self._status.age_held)
         elif before.held and not collected.held:
@@ -404,19 +391,33 @@ class Housekeeping(Housekeeper):
                 "the budget; `ros2-memory adopt DIR` takes those of a directory, and "
                 "retention.foreign=delete all",
             )
+        if before.total_bytes <= self._limits.max_total_bytes < collected.total_bytes:
+            self._report_budget_not_held(collected)
+
+    def _report_unshipped(self, unshipped: tuple[str, ...]) -> None:
+        self._unshipped += len(unshipped)
+        bags = counted(self._unshipped, "bag was", "bags were")
+        newest = unshipped[: -MAX_NAMED - 1 : -1]
+        sentence = (
+            f"since the recorder started, {bags} deleted unshipped, to make room "
+            f"(retention.max_total_gb, min_free_gb): {listed(newest, self._unshipped)}"
+        )
+        self._status = self._status._replace(unshipped=sentence)
+        _log.warning("unshipped_deleted", bags=len(unshipped), names=[*unshipped], reason=sentence)
+
+    def _report_budget_not_held(self, collected: Collected) -> None:
         most = self._limits.max_total_bytes
-        if before.total_bytes <= most < collected.total_bytes:
-            state, saved = collected.state_bytes, collected.saved_bytes
-            others = collected.total_bytes - state - saved
-            _log.error(
-                "budget_not_held",
-                total_bytes=collected.total_bytes,
-                state_bytes=state,
-                reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
-                f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
-                f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
-                "raise retention.max_total_gb",
-            )
+        state, saved = collected.state_bytes, collected.saved_bytes
+        others = collected.total_bytes - state - saved
+        _log.error(
+            "budget_not_held",
+            total_bytes=collected.total_bytes,
+            state_bytes=state,
+            reason=f"files that are never deleted exceed {most / _MB:.3g} MB: "
+            f"state and logs (.episodic, .ros_log) {state / _MB:.3g} MB, saved moments "
+            f"{saved / _MB:.3g} MB, open, damaged or newest bags {others / _MB:.3g} MB; "
+            "raise retention.max_total_gb",
+        )
 
     def _update_moments(self) -> None:
         """Saves what was asked for and updates sidecars, before anything is deleted.
@@ -427,7 +428,7 @@ class Housekeeping(Housekeeper):
             with self._index.undisturbed() as snapshot:
                 if self._moments.has_work():
                     self._moments.keep(snapshot)
-                self._moments.update_sidecars()
+                self._moments.relink_sidecars()
                 if self._triggers is not None:
                     self._triggers.look(snapshot)
         except (EpisodicError, OSError) as error:

@@ -125,7 +125,7 @@ class LossCounter:
         self._lately: deque[Loss] = deque(maxlen=10_000)
         self._counted: set[str] = set()
 
-    def begun(self, recording: str) -> None:
+    def begin(self, recording: str) -> None:
         """Notes that a recording begins, which may have what another one misses."""
         self._recordings[recording] = self._measured, 0
 

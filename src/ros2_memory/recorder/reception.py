@@ -193,7 +193,7 @@ class Reception:
             topics = {*self._flows, *anew, *self._latched}
             profiles = {topic: self._profile_of(topic, plan) for topic in topics}
             self._recordings[recording] = _Recording(plan, asked_anew=frozenset(anew))
-            self._losses.begun(recording)
+            self._losses.begin(recording)
             for name in [*self._recordings][:-_PLANS_KEPT]:
                 del self._recordings[name]
             self._asked_anew = {

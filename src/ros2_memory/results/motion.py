@@ -44,6 +44,7 @@ if TYPE_CHECKING:
         Transform,
         Twist,
     )
+    from ros2_memory.core.regions import Circle
 
 _GEODETIC: Final = keys(digits(8)("latitude"), digits(8)("longitude"), digits(4)("altitude"))
 
@@ -337,9 +338,9 @@ class PlaceVisits:
 @result(
     NAME("frame_id").merged("inherited"),
     PLAIN("where").if_known,
-    PLAIN("x").if_known,
-    PLAIN("y").if_known,
-    PLAIN("radius_m").if_known,
+    PLAIN("x", "circle.x").if_known,
+    PLAIN("y", "circle.y").if_known,
+    PLAIN("radius_m", "circle.radius_m").if_known,
     PLAIN("there_now").if_known.merged("who"),
     OBJECTS("places").if_known.along("last_exit"),
     OBJECTS("visits").unless("is_of_places").along("departed"),
@@ -356,7 +357,7 @@ class Visits(AnswerWithNotes):
 
     Attributes:
         where: the name of the place, where it has one.
-        x: of a circle, with y and radius_m; None of another region.
+        circle: the place, where it is one without a name.
         total: how many were found.
         all_counted: whether these are all; a note says how far back they were counted.
         duration: of all of these.
@@ -368,13 +369,11 @@ class Visits(AnswerWithNotes):
     """
 
     frame_id: str
-    x: float | None
-    y: float | None
-    radius_m: float | None
-    visits: tuple[Visit, ...]
-    more: bool
     total: int
     now: Ns
+    visits: tuple[Visit, ...] = ()
+    more: bool = False
+    circle: Circle | None = None
     duration: Ns = 0
     entries: int | None = None
     exits: int | None = None

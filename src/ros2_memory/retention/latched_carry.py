@@ -192,6 +192,7 @@ class Carrier:
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self.path = bag_dir / CARRY_FOLDER / CARRY_FILE
+        self._bag_dir = bag_dir
         self._reader = reader
         self._writer = writer
         self._static_topics = frozenset(static_topics)
@@ -290,8 +291,8 @@ class Carrier:
 
     def _folder(self, recording: Path) -> str:
         """Returns the directory of a recording, relative to the bag directory."""
-        bag_dir = self.path.parent.parent
-        return os.path.relpath(HardLinks(bag_dir).recorded_as(str(recording)), bag_dir)
+        recorded = HardLinks(self._bag_dir).recorded_as(str(recording))
+        return os.path.relpath(recorded, self._bag_dir)
 
     def _records(self, path: Path, topics: Collection[str]) -> Iterator[Record]:
         """Yields the messages of these topics; of a damaged bag, those that can be read.

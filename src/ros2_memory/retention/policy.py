@@ -412,12 +412,12 @@ def _too_old_by_dates(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: N
     """
     aged: set[str] = set()
     for era in eras:
-        oldest = min(max(bag.end for bag in era), stock.now) - max_age_ns
-        aged.update(bag.path for bag in era if bag.end < oldest)
+        cutoff = min(max(bag.end for bag in era), stock.now) - max_age_ns
+        aged.update(bag.path for bag in era if bag.end < cutoff)
         if era is eras[-1]:
             begun = min(bag.start for bag in era)
             undated = _outside_eras(stock.bags, *eras)
-            aged.update(bag.path for bag in undated if begun <= bag.written < oldest)
+            aged.update(bag.path for bag in undated if begun <= bag.written < cutoff)
     return aged
 
 

@@ -263,7 +263,7 @@ class MomentKeeper:
             self._waiting = True
         return None
 
-    def update_sidecars(self) -> None:
+    def relink_sidecars(self) -> None:
         """Links the sidecars of recordings again that were rewritten; a fault is reported.
 
         Which messages of a bag count is decided when its recording is over, which may be later.

@@ -169,7 +169,7 @@ class Backfill:
         return self._filled(self._follow, otherwise=False)
 
     def _follow(self, filling: Filling, timeline: Timeline) -> bool:
-        columns = self.memory.columns
+        columns = self.memory.scanner
         coverage = columns.coverage(timeline)
         waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
         make_fragments(self.memory, filling.whole_since(), waiting)
@@ -237,10 +237,10 @@ def make_fragments(
         # Of a store that has changed, all bags are looked up again: so several at once.
         unwritten += window.stop - window.start
         if unwritten >= STRETCH_NS:
-            memory.columns.write_fragments()
+            memory.scanner.write_fragments()
             unwritten = 0
         memory.large.release()
-    memory.columns.write_fragments()
+    memory.scanner.write_fragments()
 
 
 def _stretches_around(windows: Sequence[TimeWindow], waiting: Sequence[Ns]) -> Sequence[TimeWindow]:
@@ -276,7 +276,7 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
     # Each goes back in time as far as the others: what they read is still remembered.
     deque(merge(*fragments, reverse=True), maxlen=0)
     if not is_joined:
-        memory.columns.make_outlines(view.timeline, window)
+        memory.scanner.make_outlines(view.timeline, window)
 
 
 async def keep_backfilled(backfill: Backfill, every_s: float) -> None:

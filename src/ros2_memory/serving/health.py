@@ -1,4 +1,4 @@
-"""What `/health` shows, and the tasks that read the bag directory between queries.
+"""What `/health` shows, its client, and the tasks that read the bag directory between queries.
 
 The reply counts all faults and names the newest few, so that it stays small.
 """
@@ -6,6 +6,9 @@ The reply counts all faults and names the newest few, so that it stays small.
 from __future__ import annotations
 
 import asyncio
+import http
+import http.client
+import json
 import os
 from contextlib import suppress
 from dataclasses import dataclass
@@ -17,7 +20,7 @@ import anyio.to_thread
 
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import TimeWindow
+from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, moment, seconds
 from ros2_memory.core.text import encodable
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -25,6 +28,7 @@ from ros2_memory.history.context import Call, Memory, short_name
 from ros2_memory.history.coverage import recording_gaps
 from ros2_memory.history.view import View
 from ros2_memory.insights.status import clock_faults, left_open, problems_of, unrecorded
+from ros2_memory.serving.auth import HEALTH_PATH
 from ros2_memory.serving.fair_queue import FairQueue
 
 if TYPE_CHECKING:
@@ -41,6 +45,8 @@ NAMED: Final = 3
 _MAX_TOPICS: Final = 20
 _MAX_MISSING: Final = 6
 _MAX_CHARS: Final = 290
+_REPLY_WITHIN_S: Final = 5.0
+_LONGEST_REPLY: Final = 1 << 20
 
 _HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 
@@ -244,3 +250,28 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
 def _short(text: str) -> str:
     text = encodable(text)
     return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 3]}..."
+
+
+def read_health(host: str, port: int, token: str = "") -> tuple[int, dict[str, JsonValue]]:
+    """Returns the status and the reply of `/health`; an empty reply if it refuses the token.
+
+    Linux connects to the loopback address where `host` is that of all interfaces.
+
+    Raises:
+        OSError: nothing answers.
+        HTTPException: the reply is not HTTP.
+        ValueError: the reply is not a JSON object with a status.
+    """
+    headers = {"Authorization": f"Bearer {token}"} if token else {}
+    connection = http.client.HTTPConnection(host, port, timeout=_REPLY_WITHIN_S)
+    try:
+        connection.request("GET", HEALTH_PATH, headers=headers)
+        response = connection.getresponse()
+        if response.status == http.HTTPStatus.UNAUTHORIZED and token:
+            return response.status, {}
+        reply: JsonValue = json.loads(response.read(_LONGEST_REPLY))
+    finally:
+        connection.close()
+    if not isinstance(reply, dict) or "status" not in reply:
+        raise ValueError("it gives no status")
+    return response.status, reply

@@ -116,16 +116,16 @@ def web_app(
         for json_response in (True, False)
     )
 
+    def shows_all(request: Request) -> bool:
+        return not needs_token or request.scope.get(AUTHENTICATED, False)
+
     async def show_health(request: Request) -> JSONResponse:
         report = await health()
-        if needs_token and not request.scope.get(AUTHENTICATED, False):
-            # Enough for a monitor that only watches that the server is up.
-            report = {"status": report["status"]}
-        return JSONResponse(report)
+        # Enough for a monitor that only watches that the server is up.
+        return JSONResponse(report if shows_all(request) else {"status": report["status"]})
 
     async def show_recording(request: Request) -> JSONResponse:
-        is_known = not needs_token or request.scope.get(AUTHENTICATED, False)
-        return _recording(await health(), all_of_it=is_known)
+        return _recording(await health(), all_of_it=shows_all(request))
 
     @asynccontextmanager
     async def lifespan(_app: Starlette) -> AsyncIterator[None]:
@@ -143,12 +143,7 @@ def web_app(
         *(page or ()),
     ]
     if metrics is not None:
-
-        async def show_metrics(_request: Request) -> Response:
-            exposition = await metrics()
-            return Response(exposition.body, headers={"content-type": exposition.content_type})
-
-        routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
+        routes.append(_metrics_route(metrics))
     app: ASGIApp = RequestLimits(Starlette(routes=routes, lifespan=lifespan))
     if needs_token:
         app = TokenGate(app, api_token, limited=limited)
@@ -156,6 +151,14 @@ def web_app(
         # The page comes before the token: it holds no data, and asks for the token.
         app = Page(app)
     return ForgeryGuard(app, host, admits=not needs_token)
+
+
+def _metrics_route(metrics: Callable[[], Awaitable[Exposition]]) -> Route:
+    async def show_metrics(_request: Request) -> Response:
+        exposition = await metrics()
+        return Response(exposition.body, headers={"content-type": exposition.content_type})
+
+    return Route(METRICS_PATH, show_metrics, methods=["GET"])
 
 
 def _session_manager(

@@ -291,7 +291,7 @@ class SqliteBags:
         with OpenFile(path) as file:
             if not file.size:
                 raise UnreadableError(EMPTY_FILE)
-            key, size = file.key, file.size
+            key, file_bytes = file.key, file.size
         # Immutable: nothing is locked, and no file appears beside the bag.
         address = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         # A generator of records may be resumed on another thread.
@@ -301,7 +301,7 @@ class SqliteBags:
                 raise UnreadableError("it was replaced while it was being opened")
             # A name that is not UTF-8 must not hide the others.
             base.text_factory = partial(str, encoding="utf-8", errors="replace")
-            guard(base, self._limit.max_bytes, size)
+            guard(base, self._limit.max_bytes, file_bytes)
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)

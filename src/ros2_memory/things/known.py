@@ -25,7 +25,7 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.results import ThingStay
 from ros2_memory.things.instances import Estimate, Mover, estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import SIGHTS_NS, Stretch, Watching
+from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Mapping, Sequence
@@ -181,7 +181,7 @@ class _Loader:
         described = tuple(sorted((name, tuple(others)) for name, others in spellings.items()))
         key = (min_score, described, view.limits.map_frame, view.pose_topic, ahead)
         self._view = view
-        self._cache = view.memory.columns.caches.things
+        self._cache = view.memory.scanner.caches.things
         self._min_score = min_score
         self._labels = Labels(spellings)
         self._ahead = ahead
@@ -267,13 +267,13 @@ class _Loader:
         self._cache.put(self._most_key, (self._view.timeline, most), _KEPT_BYTES)
 
     @cached_property
-    def _gathered(self) -> tuple[list[list[Stretch]], bool]:
+    def _gathered(self) -> tuple[list[list[SeenStretch]], bool]:
         """The newest stretches, in order, and whether they have as many spots as are compared.
 
         Where reading older ones takes too long, `_read_from` is the start of the oldest.
         """
         most = self._most_spots
-        parts: list[list[Stretch]] = []
+        parts: list[list[SeenStretch]] = []
         reading = self._view.call.partial_after(READING_S)
         spots = 0
         try:
@@ -291,7 +291,7 @@ class _Loader:
             self._read_from = parts[-1][0].start
         return parts[::-1], False
 
-    def _things_in(self, parts: Sequence[Sequence[Stretch]], *, crowded: bool) -> KnownThings:
+    def _things_in(self, parts: Sequence[Sequence[SeenStretch]], *, crowded: bool) -> KnownThings:
         """Returns the things in some stretches; `crowded` if there are too many before these.
 
         Raises:
@@ -328,7 +328,7 @@ class _Loader:
             things, self._labels, frames, since, has_map, crowded=crowded, until=self._until
         )
 
-    def _epochs(self, stretches: Sequence[Stretch]) -> tuple[list[int], tuple[str, ...]]:
+    def _epochs(self, stretches: Sequence[SeenStretch]) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each stretch, and the frame of each epoch.
 
         All that is in the map is of epoch 0. Odometry starts again in each session.
@@ -342,7 +342,7 @@ class _Loader:
         return epochs, tuple(frame for frame, _ in numbers)
 
 
-def _of_detectors(stretches: Sequence[Stretch]) -> list[Stretch]:
+def _of_detectors(stretches: Sequence[SeenStretch]) -> list[SeenStretch]:
     """Returns stretches with the sights of topics that have detections in any of them."""
     every_topic = [of_topic for stretch in stretches for of_topic in stretch.sights]
     detectors = {topic for of_topic in every_topic if of_topic.detects for topic in of_topic.topics}
@@ -354,11 +354,11 @@ def _of_detectors(stretches: Sequence[Stretch]) -> list[Stretch]:
     return found
 
 
-def _spots(part: Sequence[Stretch]) -> int:
+def _spots(part: Sequence[SeenStretch]) -> int:
     return sum(stretch.spots for stretch in part)
 
 
-def _newest_within(parts: Sequence[list[Stretch]], most: int) -> list[list[Stretch]]:
+def _newest_within(parts: Sequence[list[SeenStretch]], most: int) -> list[list[SeenStretch]]:
     """Returns the newest parts that have at most so many spots, at least one."""
     totals = accumulate(_spots(part) for part in reversed(parts))
     return [*parts[-max(sum(total <= most for total in totals), 1) :]]

@@ -68,7 +68,7 @@ _NO_DETECTIONS: Final = frozenset(
 _TEXT: Final = "std_msgs/msg/String"
 
 
-class Stretch(NamedTuple):
+class SeenStretch(NamedTuple):
     """The sights of a session in ten minutes of the clock.
 
     Attributes:
@@ -173,7 +173,7 @@ class Watching:
         self._may_be_kept = not view.stream.may_be_relatched(self._topics)
         self._digested: tuple[object, str] = None, ""
 
-    def newest_first(self, until: Ns = MAX_NS) -> Iterator[list[Stretch]]:
+    def newest_first(self, until: Ns = MAX_NS) -> Iterator[list[SeenStretch]]:
         """Yields the sights of all sessions in each stretch with some that begins before a time.
 
         Raises:
@@ -289,7 +289,7 @@ class Watching:
 
     def _sights(self, around: _Surroundings) -> bytes:
         """Returns what was seen in a stretch, in bytes; from memory where that is known."""
-        scanner = self._view.memory.columns
+        scanner = self._view.memory.scanner
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
         if is_open or not self._may_be_kept:
             return self._read(around)
@@ -383,7 +383,7 @@ class Watching:
             yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
 
 
-def _unpacked(data: bytes, around: _Surroundings) -> Iterator[Stretch]:
+def _unpacked(data: bytes, around: _Surroundings) -> Iterator[SeenStretch]:
     """Yields the sights of each session of a stretch: a head as JSON, then those of each topic.
 
     The head has which of the sessions around it is, the frame, how many spots there are, and of
@@ -397,7 +397,7 @@ def _unpacked(data: bytes, around: _Surroundings) -> Iterator[Stretch]:
             sights.append(TopicSights(tuple(names), detects, data[begin : begin + length]))
             begin += length
         session = around.sessions[number].session
-        yield Stretch(around.window.start, frame_id, session, spots, tuple(sights))
+        yield SeenStretch(around.window.start, frame_id, session, spots, tuple(sights))
 
 
 class _Parts(NamedTuple):
@@ -425,7 +425,7 @@ class _Parts(NamedTuple):
 
         None without a store, and where it failed meanwhile.
         """
-        scanner = view.memory.columns
+        scanner = view.memory.scanner
         if scanner.store is None:
             return None
         failures = scanner.store.failures

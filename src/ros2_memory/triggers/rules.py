@@ -97,6 +97,11 @@ class Rule:
     max_bytes: int
     max_per_hour: int
 
+    @property
+    def is_of_restarts(self) -> bool:
+        """Whether it fires when the recorder restarts (`kind: recorder_restart`)."""
+        return self.topic is None
+
     def selects(self, topics: Iterable[str]) -> list[str]:
         """Returns those of the topics that the rule watches."""
         if self.topic is None:
@@ -280,7 +285,7 @@ class SplitSearch:
         self._failing = FailingFiles(monotonic)
         self._reader = reader
         self._extractor = extractor
-        self._rules = [rule for rule in rules if rule.topic is not None]
+        self._rules = [rule for rule in rules if not rule.is_of_restarts]
         self._watching: dict[str, tuple[Rule, ...]] = {}
         self._tested: set[tuple[str, str]] = set()
 

@@ -64,7 +64,6 @@ class Triggers:
         clock: the wall clock.
         split_duration_s: how long one split is.
         is_recorded: whether a topic is among those that the recorder is to record.
-        monotonic: a clock that never steps, in seconds.
 
     Attributes:
         restarts: those of the recording that are still to be evaluated; from when to when.
@@ -81,7 +80,6 @@ class Triggers:
         clock: Clock,
         split_duration_s: float,
         is_recorded: Callable[[str], bool] = bool,
-        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bag_dir = bag_dir
         self._rules = {rule.name: rule for rule in rules}
@@ -91,7 +89,6 @@ class Triggers:
         self._clock = clock
         self._split = ns_from_unix(split_duration_s)
         self._is_recorded = is_recorded
-        self._monotonic = monotonic
         self._state: TriggerState | None = None
         self._lock = threading.Lock()
         self.restarts: list[tuple[Ns, Ns]] = []
@@ -117,7 +114,7 @@ class Triggers:
             restarts, self.restarts = self.restarts, []
             deleted, self._deleted = self._deleted, 0
         for (first, at), rule in product(restarts, self._rules.values()):
-            if rule.topic is None:
+            if rule.is_of_restarts:
                 self._add_firing(Firing(rule.name, "", first, at), state, snapshot)
         for name, rule in self._rules.items():
             self._store_moments(name, state.rules[name], snapshot)
@@ -143,10 +140,10 @@ class Triggers:
             self._is_written = True
 
     def _search_closed(self, state: TriggerState, snapshot: Snapshot) -> None:
-        deadline = self._monotonic() + LOOK_S
+        deadline = time.monotonic() + LOOK_S
         closed, live = self._closed_bags(snapshot, state)
         for chain in chains_to_search(closed, live, state.searched, self._previous, self._split):
-            fired, stopped = self._search.search(chain, state, lambda: self._monotonic() > deadline)
+            fired, stopped = self._search.search(chain, state, lambda: time.monotonic() > deadline)
             for firing in fired:
                 self._add_firing(firing, state, snapshot)
             for part in chain.parts:

@@ -84,7 +84,7 @@ def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> Non
         for n in range(21)
     ]
     write_mcap(tmp_path / "bag.mcap", messages)
-    asked = asked_of(tmp_path)
+    asked = asked_in(tmp_path)
     path = plot.path_in(asked, None, None)
     assert path.frame == "map"
     assert (path.xs[0], path.xs[-1]) == pytest.approx((0.0, 11.0))
@@ -99,7 +99,7 @@ def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> Non
 
 def test_without_poses_and_transforms_it_is_that_of_the_satellite_receiver(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [fix(T0 + n * S, n * 1e-4, -n * 2e-4) for n in (0, 1, 2)])
-    path = plot.path_in(asked_of(tmp_path), None, None)
+    path = plot.path_in(asked_in(tmp_path), None, None)
     assert path.frame == "east and north of 48.123457, 11.765432"
     # One minute of latitude is a nautical mile, 1852 m, within 1 %.
     assert path.ys == pytest.approx([0.0, 1852 * 0.006, 2 * 1852 * 0.006], rel=0.01)
@@ -108,7 +108,7 @@ def test_without_poses_and_transforms_it_is_that_of_the_satellite_receiver(tmp_p
         [0, -1852 * 0.012 * shrunk, -2 * 1852 * 0.012 * shrunk], rel=0.01
     )
     assert path.line.endswith("by 3 of 3 fixes of /fix")
-    assert plot.path_in(asked_of(tmp_path), "/fix", None).line == path.line
+    assert plot.path_in(asked_in(tmp_path), "/fix", None).line == path.line
 
 
 @given(
@@ -136,8 +136,8 @@ def test_times_in_errors_are_printed_as_they_are_typed(bags: Path, exits: Progra
     assert "1700000060" not in shown
 
 
-def asked_of(bags: Path) -> plot.Asked:
-    return plot.opened(memory_of(bags), TimeWindow.everything())
+def asked_in(bags: Path) -> plot.Asked:
+    return plot.asked_in(memory_of(bags), TimeWindow.everything())
 
 
 @pytest.mark.parametrize("kind", ["path", "signal /battery_state", "timeline", "recap"])
@@ -151,7 +151,7 @@ def test_each_is_a_picture_of_the_asked_kind(
 
 
 def test_the_path_is_that_of_the_poses(bags: Path) -> None:
-    path = plot.path_in(asked_of(bags), None, None)
+    path = plot.path_in(asked_in(bags), None, None)
     assert (path.frame, path.xs[0], path.ys[0]) == ("odom", 0.0, 0.0)
     assert (path.xs[-1], path.ys[-1]) == (10.0, 9.8)
     assert np.interp(1_700_000_005.0, path.times, path.xs) == pytest.approx(5.0, abs=0.06)
@@ -165,7 +165,7 @@ def test_a_short_curve_is_drawn_through_each_pose(tmp_path: Path) -> None:
         for n, turn in enumerate(turns)
     ]
     write_mcap(tmp_path / "bag.mcap", circle)
-    path = plot.path_in(asked_of(tmp_path), None, None)
+    path = plot.path_in(asked_in(tmp_path), None, None)
     assert len(path.xs) == 101
     assert all(
         math.hypot(x, y - 2) == pytest.approx(2, abs=1e-4)
@@ -174,17 +174,17 @@ def test_a_short_curve_is_drawn_through_each_pose(tmp_path: Path) -> None:
 
 
 def test_a_signal_has_its_numbers_and_a_gap_where_there_is_none(bags: Path) -> None:
-    total, signals, _ = plot.signals_of(asked_of(bags), "/battery_state", ["percentage"])
+    total, signals, _ = plot.signals_of(asked_in(bags), "/battery_state", ["percentage"])
     _, charge = signals["percentage"]
     assert (total, charge[0], charge[-1]) == (30, 80.0, 51.0)
-    _, signals, notes = plot.signals_of(asked_of(bags), "/odom", [])
+    _, signals, notes = plot.signals_of(asked_in(bags), "/odom", [])
     assert [*signals] == ["position.x", "position.y"]  # nothing else changes
     assert sum(map(math.isnan, signals["position.x"][1])) == 1
     assert notes == []
 
 
 def test_lanes_show_what_was_recorded_and_what_was_not(bags: Path) -> None:
-    asked = asked_of(bags)
+    asked = asked_in(bags)
     rows = {name: spans for name, spans, _ in plot.event_rows(asked, asked.recap())}
     start = 1_700_000_000.0
     assert rows["recorded"] == [(start, start + 29.8), (start + 60, start + 69.8)]
@@ -258,5 +258,5 @@ def test_a_field_that_is_not_known_at_first_is_drawn(tmp_path: Path) -> None:
         for nth, each in enumerate(values)
     ]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
-    _, signals, _ = plot.signals_of(asked_of(tmp_path), "/f", ())
+    _, signals, _ = plot.signals_of(asked_in(tmp_path), "/f", ())
     assert [len(drawn) for _, drawn in signals.values()] == [len(values)]

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from ros2_memory.analysis.motion.robot_track import track_part
+from ros2_memory.analysis.motion.robot_track import partial_track
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, from_bytes, to_bytes
 from ros2_memory.columns.kinds import TRACKS
 from ros2_memory.columns.pack import compressed
@@ -122,7 +122,7 @@ def test_a_fragment_is_the_same_once_it_was_stored(whole: Whole) -> None:
 def test_a_robot_that_stands_takes_few_bytes() -> None:
     times = np.arange(0, 600 * S, S // 25) + T0
     level = np.ones(times.size)
-    track = track_part(times, level, level, level)
+    track = partial_track(times, level, level, level)
     assert len(to_bytes(track, TRACKS.classes)) < 1000
 
 
@@ -219,7 +219,7 @@ def test_a_damaged_fragment_is_made_again_and_takes_its_place(
     view = View(again.memory, Call())
     slices = [*slices_of_path(view, "/odom", EVERYTHING, [])]
     assert sum(path.poses for _, path in slices) == 600
-    again.memory.columns.write_fragments()
+    again.memory.scanner.write_fragments()
     assert damaged() == 0
     assert fragments_in(store_file(tmp_path)) == before
 

@@ -141,7 +141,7 @@ def test_every_question_is_answered_as_without_a_store(
         plain = memory_of(bag_dir, reader=BagDirReader(McapReader()), limits=limits)
         recalled = with_store(plain, bag_dir, part=part, share=share)
         if anew:  # as another process: nothing is in memory
-            recalled = replace(plain, columns=Scanner(recalled.columns.store, bag_dir))
+            recalled = replace(plain, scanner=Scanner(recalled.scanner.store, bag_dir))
         # Who fills a store reads all of a bag, and so knows of its damage earlier.
         monkeypatch.setattr(Scanner, "damaged_parts", lambda *_: [])
         for asked, ask in questions(moments, draw):

@@ -64,7 +64,7 @@ def test_bags_that_are_not_stored_are_left_out_where_that_is_asked(tmp_path: Pat
     expected = sum(bag.summary.of("/odom")[0].count for bag in bags[:2])
     found = scan(View(world.memory, Call()), "/odom", EVERYTHING, stored=True)
     assert sum(map(len, found)) == expected
-    without = replace(world.memory, columns=Scanner(None, tmp_path))
+    without = replace(world.memory, scanner=Scanner(None, tmp_path))
     assert [*scan(View(without, Call()), "/odom", EVERYTHING, stored=True)] == []
 
 
@@ -104,7 +104,7 @@ def test_parts_that_another_process_makes_meanwhile_hide_no_row(
         other.fill()
         return parts(*asked)
 
-    world = replace(world, memory=replace(world.memory, columns=Scanner(world.store, tmp_path)))
+    world = replace(world, memory=replace(world.memory, scanner=Scanner(world.store, tmp_path)))
     monkeypatch.setattr(world.store, "parts", after_a_merge)
     assert check_rows(world, "/odom") == 40
     assert world.store.unmerged() == frozenset()

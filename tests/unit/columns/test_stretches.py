@@ -246,6 +246,6 @@ def test_two_robots_side_by_side_have_no_stretch_made_anew_with_each_bag(tmp_pat
         world = World.of(tmp_path)
         world.fill()
         assert [*slices_of_path(View(world.memory, Call()), "/odom", WINDOW, [])]
-        world.memory.columns.write_fragments()
+        world.memory.scanner.write_fragments()
         found.append(joined_fragments(store_file(tmp_path)))
     assert found == found[:1] * 3 != [0] * 3

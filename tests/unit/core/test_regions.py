@@ -14,7 +14,7 @@ from ros2_memory.core.regions import (
     Rectangle,
     Region,
     Steps,
-    parts_inside,
+    clipped,
     places_at,
 )
 
@@ -39,7 +39,7 @@ def steps(draw: Random, count: int = 300) -> Steps:
 def test_the_parts_inside_are_those_whose_points_are(region: Region, seed: int) -> None:
     draw = Random(seed)
     path = steps(draw)
-    parts = parts_inside(region, path)
+    parts = clipped(region, path)
     assert (parts.start <= parts.stop).all()
     for _ in range(500):
         step, share = draw.randrange(len(path.x)), draw.random()

@@ -53,7 +53,7 @@ def storing(memory: Memory, folder: Path, draw: Random, *, part: float = 1.0) ->
     for batch in filling.batches(timeline):
         if not {*batch.bags} & {*bags[stop:]}:
             filling.fill(batch, timeline)
-    return replace(memory, columns=scanner)
+    return replace(memory, scanner=scanner)
 
 
 def noisy(draw: Random, count: int = 900, every: int = 10 * S) -> list[Msg]:

@@ -68,5 +68,5 @@ def test_what_was_stored_is_not_read_again(tmp_path: Path, monkeypatch: pytest.M
     assert found(later) == [absent]
     (tmp_path / "r" / "metadata.yaml").unlink()
     later.store_listings(later.index.refresh())
-    assert later.columns.store is not None
-    assert later.columns.store.listings() == {}
+    assert later.scanner.store is not None
+    assert later.scanner.store.listings() == {}

@@ -42,7 +42,7 @@ def test_a_later_process_reads_them_from_the_store(
     from_bags = recalled(memory)
     assert from_bags["counts"] == {"errors": 1, "on/off changes": 24, "sightings": 6}
     filled = with_store(memory, tmp_path)
-    filled.columns.write_fragments()
+    filled.scanner.write_fragments()
 
     def worked_out_again(*_: object) -> None:
         pytest.fail("a part's messages were looked at again")

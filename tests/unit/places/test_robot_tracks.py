@@ -14,7 +14,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
-from ros2_memory.places.robot_tracks import JoinedTrack, RobotTracks
+from ros2_memory.places.robot_tracks import KnownTrack, TrackReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
 from tests.support.bags import write_mcap
 from tests.support.memories import memory_of, with_store
@@ -48,11 +48,11 @@ def bag_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def track(memory: Memory, window: TimeWindow) -> JoinedTrack:
-    return RobotTracks(View(memory, Call()), "map").over(window)
+def track(memory: Memory, window: TimeWindow) -> KnownTrack:
+    return TrackReader(View(memory, Call()), "map").over(window)
 
 
-def assert_same(one: JoinedTrack, other: JoinedTrack) -> None:
+def assert_same(one: KnownTrack, other: KnownTrack) -> None:
     assert one.left_out == other.left_out
     for name in (each.name for each in fields(one.track)):
         here, there = getattr(one.track, name), getattr(other.track, name)
@@ -89,9 +89,9 @@ class Unread(Rosbag2Reader):
 def test_making_tracks_reads_no_bag_that_waits_to_be_stored(bag_dir: Path, tmp_path: Path) -> None:
     bag_dir = copytree(bag_dir / "rec", tmp_path / "rec").parent
     plain = memory_of(bag_dir)
-    store = with_store(plain, bag_dir, part=0.8).columns.store
-    most = replace(plain, columns=Scanner(store, bag_dir), reader=Unread())
+    store = with_store(plain, bag_dir, part=0.8).scanner.store
+    most = replace(plain, scanner=Scanner(store, bag_dir), reader=Unread())
     window = TimeWindow(BEGIN, BEGIN + MINUTES * 60 * S)
-    assert [*RobotTracks(View(most, Call(stored=True)), "odom").made(window)]
+    assert [*TrackReader(View(most, Call(stored=True)), "odom").made(window)]
     with pytest.raises(AssertionError, match="are read"):
-        RobotTracks(View(most, Call()), "odom").over(window)
+        TrackReader(View(most, Call()), "odom").over(window)

@@ -113,7 +113,7 @@ def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
         "new": [range(60, 100), {*range(100, 200)} - {150 * taken}, range(200, 400)],
     }
     for name in splits:
-        counter.begun(name)
+        counter.begin(name)
     losses = [
         loss
         for name in order
@@ -124,7 +124,7 @@ def test_a_hole_waits_for_the_other_recording_of_a_long_handover(
 
 def test_a_recording_that_brings_nothing_is_not_waited_for_for_ever() -> None:
     counter = LossCounter()
-    counter.begun("dead")
+    counter.begin("dead")
     kept = [each for each in range(800) if each != 5]
     losses = [
         loss
@@ -215,7 +215,7 @@ def test_stamps_of_a_clock_that_was_set_back_are_followed_from_there() -> None:
     counter = LossCounter()
     counter.measured("a", progress([*range(1000)]))
     an_hour = 3600 * 50
-    counter.begun("b")
+    counter.begin("b")
     losses: list[Loss] = []
     for split in range(9):
         first = 1000 + split * 100 - an_hour
@@ -228,9 +228,9 @@ def test_stamps_of_a_clock_that_was_set_back_are_followed_from_there() -> None:
 
 def test_what_is_latched_and_comes_again_in_a_rotation_hides_no_loss() -> None:
     counter = LossCounter()
-    counter.begun("old")
+    counter.begin("old")
     assert counter.measured("old", progress([*range(100)])) == []
-    counter.begun("new")
+    counter.begin("new")
     again = [Position(value, T0 + 205 * PERIOD) for value, _ in at([*range(90, 130)])]
     new = [*at([*range(205, 210)]), *again, *at([*range(210, 300)])]
     old = progress([tick for tick in range(100, 215) if not 180 <= tick < 190])

@@ -100,7 +100,7 @@ class TestKeeping:
 
         monkeypatch.setattr(type(sidecar), "samefile", gone)
         with structlog.testing.capture_logs() as logs:
-            house._moments.update_sidecars()
+            house._moments.relink_sidecars()
         assert [each for each in logs if each["event"] == "moment_not_followed"] == []
 
     def test_what_was_never_recorded_is_refused(self, tmp_path: Path) -> None:

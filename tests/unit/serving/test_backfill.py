@@ -59,7 +59,7 @@ def storing(
     store = ColumnStore([bag_dir / OWN_FOLDER / FILE], memory.reader.definition)
     scanner = Scanner(store, bag_dir, reading)
     filling = Filling(scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
-    memory = replace(memory, columns=scanner)
+    memory = replace(memory, scanner=scanner)
     return memory, Backfill(memory, filling)
 
 
@@ -70,9 +70,9 @@ def outlines_in(bag_dir: Path) -> list[tuple[int, str]]:
 
 
 def stored(memory: Memory) -> list[str]:
-    assert memory.columns is not None
-    assert memory.columns.store is not None
-    return sorted(memory.columns.store.paths())
+    assert memory.scanner is not None
+    assert memory.scanner.store is not None
+    return sorted(memory.scanner.store.paths())
 
 
 def test_when_all_is_stored_nothing_waits(tmp_path: Path) -> None:
@@ -110,16 +110,16 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
         pass
     outlines = outlines_in(tmp_path)
     memory, backfill = storing(tmp_path, reading="after")
-    assert memory.columns is not None
-    before = len(memory.columns.fragments_of_others())
+    assert memory.scanner is not None
+    before = len(memory.scanner.fragments_of_others())
     assert backfill.follow()
-    assert 0 < len(memory.columns.fragments_of_others()) < before
+    assert 0 < len(memory.scanner.fragments_of_others()) < before
     while backfill.follow():
         pass
-    assert memory.columns.fragments_of_others() == []
+    assert memory.scanner.fragments_of_others() == []
     # They depend on no settings.
     assert outlines_in(tmp_path) == outlines != []
-    known = storing(tmp_path, reading="before")[0].columns
+    known = storing(tmp_path, reading="before")[0].scanner
     assert known is not None
     assert known.fragments_of_others() == []
 

@@ -23,7 +23,7 @@ from ros2_memory.bag_dir.moment_file import (
     make_moment_folder,
     write_saved_moment,
 )
-from ros2_memory.cli.plot import opened
+from ros2_memory.cli.plot import asked_in
 from ros2_memory.columns.fill import Progress
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import TimeWindow
@@ -134,7 +134,7 @@ def test_a_span_asked_for_again_keeps_its_ends_and_what_it_holds(tmp_path: Path)
     memory = memory_of(tmp_path)
     first = shown(memory, "last=1000")
     again = shown(memory, f"start={first['start']:.3f}&end={first['end']:.3f}")
-    picture = opened(memory, TimeWindow.everything()).recap()
+    picture = asked_in(memory, TimeWindow.everything()).recap()
     assert picture is not None
     for each in (first, again):
         assert each["distance_m"] == picture.distance_m == 3.5
@@ -195,7 +195,7 @@ def test_bounds_of_rounded_numbers_enclose_their_mean(tmp_path: Path) -> None:
     poses = [odom(BEGIN + n * S, x, 0.0) for n, x in enumerate(positions)]
     write_mcap(tmp_path / "rec" / "rec_0.mcap", poses)
     plain = memory_of(tmp_path)
-    for asked_of in (plain, replace(plain, columns=stored_columns(plain, tmp_path))):
+    for asked_of in (plain, replace(plain, scanner=stored_columns(plain, tmp_path))):
         signal = "/odom:pose.pose.position.x"
         [found] = shown(asked_of, f"last=1000&signal={signal}")["signals"]
         assert all(low <= mean <= high for low, mean, high in zip(*bounds(found), strict=True))

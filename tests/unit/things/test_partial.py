@@ -51,10 +51,10 @@ def fresh(tmp_path: Path) -> Callable[[], Memory]:
     """
     moments = [looked(APART_S * n, APART_S * n + 3, HERE, thing) for n, thing in enumerate(THINGS)]
     write_splits(tmp_path, [message for some in moments for message in some])
-    stored = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).columns
+    stored = with_store(memory_of(tmp_path, limits=NAMED), tmp_path, part=0.25).scanner
     assert stored is not None
     return lambda: replace(
-        memory_of(tmp_path, limits=NAMED), columns=Scanner(stored.store, tmp_path)
+        memory_of(tmp_path, limits=NAMED), scanner=Scanner(stored.store, tmp_path)
     )
 
 
@@ -146,7 +146,7 @@ class WithoutEstimates(ByteLru[tuple[Timeline, object]]):
 def test_where_a_machine_was_slow_for_a_while_all_are_compared_again(
     crowded: Memory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scanner = crowded.columns
+    scanner = crowded.scanner
     assert scanner is not None
     caches = replace(scanner.caches, things=WithoutEstimates(1 << 20))
     monkeypatch.setattr(scanner, "caches", caches)

@@ -55,14 +55,14 @@ def made_in(bag_dir: Path) -> World:
 
 
 def make(memory: Memory) -> None:
-    assert memory.columns is not None
+    assert memory.scanner is not None
     deque(Watching(View(memory, Call())).made(EVERYTHING), maxlen=0)
-    memory.columns.write_fragments()
+    memory.scanner.write_fragments()
 
 
 def another(world: World) -> Memory:
     """The memory of another process over the same store."""
-    return replace(world.memory, columns=Scanner(world.store, world.bag_dir))
+    return replace(world.memory, scanner=Scanner(world.store, world.bag_dir))
 
 
 def stored(bag_dir: Path) -> int:

@@ -79,7 +79,7 @@ class RobotTrack:
         return self.times[self.begins], self.times[self.ends]
 
 
-class TrackPart(NamedTuple):
+class PartialTrack(NamedTuple):
     """The track by some poses, in order of time, before it is joined with those before and after.
 
     Attributes:
@@ -112,22 +112,22 @@ class TrackPart(NamedTuple):
         """The arrays of its vertices."""
         return self[:6]
 
-    def some(self, index: NDArray[np.intp]) -> TrackPart:
+    def some(self, index: NDArray[np.intp]) -> PartialTrack:
         """Returns some vertices of it, in the order given."""
         columns = (column[index] for column in self.columns)
-        return TrackPart._make((*columns, self.left_out, self.recording))
+        return PartialTrack._make((*columns, self.left_out, self.recording))
 
 
-def united_parts(parts: Sequence[TrackPart]) -> TrackPart:
+def end_to_end(parts: Sequence[PartialTrack]) -> PartialTrack:
     """Returns the vertices of parts, one at least, in their order, under the first's recording."""
     columns = map(np.concatenate, zip(*(part.columns for part in parts), strict=True))
     left_out = sum(part.left_out for part in parts)
-    return TrackPart._make((*columns, left_out, parts[0].recording))
+    return PartialTrack._make((*columns, left_out, parts[0].recording))
 
 
 def empty_track() -> RobotTrack:
     """Returns a track without a vertex."""
-    return track_by(*joined_parts([]))
+    return track_by(*joined_tracks([]))
 
 
 def thinned(times: Times, recordings: Times | int = 0) -> NDArray[np.intp]:
@@ -153,7 +153,9 @@ def _is_last(is_first: Mask) -> Mask:
     return np.append(is_first[1:], [True])[: len(is_first)]
 
 
-def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0) -> TrackPart:
+def partial_track(
+    times: Times, x: Floats, y: Floats, heading: Floats, left_out: int = 0
+) -> PartialTrack:
     """Returns the track by poses in log-time order; those that are no place are left out."""
     fine = np.flatnonzero((np.abs(x) < _MAX_M) & (np.abs(y) < _MAX_M))  # false for NaN
     fine = fine[thinned(times[fine])]
@@ -164,16 +166,16 @@ def track_part(times: Times, x: Floats, y: Floats, heading: Floats, left_out: in
     slices = times // TRACK_SLICE_NS
     settled = (slices > slices[:1].sum()) & (slices < slices[-1:].sum())
     turns = _continuous(turns, np.zeros(len(times), np.bool_))
-    part = TrackPart(times, x, y, turns, known, settled, left_out)
+    part = PartialTrack(times, x, y, turns, known, settled, left_out)
     return part.some(_vertices(part, ~settled, np.zeros(len(times), np.int64)))
 
 
 def track_of(times: Times, x: Floats, y: Floats, heading: Floats) -> RobotTrack:
     """Returns the track of poses in log-time order; those that are no place are left out."""
-    return track_by(*joined_parts([[track_part(times, x, y, heading)]]))
+    return track_by(*joined_tracks([[partial_track(times, x, y, heading)]]))
 
 
-def track_by(whole: TrackPart, recordings: Times, fastest_mps: float = math.inf) -> RobotTrack:
+def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.inf) -> RobotTrack:
     """Returns the track by the vertices of recordings; of two of one time the first counts.
 
     `recordings`: the number of the recording of each vertex.
@@ -186,7 +188,7 @@ def track_by(whole: TrackPart, recordings: Times, fastest_mps: float = math.inf)
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
-def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, Times]:
+def joined_tracks(recordings: Sequence[Sequence[PartialTrack]]) -> tuple[PartialTrack, Times]:
     """Returns the tracks by the poses of all tables of recordings, one track after the other.
 
     With the number of the recording of each vertex. All at once: a week has thousands of them.
@@ -194,9 +196,9 @@ def joined_parts(recordings: Sequence[Sequence[TrackPart]]) -> tuple[TrackPart, 
     parts_in_order = [part for parts in recordings for part in parts]
     if not parts_in_order:
         times, none = np.zeros(0, np.int64), np.zeros(0)
-        return track_part(times, none, none, none), times
+        return partial_track(times, none, none, none), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
-    whole, numbers = united_parts(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
+    whole, numbers = end_to_end(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
@@ -223,7 +225,7 @@ def _continuous(turns: Times, are_known: Mask) -> Times:
     return whole
 
 
-def _vertices(part: TrackPart, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
+def _vertices(part: PartialTrack, keeps: Mask, recordings: Times) -> NDArray[np.intp]:
     """Returns which poses are vertices: those to keep, and what their slices need besides."""
     times = part.times
     is_first = _is_new(times // TRACK_SLICE_NS, recordings)

@@ -65,7 +65,7 @@ from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import open_view
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.places.where import parse_where, times_in_region
+from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
@@ -185,9 +185,10 @@ class _Forget:
         if where is not None:
             with spinner(f"looking when the robot was in {where}"):
                 view = open_view(self._memory, Call(), None)
-                inside = times_in_region(view, parse_where(self._memory.limits, where), window)
+                place = parse_where(self._memory.limits, where)
+                stays = known_track_for(view, place, window).inside(place.region, window)
             margin = PLACE_MARGIN_NS
-            around = [TimeWindow(time.start - margin, time.stop + margin + 1) for time in inside]
+            around = [TimeWindow(stay.start - margin, stay.stop + margin + 1) for stay in stays]
             windows = [time.intersect(window) for time in around]
             unknown = [f"what is not known: {note}" for note in view.notes.sentences()]
         with spinner("looking which topics there are"):
@@ -291,15 +292,21 @@ class _Forget:
                 else:
                     going.append(bag)
         deleted_too = {other_form(bag.file) for bag in going}
-        for aside, span in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
-            reason, span = aside.reason, self._written.get(aside.path, span)  # noqa: PLW2901
-            if span is None:
-                reason = f"when it was recorded is unknown ({reason})"
-            elif aside.until is not None or not span.overlaps(window.start, window.stop - 1):
-                continue
-            if str(aside.path) not in deleted_too:
-                kept.append(f"{self._name(aside)}: {reason}")
+        kept += (
+            f"{self._name(aside)}: {reason}"
+            for aside, reason in self._unread_in(window, snapshot)
+            if str(aside.path) not in deleted_too
+        )
         return going, kept
+
+    def _unread_in(self, window: TimeWindow, snapshot: Snapshot) -> Iterator[tuple[SetAside, str]]:
+        """Yields the files that may have messages in a window and are not read, each with why."""
+        for aside, bounds in {**snapshot.unread_spans, **snapshot.unread_bounds}.items():
+            span = self._written.get(aside.path, bounds)
+            if span is None:
+                yield aside, f"when it was recorded is unknown ({aside.reason})"
+            elif aside.until is None and span.overlaps(window.start, window.stop - 1):
+                yield aside, aside.reason
 
     def _may_hold(self, aside: SetAside, snapshot: Snapshot) -> TimeWindow | None:
         """Returns what a file may hold that is being written, from the first message in it."""

@@ -7,7 +7,6 @@ a pixel of the screen.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -20,7 +19,7 @@ from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
 from ros2_memory.history.view import View
 from ros2_memory.places.local_map import local_track
 from ros2_memory.places.pose_frames import robot_places
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import TrackReader
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -64,10 +63,10 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
         NoDataError: no topic places the robot.
         QueryTimeoutError: the call's time is over before its track is known.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    view = View(memory, call.within(_QUICK_S), window.stop)
     places, tracks = robot_places(view, window), None
     if places is not None:
-        tracks = RobotTracks(view, places.map_frame)
+        tracks = TrackReader(view, places.map_frame)
         frame, track = places.map_frame, tracks.over(window).track
     elif (local := local_track(view, view.pose_topic, window)) is not None:
         frame, track = local
@@ -117,7 +116,7 @@ def _bounds(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 
 def _every_pose(
-    tracks: RobotTracks, track: RobotTrack, stretches: Sequence[tuple[int, int]]
+    tracks: TrackReader, track: RobotTrack, stretches: Sequence[tuple[int, int]]
 ) -> Iterator[_Line]:
     """Yields a line through each pose of a stretch, the newest stretch first, while time lasts."""
     for first, last in reversed(stretches):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -56,7 +56,7 @@ from ros2_memory.insights.saved_moments import list_moments
 from ros2_memory.insights.status import memory_status
 from ros2_memory.places.local_map import local_track
 from ros2_memory.places.pose_frames import robot_places
-from ros2_memory.places.robot_tracks import RobotTracks
+from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.queries import data_time_range
 from ros2_memory.serving.page.topics import Signal, signal_in
 from ros2_memory.things.find import find_things
@@ -272,7 +272,7 @@ def _united_parts(
         if request.first:
             budget_s = max(whole.left_s(), 0.0) / 2
         try:
-            known = part(replace(call, deadline=call.deadline.within(budget_s)))
+            known = part(call.within(budget_s))
         except QueryTimeoutError as error:
             known = Shown({}, (f"the {name} are not known yet: {error}",))
         shown |= known.keys
@@ -328,7 +328,7 @@ def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
     places = robot_places(view, window)
     if places is None:
         return _path_by_fixes(view, window, latest)
-    tracks = RobotTracks(view, places.map_frame)
+    tracks = TrackReader(view, places.map_frame)
     # With what was just before, to know whether the path goes on from there.
     tracked = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
     track = cut(tracked.track, window)
@@ -372,11 +372,11 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
     Raises:
         QueryTimeoutError: it is not known within the time of a quick answer.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    view = View(memory, call.within(_QUICK_S), window.stop)
     places = robot_places(view, window)
     if places is None:
         return None
-    tracked = RobotTracks(view, places.map_frame).over(window)
+    tracked = TrackReader(view, places.map_frame).over(window)
     return _drawn(cut(tracked.track, window), places.map_frame, is_whole=tracked.since is None)
 
 

@@ -7,7 +7,6 @@ the greatest of each. Labels count without a place, too.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -54,7 +53,7 @@ def labels_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_PATIENT_S)), window.stop)
+    view = View(memory, call.within(_PATIENT_S), window.stop)
     least = memory.limits.min_score
     in_view = [
         events.visible for events in found_events(view, window).values() if events is not None
@@ -205,7 +204,7 @@ def topics_shown(memory: Memory, call: Call, window: TimeWindow) -> JsonObject:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    view = View(memory, replace(call, deadline=call.deadline.within(_QUICK_S)), window.stop)
+    view = View(memory, call.within(_QUICK_S), window.stop)
     topics = view.timeline.topics()
     return {
         "topics": [_topic_row(view, topic, window) for topic in topics[:MOST_TOPICS]],
@@ -268,7 +267,7 @@ def _binned(times: NDArray[np.int64], window: TimeWindow) -> NDArray[np.int64]:
 
 def _numbers(view: View, topic: str) -> list[str]:
     """Returns the fields of a topic's newest message that are numbers, as dot-paths."""
-    newest = view.stream.newest(topic, TimeWindow.everything())
+    newest = view.stream.last(topic)
     if newest is None or len(newest.record.payload) > _LARGEST_BYTES:
         return []
     message = view.bags.decode(newest)

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from ros2_memory.analysis.motion.robot_track import (
     TOLERANCE_M,
     TOLERANCE_RAD,
+    PartialTrack,
     RobotTrack,
-    TrackPart,
-    joined_parts,
+    joined_tracks,
+    partial_track,
     thinned,
     track_by,
     track_of,
-    track_part,
 )
 from tests.support.examples import examples
 
@@ -86,18 +86,18 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
 ) -> None:
     columns = [np.array(column) for column in driven(seed)]
 
-    def part(begin: int, end: int) -> TrackPart:
+    def part(begin: int, end: int) -> PartialTrack:
         some = [column[begin:end] for column in columns]
         if thins:
             index = thinned(some[0])
             some = [column[index] for column in some]
         times, x, y, heading = some
-        return track_part(times, x, y, heading)
+        return partial_track(times, x, y, heading)
 
-    whole = track_by(*joined_parts([[part(0, 1500)]]))
+    whole = track_by(*joined_tracks([[part(0, 1500)]]))
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
-    assert same(track_by(*joined_parts([parts])), whole)
-    assert same(track_by(*joined_parts([parts[::-1]])), whole)
+    assert same(track_by(*joined_tracks([parts])), whole)
+    assert same(track_by(*joined_tracks([parts[::-1]])), whole)
 
 
 def test_turns_on_the_spot_add_up() -> None:
@@ -142,6 +142,6 @@ def test_of_poses_of_one_time_the_first_counts_in_one_table_and_in_two() -> None
     still = np.zeros(4)
     assert track_of(times, x, still, still).x.tolist() == [0.0, 2.0]
     parts = [
-        track_part(times[rows], x[rows], still[rows], still[rows]) for rows in ([0, 1], [2, 3])
+        partial_track(times[rows], x[rows], still[rows], still[rows]) for rows in ([0, 1], [2, 3])
     ]
-    assert same(track_by(*joined_parts([parts])), track_of(times, x, still, still))
+    assert same(track_by(*joined_tracks([parts])), track_of(times, x, still, still))
