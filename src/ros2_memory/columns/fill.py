@@ -296,6 +296,7 @@ class Filling:
             begin = self._slot(bags[0])[1]
             self._merged.append((begin, begin + PART_NS))
             self._whole_parts.append(([*written.parts], bags))
+            self._scanner.remember(written.parts)
         if written.bags:
             spent = ms_from_ns(time.perf_counter_ns() - begun)
             log.debug("bags_stored", bags=written.bags, whole=whole, duration_ms=round(spent, 3))

@@ -6,7 +6,7 @@ Of a part that nothing needs not even the times are unpacked.
 from __future__ import annotations
 
 import struct
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar, cast
 
@@ -29,13 +29,14 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.analysis.clock_steps import ClockStep
     from ros2_memory.columns.store import ColumnStore, PartHead
     from ros2_memory.columns.transforms import Pair
     from ros2_memory.columns.values import Mask
+    from ros2_memory.columns.writing import PackedPart
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import Channel, IntArray
 
@@ -370,6 +371,16 @@ class Scanner:
             head.number if head.is_whole else None,
             counting.size == head.bags.size,
         )
+
+    def remember(self, parts: Mapping[int, PackedPart]) -> None:
+        """Remembers parts that were written, by their numbers: what follows is made of these."""
+        for number, part in parts.items():
+            for path, packed in part.columns.items():
+                known = replace(packed, data=b"")
+                self.caches.packed.put((number, path), known, _COLUMN_BYTES)
+                if packed.data:
+                    size = len(packed.data) + _COLUMN_BYTES
+                    self.caches.fetched.put((number, path), packed.data, size)
 
     def packed(self, head: PartHead, path: str, together: Sequence[PartHead]) -> Packed | None:
         """Returns what is known of a column of a part; None where it has no such one.

@@ -34,6 +34,7 @@ from ros2_memory.columns.writing import (
     UNMERGED,
     Layouts,
     LongBag,
+    PackedPart,
     ReadBag,
     bytes_of_topics,
     delete_bags,
@@ -49,7 +50,7 @@ from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.fragments import FragmentKey
@@ -114,10 +115,10 @@ class State(NamedTuple):
 
 
 class Written(NamedTuple):
-    """How many bags are stored, and the numbers of the parts that were made of them."""
+    """How many bags are stored, and the parts that were made of them by their numbers."""
 
     bags: int
-    parts: tuple[int, ...]
+    parts: Mapping[int, PackedPart]
 
 
 class StoredBag(NamedTuple):
@@ -479,7 +480,7 @@ class ColumnStore(Database):
             bags: with their tables.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
-        written = Written(0, ())
+        written = Written(0, {})
 
         def write(connection: sqlite3.Connection) -> None:
             nonlocal written
@@ -497,9 +498,9 @@ class ColumnStore(Database):
             delete_bags(connection, [bag.key.path for bag in new])
             parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
             done = len(bags) - len(missing) + len(new)
-            written = Written(done, tuple(self.offset + part for part in parts))
+            written = Written(done, {self.offset + row: part for row, part in parts.items()})
 
-        return written if self.write(write) else Written(0, ())
+        return written if self.write(write) else Written(0, {})
 
     def renew(self, key: BagKey, bag: BagFile) -> bool:
         """Keeps what is stored of a bag whose sidecar is another one now; returns whether it did.

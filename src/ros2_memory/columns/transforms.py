@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -41,6 +42,11 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
     transforms = _transforms_of(table)
     if transforms is None:
         return None
+    read = partial(_edges_of, transforms, times, index)
+    return table.remember("edges", read, _bytes_of) if index is None else read()
+
+
+def _edges_of(transforms: Elements, times: IntArray, index: IntArray | None) -> Edges:
     if index is not None:
         transforms = transforms.rows(index)
     pairs, codes = _coded_pairs(transforms)
@@ -61,6 +67,10 @@ def edges_in(table: Table, times: IntArray, index: IntArray | None = None) -> Ed
     return edges
 
 
+def _bytes_of(edges: Edges) -> int:
+    return 1000 + sum(500 + 72 * edge.stamps.size for edge in edges.values())
+
+
 def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | None:
     """Returns the parents and children of the transforms in some rows of a table.
 
@@ -75,8 +85,8 @@ def pairs_in(table: Table, index: IntArray | None = None) -> frozenset[Pair] | N
         for zone in zones
     ):
         return frozenset(_coded_pairs(transforms)[0])
-    edges = edges_in(table, np.zeros(len(table) if index is None else index.size, np.int64), index)
-    return None if edges is None else frozenset(edges)
+    times = np.zeros(len(table) if index is None else index.size, np.int64)
+    return frozenset(_edges_of(transforms, times, index))
 
 
 def static_times(table: Table, times: IntArray, index: IntArray | None) -> IntArray | None:

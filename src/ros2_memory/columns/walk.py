@@ -31,6 +31,8 @@ _MANY: Final = 500
 _FEW_ROWS: Final = 24
 """Of more than `_MANY` elements, in fewer rows on average, each is sooner decoded alone than nth by
 nth."""
+_MANY_ROWS: Final = 100
+"""Of a text that so many rows have, these are found together."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
 _HEADER_BYTES: Final = 4
@@ -169,19 +171,25 @@ class _Walk:
         return end
 
     def _texts(self, places: IntArray, sizes: IntArray) -> Texts:
-        rows = places.size
-        if not rows:
-            return Texts(np.zeros(0, np.uint32), ())
-        size = int(sizes[0])
-        if (sizes == size).all():
-            data = gathered(self.buffer, np.dtype(f"V{size}"), places).tobytes() if size else b""
-            if data == data[:size] * rows:
-                return Texts(np.zeros(rows, np.uint32), (data[:size].decode(),))
-        buffer, ends = self.buffer, (places + sizes).tolist()
-        words = [buffer[begin:end] for begin, end in zip(places.tolist(), ends, strict=True)]
-        code_of: dict[bytes, int] = {}
-        codes = [code_of.setdefault(word, len(code_of)) for word in words]
-        return Texts(np.array(codes, np.uint32), tuple([word.decode() for word in code_of]))
+        buffer, codes, words = self.buffer, np.zeros(places.size, np.uint32), list[bytes]()
+        left = np.arange(places.size)
+        equal = left
+        while left.size and equal.size >= _MANY_ROWS:
+            begin, size = int(places[left[0]]), int(sizes[left[0]])
+            word, is_equal = buffer[begin : begin + size], sizes[left] == size
+            if size:
+                alike = gathered(buffer, np.dtype(f"V{size}"), places[left[is_equal]])
+                is_equal[is_equal] = alike == np.void(word)
+            equal, left = left[is_equal], left[~is_equal]
+            codes[equal] = len(words)
+            words.append(word)
+        code_of = {word: code for code, word in enumerate(words)}
+        ends = (places + sizes)[left].tolist()
+        codes[left] = [
+            code_of.setdefault(buffer[begin:end], len(code_of))
+            for begin, end in zip(places[left].tolist(), ends, strict=True)
+        ]
+        return Texts(codes, tuple([word.decode() for word in code_of]))
 
     def _read_numbers(
         self, step: NumberSequence, rows: _Bodies, at: IntArray, level: LevelColumns | None

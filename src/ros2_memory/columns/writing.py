@@ -323,8 +323,8 @@ def insert_bags(
     layouts: Layouts,
     *,
     whole: bool,
-) -> list[int]:
-    """Inserts bags of one recording, in one part for each topic; returns the ids of these."""
+) -> dict[int, PackedPart]:
+    """Inserts bags of one recording, in one part for each topic; returns these by their ids."""
     rows: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
     for bag in bags:
@@ -332,8 +332,11 @@ def insert_bags(
         for table in bag.tables:
             topic, layout_of[topic] = topic_of(connection, table, layouts)
             rows[topic].append((table, np.full(len(table), number)))
-    parts = ((topic, packed_part(layout_of[topic], of_topic)) for topic, of_topic in rows.items())
-    return [_insert_part(connection, topic, part, whole=whole) for topic, part in parts]
+    parts: dict[int, PackedPart] = {}
+    for topic, of_topic in rows.items():
+        part = packed_part(layout_of[topic], of_topic)
+        parts[_insert_part(connection, topic, part, whole=whole)] = part
+    return parts
 
 
 def _insert_part(
