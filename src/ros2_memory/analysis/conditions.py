@@ -19,7 +19,6 @@ from itertools import chain, starmap
 from typing import TYPE_CHECKING, Final, TypeAlias
 
 from ros2_memory.core.errors import InvalidArgumentsError
-from ros2_memory.core.geometry import distance
 from ros2_memory.core.text import abbreviate
 from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
@@ -228,7 +227,7 @@ class NearPosition:
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Returns whether a position (m) is near; its z may be NaN where none is asked."""
         here: Vector3 = (x, y, 0.0 if self.z is None else z)
-        return distance(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
+        return math.dist(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
 
 
 Test: TypeAlias = Contains | Equals | Beyond | NearPosition

@@ -29,7 +29,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
-import structlog
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, StrictBool, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
@@ -42,6 +41,7 @@ from ros2_memory.bag_dir.layout import (
     utc_stamp,
 )
 from ros2_memory.core import directories
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class HardLinks:
         return f"{self._root}{name}" if slash and self.is_saved(path) else path
 
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 FORMAT: Final = 1
 MAX_LABEL_CHARS: Final = 120

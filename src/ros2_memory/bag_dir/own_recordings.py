@@ -32,7 +32,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
 
-import structlog
 from pydantic import AfterValidator, Field, StrictBool
 
 from ros2_memory.bag_dir.durable_write import (
@@ -60,6 +59,7 @@ from ros2_memory.core.directories import (
     mode_of,
 )
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import COMPRESSED
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ _LOCK_WAIT_S: Final = 2.0
 _POLL_S: Final = 0.01
 _APPEND: Final = os.O_RDWR | os.O_APPEND | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 def _checked_name(name: str) -> str:

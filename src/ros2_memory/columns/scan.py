@@ -1,7 +1,8 @@
 """Scans a topic: from the store where it has the rows, else from the bags, each message once.
 
 A scan yields `Rows`: a table, and which of its rows count. Rows of different tables may overlap in
-time where recordings do. Of a table that nothing needs not even the times are unpacked.
+time where recordings do. Queries open scans by `history.scan`; parts come from the `Scanner`, whose
+columns are unpacked when they are first used.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
 """What is stored of a bag directory: parts, with zones and columns that are remembered.
 
-Of a part that nothing needs not even the times are unpacked.
+It lies between a `Scan`, which asks for parts, and the `ColumnStore`, which reads the bytes of
+their columns. Of a part that nothing needs not even the times are unpacked.
 """
 
 from __future__ import annotations

@@ -116,7 +116,7 @@ def transform_point(t: Transform, point: Vector3) -> Vector3:
 def alike(one: Transform, other: Transform) -> bool:
     """Returns whether two transforms differ by less than 1 um and 3 mrad."""
     cosine = sum(p * q for p, q in zip(one.rotation, other.rotation, strict=True))
-    return distance(one.translation, other.translation) < _SAME_M and abs(cosine) > 1 - _SAME_M
+    return math.dist(one.translation, other.translation) < _SAME_M and abs(cosine) > 1 - _SAME_M
 
 
 def slerp(a: tuple[N, N, N, N], b: tuple[N, N, N, N], ratio: N) -> tuple[N, N, N, N]:
@@ -132,11 +132,6 @@ def slerp(a: tuple[N, N, N, N], b: tuple[N, N, N, N], ratio: N) -> tuple[N, N, N
     x, y, z, w = (from_a * p + from_b * q for p, q in zip(a, b, strict=True))
     length = np.sqrt(x * x + y * y + z * z + w * w)
     return (x / length, y / length, z / length, w / length)
-
-
-def distance(a: Vector3, b: Vector3) -> float:
-    """Returns the straight distance between two points (m)."""
-    return math.dist(a, b)
 
 
 def simplified(

@@ -170,6 +170,10 @@ class BagFile(NamedTuple):
         folder, slash, _ = self.file.rpartition("/")
         return _folder(folder or slash)
 
+    def reaches_into(self, window: TimeWindow) -> bool:
+        """Whether it may have messages in a window, as it begins and ends."""
+        return window.overlaps(self.start, self.end)
+
 
 # Two caches, since a pass over all files would evict the folders.
 _path = lru_cache(maxsize=_CACHED_PATHS)(Path)

@@ -81,6 +81,11 @@ def ms_from_ns(ns: Ns) -> float:
     return ns / NS_PER_MS
 
 
+def ms_since(begun: Ns) -> float:
+    """Returns the milliseconds since `time.perf_counter_ns()` was so much, for log events."""
+    return round(ms_from_ns(time.perf_counter_ns() - begun), 3)
+
+
 def iso_local(ns: Ns) -> str | None:
     """Returns ISO 8601 local time with offset; None for years that the calendar does not have.
 

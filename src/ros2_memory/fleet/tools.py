@@ -466,16 +466,8 @@ def _combined(
         of_robots = {name: value[key] for name, value in values.items() if key in value}
         how = merging.get(key, "added" if key == AT_LEAST else "")
         agree = len({*map(to_json_text, of_robots.values())}) == 1 and len(of_robots) == len(values)
-        if how == "who":
-            combined[key] = [name for name, is_so in of_robots.items() if is_so]
-        elif how == "counted":
-            sums: Counter[str] = Counter()
-            for counts in of_robots.values():
-                sums.update(counts if isinstance(counts, dict) else {})
-            combined[key] = dict(sums.most_common())
-        elif how in ("earliest", "newest"):
-            times = [_number(of_robots[name]) for name in dated if of_robots.get(name) is not None]
-            combined[key] = (min if how == "earliest" else max)(times, default=None)
+        if how in {"who", "counted", "earliest", "newest"}:
+            combined[key] = _as_one(how, of_robots, dated)
         elif how == "" and agree:
             combined[key] = next(iter(of_robots.values()))
         else:
@@ -485,6 +477,19 @@ def _combined(
             for name, value in of_robots.items():
                 by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
+
+
+def _as_one(how: str, of_robots: Mapping[str, JsonValue], dated: Sequence[str]) -> JsonValue:
+    """Returns what a key becomes that is not listed by robot; times are those of `dated` robots."""
+    if how == "who":
+        return [name for name, is_so in of_robots.items() if is_so]
+    if how == "counted":
+        sums = Counter[str]()
+        for counts in of_robots.values():
+            sums.update(counts if isinstance(counts, dict) else {})
+        return dict(sums.most_common())
+    times = [_number(of_robots[name]) for name in dated if of_robots.get(name) is not None]
+    return (min if how == "earliest" else max)(times, default=None)
 
 
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:

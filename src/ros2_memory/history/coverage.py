@@ -110,7 +110,7 @@ def note_unread(
 
 def describe_thinned(snapshot: Snapshot, window: TimeWindow) -> Iterator[str]:
     """Yields a sentence on days of a window of which only some messages stayed, if there are."""
-    days = [bag for bag in snapshot.timeline.thinned if window.overlaps(bag.start, bag.end)]
+    days = [bag for bag in snapshot.timeline.thinned if bag.reaches_into(window)]
     if days and overlaps_any(snapshot.timeline.thinned_times, window.start, window.stop - 1):
         span = f"{unix_text(days[0].start)} to {unix_text(max(bag.end for bag in days))}"
         yield (
@@ -254,7 +254,7 @@ def note_edges(view: View, window: TimeWindow) -> None:
     earliest = snapshot.earliest
     if earliest is not None and asked_from < earliest:
         before = TimeWindow(asked_from, earliest)
-        if not any(before.overlaps(fault.bag.start, fault.bag.end) for fault in snapshot.misdated):
+        if not any(fault.bag.reaches_into(before) for fault in snapshot.misdated):
             view.notes.add(f"the memory begins at {unix_text(earliest)}")
     if snapshot.latest is None or not _ends_after(window, snapshot.latest):
         return
@@ -340,9 +340,7 @@ def unread_spans(
         yield f"{HELD_BACK}: {listed(held)}"
     if any(aside.reason != HELD_BACK for aside in active):
         yield _describe_active(snapshot, active, window)
-    faults = [
-        fault for fault in snapshot.misdated if window.overlaps(fault.bag.start, fault.bag.end)
-    ]
+    faults = [fault for fault in snapshot.misdated if fault.bag.reaches_into(window)]
     if faults and not nothing:
         yield describe_misdated(faults)
     yield from describe_odd(odd)
@@ -460,13 +458,13 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     if earliest is None or latest is None:
         return None
     misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
-    if not any(asked.overlaps(bag.start, bag.end) for bag in misdated):
+    if not any(bag.reaches_into(asked) for bag in misdated):
         for first, last in view.gaps(asked):
             if first < asked.start and asked.stop <= last:
                 return first, last
     segments = snapshot.timeline.segments_in(asked)
     bags = (bag for segment in segments for bag in segment.bags if not is_carried(bag.file))
-    if any(asked.overlaps(bag.start, bag.end) for bag in bags):
+    if any(bag.reaches_into(asked) for bag in bags):
         return None
     start, end = asked.asked()
     if end < earliest:
@@ -519,7 +517,7 @@ def recorded_reach(snapshot: Snapshot, window: TimeWindow) -> tuple[Ns, Ns] | No
     if window.overlaps(*reach):
         return reach
     misdated = [fault.bag for fault in snapshot.misdated]
-    shown = {bag.recording for bag in misdated if window.overlaps(bag.start, bag.end)}
+    shown = {bag.recording for bag in misdated if bag.reaches_into(window)}
     if not shown:
         return reach
     # Of whole recordings: where their bags end says nothing.

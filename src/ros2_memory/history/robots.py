@@ -202,7 +202,7 @@ def _differing_topic(
 ) -> str | None:
     both = TimeWindow(pair.start, pair.end + 1)
     first_bags, other_bags = (
-        [bag for bag in recordings.get(str(path), ()) if both.overlaps(bag.start, bag.end)]
+        [bag for bag in recordings.get(str(path), ()) if bag.reaches_into(both)]
         for path in (pair.first, pair.second)
     )
     shared = _topics_of(first_bags) & _topics_of(other_bags) - view.timeline.transient_local

@@ -1,5 +1,7 @@
 """Visits to a place: arrival, departure and closest approach, newest first.
 
+`visits` is the query; the track comes from `robot_tracks`, by way of `known_track`.
+
 A visit is pose after pose inside. It is over when the robot is outside for some seconds, and where
 for longer there is no pose to know it by. All visits are found by the track, from which no pose is
 farther than some 5 cm; those that are shown begin and end at poses. When odometry is reset, the

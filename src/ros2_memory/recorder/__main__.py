@@ -13,8 +13,6 @@ import time
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -34,7 +32,7 @@ from ros2_memory.config import (
     unused_config,
 )
 from ros2_memory.core.errors import ConfigError, EpisodicError
-from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.malloc import return_large_at_once, share_one_arena
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
 from ros2_memory.recorder.process.topics import load_topics
@@ -56,7 +54,7 @@ CACHE_MB: Final = 1
 """Every bag is read once: a cache of chunks would only take memory."""
 ENDING_SIGNALS: Final = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

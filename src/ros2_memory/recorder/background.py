@@ -6,9 +6,8 @@ import threading
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
 PATIENCE_S: Final = 8.0
 """How long a recorder that stops waits for what is under way; the service manager allows 40 s."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Background:

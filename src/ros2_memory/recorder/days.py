@@ -17,7 +17,6 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
-import structlog
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
@@ -39,9 +38,10 @@ from ros2_memory.bag_dir.state_files import (
 from ros2_memory.columns.decode import decoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.text import LABELS, LISTS_OF_LABELS, match_topics
-from ros2_memory.core.timebase import NS_PER_S, Ns, ms_from_ns
+from ros2_memory.core.timebase import NS_PER_S, Ns, ms_since
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.recorder.thinning import (
     MINUTE_NS,
@@ -112,7 +112,7 @@ COUNTED_S: Final = 600.0
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 _EVERYTHING: Final = TimeWindow.everything()
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class MemoryLimits(NamedTuple):
@@ -209,7 +209,7 @@ class MemoryDays:
             bags=len(bags),
             messages=messages,
             left_out=chosen.left_out,
-            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            duration_ms=ms_since(begun),
         )
 
     def limit(self, now: Ns | None) -> None:
@@ -340,16 +340,8 @@ class MemoryDays:
         detections = DetectionColumns(self._extractor)
         for table in chain.from_iterable(self._tables(bag.path) for bag in bags):
             topic, kind = table.channel.topic, table.channel.type
-            if "" in table.left_out:
-                chosen.left_out[topic] = table.left_out[""]
-            elif is_sampled(table):
-                chosen.left_out[topic] = "it has long arrays of numbers"
-            elif self._is_of_people(f"{topic}/{kind}") and not self._limits.labels:
-                chosen.left_out[topic] = "it is of people, and memory.labels names none"
-            elif is_said(table) and not any(
-                match_topics((topic,), glob) for glob in self._limits.texts
-            ):
-                chosen.left_out[topic] = "it has texts, and memory.texts does not name it"
+            if why := self._why_left_out(table):
+                chosen.left_out[topic] = why
             elif self._is_latched(snapshot, topic):
                 chosen.latched.add(topic)
                 chosen.times[topic, kind].update(table.log_times.tolist())
@@ -361,6 +353,19 @@ class MemoryDays:
         for key, thinning in thinned.items():
             chosen.times[key].update(thinning.times().tolist())
         return chosen
+
+    def _why_left_out(self, table: Table) -> str | None:
+        """Returns why nothing of a topic stays; None where something does."""
+        topic = table.channel.topic
+        if "" in table.left_out:
+            return table.left_out[""]
+        if is_sampled(table):
+            return "it has long arrays of numbers"
+        if self._is_of_people(f"{topic}/{table.channel.type}") and not self._limits.labels:
+            return "it is of people, and memory.labels names none"
+        if is_said(table) and not any(match_topics((topic,), glob) for glob in self._limits.texts):
+            return "it has texts, and memory.texts does not name it"
+        return None
 
     def _is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether all messages of a topic stay: each holds until the next, however long that is."""

@@ -5,9 +5,8 @@ from __future__ import annotations
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-import structlog
-
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.recorder.process.output import Line, LineKind
 
 if TYPE_CHECKING:
@@ -15,7 +14,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.timebase import Clock, Ns
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 _INFORM = frozenset({LineKind.READY, LineKind.SUBSCRIBED, LineKind.STOPPED})
 _ADVICE = {

@@ -31,8 +31,6 @@ from itertools import groupby, islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-import structlog
-
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
     Counting,
@@ -49,6 +47,7 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.recorder.policies import ClockReading, set_back
@@ -82,7 +81,7 @@ SAMPLE: Final = 2000
 MOST_LISTED: Final = 10_000
 """More messages are not listed in a sidecar: then all count, and queries leave out duplicates."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 def pending(old_name: str) -> Handover:

@@ -15,8 +15,6 @@ from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
 from ros2_memory.bag_dir.moment_file import HardLinks
@@ -24,9 +22,10 @@ from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, append_losses
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_from_ns, ns_from_unix
+from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, HouseStatus
@@ -60,7 +59,7 @@ _MCAP: Final = ".mcap"
 _LAST_STEPS: Final = 2
 _WRITTEN_AT_ONCE: Final = 2
 """Recordings, during a rotation."""
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Housekeeping(Housekeeper):
@@ -347,7 +346,7 @@ class Housekeeping(Housekeeper):
             total_bytes=collected.total_bytes,
             state_bytes=collected.state_bytes,
             foreign_bytes=collected.foreign_bytes,
-            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            duration_ms=ms_since(begun),
             **wanted,
         )
         self._report(before, collected)
@@ -520,7 +519,7 @@ class Housekeeping(Housekeeper):
             cut_bytes=repaired.rewritten.lost_bytes,
             reason=repaired.rewritten.describe_loss(),
             notes=list(repaired.rewritten.notes),
-            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            duration_ms=ms_since(begun),
         )
         return True
 

@@ -21,7 +21,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BagFile, BagState
-from ros2_memory.core.timebase import Clock, Ns, ms_from_ns, ns_from_unix
+from ros2_memory.core.timebase import Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.bag_table import BagTable, KnownBags, TableChange
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
@@ -210,7 +210,7 @@ class IndexManager:
             unread=len(after.unread),
             empty=len(after.empty),
             problem=after.problem,
-            duration_ms=round(ms_from_ns(time.perf_counter_ns() - begun), 3),
+            duration_ms=ms_since(begun),
         )
 
 

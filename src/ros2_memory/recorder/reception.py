@@ -12,13 +12,13 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-import structlog
 import yaml
 
 from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import EpisodicError, RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.recorder.measure import (
@@ -104,7 +104,7 @@ _LOOKED_AT: Final = 3
 _MOST_UNWRITTEN: Final = 1000
 _TASK: Final = "reception"
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Rotation(NamedTuple):

@@ -5,8 +5,6 @@ from __future__ import annotations
 from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.layout import (
     QOS_FILE,
@@ -16,6 +14,7 @@ from ros2_memory.bag_dir.layout import (
 )
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Housekeeper, Recorder
@@ -43,7 +42,7 @@ __all__ = ["Ros2BagRecorder", "record_argv"]
 ROSOUT: Final = "/rosout"
 LOGS_KEPT: Final = 20
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Ros2BagRecorder(Recorder):

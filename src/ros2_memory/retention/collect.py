@@ -14,12 +14,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Protocol
 
-import structlog
-
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.metadata_yaml import bare_name
 from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of, unshipped
 from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.disk import RETRIED_S, free_bytes
 from ros2_memory.retention.inventory import Inventory
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
 MOST_AT_ONCE: Final = 2000
 """Bags deleted in one pass, which take some tenths of a second. The next pass continues."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 @dataclass(slots=True)

@@ -32,8 +32,6 @@ from itertools import accumulate, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
-import structlog
-
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_thinned
 from ros2_memory.bag_dir.moment_file import HardLinks
@@ -42,6 +40,7 @@ from ros2_memory.core.errors import (
     BagVanishedError,
     UndecodableError,
 )
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.delete import beside
@@ -61,7 +60,7 @@ RECEIVED_AGAIN_NS: Final[Ns] = NS_PER_S
 _RECORDINGS: Final = "ros2_memory_recordings"
 _OFTEN: Final = "ros2_memory_often"
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Origin(NamedTuple):

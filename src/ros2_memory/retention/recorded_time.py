@@ -20,10 +20,9 @@ import threading
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.layout import RECORDED_FILE
 from ros2_memory.bag_dir.state_files import RECORDED, Recorded
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ STEP_NS: Final[Ns] = 60 * NS_PER_S
 _MOST_LINES: Final = 20_000
 _MAX_NAMED: Final = 5
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class RecordedTime:

@@ -19,8 +19,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import structlog
-
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
@@ -42,6 +40,7 @@ from ros2_memory.bag_dir.moment_file import (
     write_saved_moment,
 )
 from ros2_memory.core import directories
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import overlaps_any
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
@@ -66,7 +65,7 @@ SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S
 _SHARE: Final = "retention.max_moments_gb"
 _OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class NeededBags(NamedTuple):
@@ -101,7 +100,7 @@ def needed_bags(
     ready = []
     for bag in bags:
         is_derived = is_carried(bag.file) or is_thinned(bag.file)
-        if not window.overlaps(bag.start, bag.end) or is_derived:
+        if not bag.reaches_into(window) or is_derived:
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
         if unfinished and now - asked < REPAIRED_WITHIN_NS:

@@ -19,14 +19,13 @@ from dataclasses import replace
 from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import structlog
-
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
 from ros2_memory.bag_dir.metadata_yaml import bare_name, why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import match_topics
-from ros2_memory.core.timebase import Ns, ms_from_ns
+from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.policy import RetentionLimits, RetentionStock, older_than
 from ros2_memory.retention.repair import left_in, rewritten
@@ -44,7 +43,7 @@ SLICE_S: Final = 1.0
 PATIENCE_S: Final = 3600.0
 """How long cutting waits for a quiet minute: a robot may be busy all day."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class TopicAge(NamedTuple):
@@ -166,7 +165,7 @@ class TopicCutter:
             if self._monotonic() >= until_s:
                 break
         if bags:
-            ms = round(ms_from_ns(time.perf_counter_ns() - begun), 3)
+            ms = ms_since(begun)
             _log.info("topics_cut", bags=bags, messages=dict(gone), duration_ms=ms)
         return bags
 

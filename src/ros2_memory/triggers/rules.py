@@ -217,7 +217,7 @@ def chains_to_search(
     for name, bags in closed.items():
         start = searched.get(name, MIN_NS)
         window = TimeWindow(start, max(start, min(limits[name], ends[name] + 1)))
-        touched = tuple(bag for bag in bags if window.overlaps(bag.start, bag.end))
+        touched = tuple(bag for bag in bags if bag.reaches_into(window))
         if window.empty or not touched:
             continue
         part = SearchPart(name, window, touched)

@@ -20,8 +20,6 @@ from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-import structlog
-
 from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
@@ -45,6 +43,7 @@ from ros2_memory.core.errors import (
     RecorderError,
     UndecodableError,
 )
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
@@ -79,7 +78,7 @@ RETRY_S: Final = 30.0
 REMIND_S: Final = 600.0
 """How long until a rule that still cannot be evaluated is logged again."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 _ClosedFiles: TypeAlias = "list[tuple[Path, BagSummary]]"

@@ -15,8 +15,6 @@ from copy import deepcopy
 from itertools import product
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.handover_file import Counting, read_handover
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.moment_file import SaveRequest
@@ -26,6 +24,7 @@ from ros2_memory.bag_dir.state_files import (
     RuleRecord,
     TriggerState,
 )
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
@@ -49,7 +48,7 @@ MOST_WAITING: Final = 100
 MOST_SEARCHED: Final = 64
 """Recordings that are remembered one by one; older ones were searched to their end."""
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 
 class Triggers:

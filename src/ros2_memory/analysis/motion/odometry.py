@@ -21,7 +21,6 @@ from ros2_memory.analysis.motion.path_length import (
     measured,
 )
 from ros2_memory.core.arrays import row_sums
-from ros2_memory.core.geometry import distance
 from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -133,7 +132,7 @@ def _step(before: TimedPosition, after: TimedPosition) -> tuple[float, float]:
     A burst shortens the time between two poses to nothing, which is neither a jump nor fast.
     """
     elapsed_s = unix_from_ns(max(after.time - before.time, ARRIVAL_JITTER_NS))
-    return distance(before.position, after.position), elapsed_s
+    return math.dist(before.position, after.position), elapsed_s
 
 
 def _is_jump(step_m: float, elapsed_s: float, fastest_mps: float) -> bool:
@@ -194,7 +193,7 @@ class Leg(NamedTuple):
 
     def joined(self, later: Leg) -> Leg:
         """Returns this leg continued, without a break, by a later one."""
-        step_m = distance(self.last.position, later.first.position)
+        step_m = math.dist(self.last.position, later.first.position)
         is_bridged = (self.poses < FEWEST) != (later.poses < FEWEST)
         head, tail, length_m, still = (
             self._bridged(later, step_m) if is_bridged else self._linked(later, step_m)
@@ -244,10 +243,10 @@ class Leg(NamedTuple):
     def _bridged(self, later: Leg, step_m: float) -> tuple[End, End, float, bool]:
         """Does as `_linked`, where one of the legs has too few poses to estimate its noise."""
         if later.poses < FEWEST:
-            net_m = distance(self.last.position, later.last.position)
+            net_m = math.dist(self.last.position, later.last.position)
             end, short, long = self.tail, later, self
         else:
-            net_m = distance(self.first.position, later.first.position)
+            net_m = math.dist(self.first.position, later.first.position)
             end, short, long = later.head, self, later
         added_m = _step_m(end, end, short.poses, net_m, step_m + short.sum_m)
         return long.head, long.tail, long.length_m + added_m, long.still
@@ -488,7 +487,7 @@ class Motion:
     def count_break(self, kind: Link, before: TimedPosition, after: TimedPosition) -> None:
         """Counts what ends a leg."""
         totals = self.totals
-        step_m = distance(before.position, after.position)
+        step_m = math.dist(before.position, after.position)
         if after.time - before.time > GAP_NS:
             totals.gap_ns += after.time - before.time
         if kind == "gap":

@@ -35,7 +35,6 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ros2_memory.core.arrays import row_maxima, row_sums
-from ros2_memory.core.geometry import distance
 
 if TYPE_CHECKING:
     from ros2_memory.core.arrays import Flags, Floats, Vectors
@@ -98,11 +97,11 @@ class Creep(NamedTuple):
     @property
     def length_m(self) -> float:
         """Length from the first place to the last."""
-        return 0.0 if self.second is None else distance(self.start, self.second) + self.middle_m
+        return 0.0 if self.second is None else math.dist(self.start, self.second) + self.middle_m
 
     def to(self, place: Vector3) -> Creep:
         """Returns the creep with one more place, if that is off the last one."""
-        step = distance(self.end, place)
+        step = math.dist(self.end, place)
         if step <= self.reach_m:
             return self
         if self.second is None:
@@ -115,7 +114,7 @@ class Creep(NamedTuple):
         whole = self._replace(reach_m=reach_m).to(later.start)
         if later.second is None:
             return whole
-        step = distance(whole.end, later.second)
+        step = math.dist(whole.end, later.second)
         if whole.second is None:
             return whole._replace(second=later.second, middle_m=later.middle_m, end=later.end)
         return whole._replace(middle_m=whole.middle_m + step + later.middle_m, end=later.end)
@@ -300,7 +299,7 @@ def _creep(places: Vectors, reach: Floats, origin: Vector3) -> Creep:
         left_at.append(at + int(off.argmax()))
     x, y, z = origin
     left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[left_at]]
-    middle_m = math.fsum(distance(here, there) for here, there in pairwise(left[1:]))
+    middle_m = math.fsum(math.dist(here, there) for here, there in pairwise(left[1:]))
     second = left[1] if len(left) > 1 else None
     return Creep(left[0], second, middle_m, left[-1], float(reach.max()))
 

@@ -286,7 +286,7 @@ class _Forget:
         kept: list[str] = []
         snapshot = self._memory.index.snapshot()
         for bag in self._raw_bags(snapshot):
-            if window.overlaps(bag.start, bag.end):
+            if bag.reaches_into(window):
                 if reason := self._reason_to_keep(bag, window):
                     kept.append(f"{self._name(bag)}: {reason}")
                 else:

@@ -9,9 +9,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import structlog
-
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.recorder.process.child import run_bounded
 from ros2_memory.recorder.process.command import HELP_ARGV, options_in_help
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
 
 SETUP_TIMEOUT_S: Final = 60.0
 
-_log: structlog.typing.FilteringBoundLogger = structlog.get_logger(__name__)
+_log = get_logger(__name__)
 
 # The script prints each file's name before it sources the file, so that a file that fails or exits
 # can be named. What files print goes to stderr. They do not see the arguments, which some would

@@ -160,7 +160,7 @@ def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
     names: dict[str, str] = {}
     ends: dict[str, Ns] = {}
     for path, bags in recordings_of(memory.index.snapshot()).items():
-        if any(window.overlaps(bag.start, bag.end) for bag in bags):
+        if any(bag.reaches_into(window) for bag in bags):
             names[path] = name_of(path, bags, root)
             ends[names[path]] = max(bag.end for bag in bags)
     unlike = _folders_with_unlike_frames(memory, call, {*map(_folder, names.values())})
