@@ -102,12 +102,11 @@ from ros2_memory.insights.status import (
 )
 from ros2_memory.places.driven_inside import farthest_from
 from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
-from ros2_memory.things.labels import as_it_stands
+from ros2_memory.things.unseen import found_in_singular
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.extract import Extracted
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
@@ -381,7 +380,7 @@ def find_last_match(
             require_recorded(view, TimeWindow(MIN_NS, until))
         stored = search.newest(until)
         if stored is None:
-            notes = _notes_on_never(view, search, until, condition, min_score)
+            notes = _notes_on_never(view, topic, search, until, min_score)
             return results.Match(None, notes=notes)
         note_robots_near(view, stored)
         note_unread(view, _searched_window(view, stored, until, now), search=True)
@@ -431,7 +430,7 @@ def value_when(
             require_recorded(view, TimeWindow(MIN_NS, until))
         match = search.newest(until)
         if match is None:
-            notes = _notes_on_never(view, search, until, condition, min_score)
+            notes = _notes_on_never(view, condition_topic, search, until, min_score)
             return results.ValueWhen(None, notes=notes)
         note_unread(view, _searched_window(view, match, until, now), search=True)
         note_robots_near(view, match)
@@ -659,18 +658,18 @@ def _going_back(
 
 
 def _notes_on_never(
-    view: View, search: ReverseSearch, until: Ns, condition: Condition, min_score: float | None
+    view: View, topic: str, search: ReverseSearch, until: Ns, min_score: float | None
 ) -> tuple[str, ...]:
     """Returns the notes on a search that found nothing; without any the reply is a plain null.
 
     They are on what was not read, and on when its topics were silent.
     """
-    window = TimeWindow(MIN_NS, until)
+    window, condition = TimeWindow(MIN_NS, until), search.condition
     notes = (
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
         *unasked_limit(condition, min_score),
-        *as_it_stands(condition),
+        *found_in_singular(view, topic, condition, window),
     )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()

@@ -55,7 +55,7 @@ from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
-from ros2_memory.things.labels import as_it_stands
+from ros2_memory.things.unseen import found_in_singular
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -137,9 +137,12 @@ def find_matches(
     note_unread(view, searched, nothing=total == 0, search=True)
     if total == 0:
         silences = describe_silences(view, topics, searched)
-        view.notes.add(*silences, *unasked_limit(condition, min_score), *as_it_stands(condition))
+        view.notes.add(*silences, *unasked_limit(condition, min_score))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
+    notes = view.notes.sentences()
+    if total == 0:
+        notes = (*notes, *found_in_singular(view, topic, condition, window))
     total = total if scope.since is None else None
     return Sightings(
         sightings,
@@ -152,7 +155,7 @@ def find_matches(
         topic="" if topics[1:] else topics[0],
         of_texts=is_spoken,
         episodes=episodes,
-        notes=view.notes.sentences(),
+        notes=notes,
     )
 
 

@@ -11,13 +11,10 @@ import unicodedata
 from collections import Counter
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.analysis.conditions import Contains, Equals
-from ros2_memory.core.text import MAX_LABEL_CHARS, abbreviate, shortened
+from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
-
-    from ros2_memory.analysis.conditions import Condition
 
 _SPACING: Final = re.compile(r"[\s_\-]+")
 _IRREGULAR: Final = {
@@ -78,15 +75,6 @@ def singular(label: str) -> str:
     """Returns a label as `plain`, its last word in the singular, as far as simple rules know it."""
     before, space, word = plain(label).rpartition(" ")
     return before + space + _singular(word)
-
-
-def as_it_stands(condition: Condition) -> tuple[str, ...]:
-    """Returns the note on a plural, of which a search knows no singular, for "never"."""
-    test = condition.test
-    text = test.folded if isinstance(test, Contains | Equals) else None
-    if text is None or singular(text) == plain(text):
-        return ()
-    return (f"{abbreviate(text)} was searched as it stands, not {abbreviate(singular(text))}",)
 
 
 def last_word(key: str) -> str:

@@ -7,13 +7,20 @@ from __future__ import annotations
 
 import difflib
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
 from ros2_memory.core.arrays import distinct_rows
-from ros2_memory.core.errors import NotInLakeError, UndecodableError
+from ros2_memory.core.errors import (
+    InvalidArgumentsError,
+    NotInLakeError,
+    QueryTimeoutError,
+    UndecodableError,
+)
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import (
     LABELS,
@@ -27,12 +34,15 @@ from ros2_memory.core.text import (
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
+from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.insights.silences import describe_silences
+from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import may_have_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
 
+    from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.view import View
     from ros2_memory.things.known import KnownThings
 
@@ -104,6 +114,28 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
     return frozenset(reasons)
+
+
+def found_in_singular(
+    view: View, topic: str, condition: Condition, window: TimeWindow
+) -> tuple[str, ...]:
+    """Returns the note on a text that no message has, but its singular; none where there is none.
+
+    A search takes a text as it stands, and `find_things` a label in either form.
+    """
+    test = condition.test
+    text = test.folded if isinstance(test, Contains | Equals) else None
+    if text is None or singular(text) == plain(text):
+        return ()
+    one = singular(text)
+    other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
+    stored = None
+    with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
+        stored = ReverseSearch(view, topic, replace(condition, test=other)).newest(window.stop)
+    if stored is None or stored.time < window.start:
+        return ()
+    at = unix_text(stored.time)
+    return (f"{abbreviate(text)} was not found, but {abbreviate(one)} was, last at {at}",)
 
 
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
