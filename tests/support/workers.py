@@ -21,24 +21,25 @@ if TYPE_CHECKING:
 
 TESTS: Final = Path(__file__).parents[1]
 GROUPS: Final[Mapping[str, Sequence[str]]] = {
-    "live": ("integration/test_live_*.py",),
-    "recorder": (
-        "integration/test_recorder_*.py",
-        "integration/test_retention_*.py",
-        "integration/test_ros2_double*.py",
+    "live": ("integration/test_live_*.py", "integration/test_ros2_double*.py"),
+    "stalls": (
+        "integration/test_recorder_exclusion.py",
+        "integration/test_recorder_stalls.py",
+        "integration/test_recorder_triggers.py",
     ),
+    "recorder": ("integration/test_recorder_*.py", "integration/test_retention_*.py"),
     "heavy": ("fuzz/*.py", "soak/*.py", "faults/*.py"),
 }
 """Groups of files, which begin before all else, in this order.
 
-The first two mostly wait for real time, and take longest. "heavy" burns processor time: one such
-test at a time leaves some to those that wait.
+The first three mostly wait for real time, for about the same time. "heavy" burns processor time:
+one such test at a time leaves some to those that wait.
 """
 
-WORKERS: Final = 4
-"""On two cores: two mostly wait for real time at first, and the others leave no core idle."""
+WORKERS: Final = 7
+"""On two cores: three mostly wait for real time at first, and the others leave no core idle."""
 
-PUNCTUAL: Final = ("live", "recorder")
+PUNCTUAL: Final = ("live", "stalls", "recorder")
 """Groups whose programs are to run when their time has come, whatever else there is to do."""
 
 _MARK: Final = re.compile(r'xdist_group\("(\w+)"\)')
