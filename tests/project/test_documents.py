@@ -26,7 +26,6 @@ from ros2_memory import cli
 from ros2_memory.config import load_settings
 from ros2_memory.serving.web_app import STREAM_PATH
 from tests.support.documented_history import START_S, write_history
-from tests.support.forked_commands import forked_commands
 from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
@@ -110,26 +109,18 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_history(tmp_path_factory.mktemp("history") / "bags")
 
 
-@pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with forked_commands(tmp_path_factory.mktemp("commands")) as folder:
-        yield folder
-
-
 @pytest.fixture
-def home(tmp_path: Path, history: Path, commands: Path) -> Path:
+def home(tmp_path: Path, history: Path) -> Path:
     """A user's home with bags in it."""
     for place in ("bags", "robot", "fleet/r1", "fleet/r2"):
         shutil.copytree(history, tmp_path / place)
-    (tmp_path / "commands").symlink_to(commands)
     return tmp_path
 
 
 def environment(home: Path) -> dict[str, str]:
     ours = ("MEMORY_", "MCP_", "ROS_")
     kept = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
-    programs = (str(home / "commands"), str(PROGRAMS), kept.get("PATH", ""))
-    return {**kept, "HOME": str(home), "PATH": os.pathsep.join(programs)}
+    return {**kept, "HOME": str(home), "PATH": f"{PROGRAMS}{os.pathsep}{kept.get('PATH', '')}"}
 
 
 @pytest.mark.parametrize("block", of("sh"))
