@@ -101,12 +101,6 @@ def test_a_command_imports_what_it_needs(env: dict[str, str]) -> None:
         assert absent.isdisjoint(there), line
 
 
-def test_a_name_is_completed_without_importing_what_has_it(env: dict[str, str]) -> None:
-    completing = {"COMP_WORDS": "ros2-memory to", "COMP_CWORD": "1"}
-    ((*there,),) = of_commands([""], env | completing | {"_ROS2_MEMORY_COMPLETE": "complete_bash"})
-    assert (SERVING | ANSWERING | CONFIGURING | LOOKING) & {*there} == set()
-
-
 def test_the_recorder_imports_nothing_that_answers(env: dict[str, str]) -> None:
     program = (
         "import ros2_memory.recorder.__main__\n"

@@ -5,12 +5,11 @@ from __future__ import annotations
 import random
 import struct
 import zlib
-from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final
 
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.writer import IndexType, Writer
+from mcap.writer import Writer
 
 from tests.support.bags import McapLayout, Msg, text
 
@@ -97,20 +96,6 @@ def rewrite_summary(path: Path, change: Callable[[int, bytes], bytes | None]) ->
     footer = FOOTER.pack(kind, length, start, offsets, 0)[:-4]
     crc = zlib.crc32(footer, zlib.crc32(section))
     path.write_bytes(data[:start] + section + footer + struct.pack("<I", crc) + data[-8:])
-
-
-def one_chunk(compression: str, data: bytes) -> bytes:
-    """An MCAP file with one chunk that states 2^60 bytes of content, and no summary."""
-    out = BytesIO()
-    writer = Writer(out, index_types=IndexType.NONE, use_statistics=False, use_chunking=False)
-    writer.start()
-    start = out.tell()
-    writer.finish()
-    name = compression.encode()
-    body = struct.pack("<QQQII", 1, 2, 1 << 60, 0, len(name)) + name
-    body += struct.pack("<Q", len(data)) + data
-    whole = out.getvalue()
-    return whole[:start] + RECORD.pack(Opcode.CHUNK, len(body)) + body + whole[start:]
 
 
 def damaged(data: bytes, seed: int) -> bytes:

@@ -57,12 +57,6 @@ def test_statuses_and_goals_have_a_value_each() -> None:
     assert stated(None, DIAGNOSTICS) == stated(7, GOALS) == {}
 
 
-def test_statuses_that_are_too_many_to_track_are_counted() -> None:
-    status: JsonValue = {"status": [{"name": f"{nth}", "level": 0} for nth in range(515)]}
-    found = state_of(status, DIAGNOSTICS)
-    assert (len(found.facts), found.beyond) == (512, 3)
-
-
 @pytest.mark.parametrize("charge", [math.nan, -1.0, 101.0, math.inf, None, "full", True])
 def test_a_charge_that_is_not_known_is_no_fact(charge: JsonValue) -> None:
     assert charge_of({"percentage": charge}) is None

@@ -18,13 +18,11 @@ from ros2_memory.analysis.sights import (
     Unplaced,
     fixes_of,
 )
-from ros2_memory.analysis.sights import sights_of as of_arrays
 from tests.support.sights import (
     Message,
     PlacedDetection,
     joined_of,
     no_sights,
-    seen_in,
     sights_of_messages,
 )
 
@@ -66,15 +64,6 @@ def test_spots_that_grew_together_are_one_where_no_message_has_both() -> None:
     far_apart_at_first = [[mug(1.0)], [mug(1.8)], *[[mug(1.3)]] * 8, *[[mug(1.5)]] * 8]
     found = sights_of(*far_apart_at_first)
     assert found.spots[:, Spot.N].tolist() == [18]
-
-
-def test_looks_differ_by_place_and_direction() -> None:
-    poses = [(0.1, 0.1, 0.05), (0.2, 0.2, 0.1), (0.3, 0.1, 0.05), (0.1, 0.1, 1.0)]
-    messages = [Message("/detections", nth, pose, []) for nth, pose in enumerate(poses)]
-    looks = sights_of_messages(messages).looks
-    assert sorted(looks[:, Look.N].tolist()) == [1, 1, 2]
-    assert looks[0, Look.X] == 150
-    assert looks[0, Look.YAW] == 43  # the mean of 2.9 and 5.7 degrees
 
 
 def test_a_score_that_is_no_number_is_none() -> None:
@@ -176,15 +165,6 @@ def test_fixes_are_kept_where_no_detector_published() -> None:
 def test_what_is_seen_at_the_end_of_64_bits_has_a_time_that_fits() -> None:
     [spot] = sights_of_messages([Message("/detections", 2**63 - 1, HERE, [mug(1.0)])]).spots
     assert spot[Spot.LAST] == 2**63 - 808
-
-
-def test_labels_of_other_messages_are_not_in_sights() -> None:
-    found = sights_of([mug(1.0)])
-    seen = seen_in([Message("/detections", 0, HERE, [mug(1.0)])])
-    others = seen._replace(names=("letter", *seen.names), labels=seen.labels + 1)
-    again = of_arrays("/detections", others)
-    assert again.labels == found.labels == ("mug",)
-    assert again.spots[:, Spot.LABEL].tolist() == [0]
 
 
 def test_numbers_of_more_than_32_bits_are_packed() -> None:

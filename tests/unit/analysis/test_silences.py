@@ -13,7 +13,6 @@ from ros2_memory.analysis.silences import (
     Spacing,
     joined,
     silences,
-    usual_period,
 )
 
 S = 10**9
@@ -106,12 +105,6 @@ def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_record
         assert [each.length for each in whole] == ([5 * HOUR] if goes_on else [])
 
 
-def test_the_period_is_that_of_the_bags_around_the_median() -> None:
-    spacings = {3: Spacing(1, 10 * S, 1), 0: Spacing(5, 50 * S, 500), 1: Spacing(1, 10 * S, 50)}
-    assert usual_period(Presence(((0, 9 * S),), spacings, 600, 70 * S)) == S // 10
-    assert usual_period(BURST) is None
-
-
 def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
     presences = {
         "/a/odom": heard((0, HOUR)),
@@ -134,24 +127,7 @@ def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
     assert [each.length for each in nights] == 4 * [8 * HOUR]
 
 
-def test_a_part_of_a_silence_is_no_longer_than_its_window() -> None:
-    silence = Silence(SEEN, HOUR, 6 * HOUR, 2 * HOUR)
-    assert silence.within(0, 9 * HOUR) == silence
-    assert silence.within(HOUR, 2 * HOUR) == Silence(SEEN, HOUR, 2 * HOUR, HOUR, goes_on=True)
-    assert silence.within(0, HOUR) is None
-
-
 RUNS = st.lists(st.tuples(st.integers(0, 400), st.integers(1, 60)), min_size=1, max_size=12)
-
-
-@given(RUNS, st.data())
-def test_presences_add_up_however_a_memory_is_cut(
-    drawn: list[tuple[int, int]], data: st.DataObject
-) -> None:
-    parts = [heard((start * S, (start + length) * S)) for start, length in drawn]
-    cut = data.draw(st.integers(0, len(parts) - 1))
-    halves = [joined(half) for half in (parts[:cut], parts[cut:]) if half]
-    assert joined(halves) == joined(parts)
 
 
 @given(RUNS, RUNS)

@@ -22,8 +22,6 @@ from ros2_memory.analysis.facts import (
 from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.topic_events import Change, KnownState, Report, TopicEvents, joined_events
 from ros2_memory.analysis.topic_events import events_of as events_of_stated
-from ros2_memory.columns.fragments import from_bytes, to_bytes
-from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.core.timebase import NS_PER_S
 
 Messages = list[tuple[int, State]]
@@ -96,13 +94,6 @@ def test_where_a_history_is_cut_into_bags_changes_nothing(
     parts = [events_of(messages[begin:end]) for begin, end in ends]
     whole = joined_events([part for part in parts if part is not None])
     assert _comparable(whole) == _comparable(events_of(messages))
-
-
-@given(histories())
-def test_events_come_back_from_their_bytes(history: tuple[Messages, list[int]]) -> None:
-    events = events_of(history[0])
-    assert events is not None
-    assert from_bytes(to_bytes(events, EVENTS.classes), EVENTS.classes) == events
 
 
 @given(histories(), st.data())

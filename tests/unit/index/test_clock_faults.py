@@ -118,16 +118,6 @@ MOMENTS = st.sampled_from(
 SPANS = st.lists(st.tuples(MOMENTS, MOMENTS), min_size=1, max_size=12)
 
 
-@given(SPANS, st.integers(1, 5), st.sampled_from([0, NOW]))
-def test_the_span_is_that_of_the_bags_that_are_not_left_out(
-    spans: list[tuple[int, int]], size: int, now: int
-) -> None:
-    bags = [bag(f"{n}", *sorted(each)) for n, each in enumerate(spans)]
-    found = dating(*bags, now=now, size=size)
-    kept = [each for each in bags if each.file not in found.misdated]
-    assert span(found) == (min(each.start for each in kept), max(each.end for each in kept))
-
-
 @given(SPANS, st.integers(1, 5), st.data())
 def test_one_sound_bag_keeps_all_others_from_spoiling_the_span(
     spans: list[tuple[int, int]], size: int, data: st.DataObject

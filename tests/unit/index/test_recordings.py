@@ -59,16 +59,6 @@ def test_a_filter_leaves_what_a_scan_of_one_recording_finds(tmp_path: Path, name
     )
 
 
-def test_what_did_not_change_is_the_same_timeline(tmp_path: Path) -> None:
-    """What is computed of a timeline is kept with it."""
-    write(tmp_path, "a/0")
-    write(tmp_path, "b/0", at_s=1)
-    index, part = index_of(tmp_path), RecordingFilter(tmp_path, "a")
-    before = part.narrowed(index.refresh())
-    write(tmp_path, "b/1", at_s=2)
-    assert part.narrowed(index.refresh()).timeline is before.timeline
-
-
 def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
     for n, bag in enumerate(["a/0", "a/1", "run_0", "run_1", "loose", "deep/b/x", "deep/b/y"]):
         write(tmp_path, bag, at_s=n)

@@ -68,45 +68,6 @@ def test_folders_and_files_that_begin_with_a_dot_are_left_out(tmp_path: Path) ->
     assert _names(Tree(tmp_path).scan(NOW, ())) == []
 
 
-def test_a_second_walk_looks_at_nothing_that_lies_in_unchanged_folders(tmp_path: Path) -> None:
-    _file(tmp_path / "rec_1" / "a.mcap")
-    _file(tmp_path / "rec_2" / "b.mcap")
-    tree = Tree(_aged(tmp_path))
-    assert _names(tree.scan(NOW, ())) == ["a.mcap", "b.mcap"]
-    assert tree.scan(NOW, ()) == ScanResult({}, set(), [], [])
-
-
-@pytest.mark.parametrize("age_s", [0.0, 1.9, -1.9])
-def test_a_folder_whose_mtime_is_younger_than_2_s_is_listed_again(
-    tmp_path: Path, age_s: float
-) -> None:
-    first = NOW - round(age_s * S)
-    _file(tmp_path / "a.mcap")
-    tree = Tree(_aged(tmp_path, first))
-    tree.scan(NOW, ())
-    _file(tmp_path / "b.mcap")
-    _aged(tmp_path, first)  # the same tick of the file system
-    assert _names(tree.scan(NOW + 10 * S, ())) == ["a.mcap", "b.mcap"]
-
-
-@pytest.mark.parametrize("age_s", [2.0, 3600.0, -2.0, -3600.0])
-def test_an_mtime_further_from_the_clock_is_trusted(tmp_path: Path, age_s: float) -> None:
-    _file(tmp_path / "a.mcap")
-    tree = Tree(_aged(tmp_path, NOW - round(age_s * S)))
-    tree.scan(NOW, ())
-    assert _names(tree.scan(NOW, ())) == []
-
-
-def test_a_watched_file_is_looked_at_though_its_folder_did_not_change(tmp_path: Path) -> None:
-    path = _file(tmp_path / "a.mcap", "x")
-    _file(tmp_path / "b.mcap", "x")
-    tree = Tree(_aged(tmp_path))
-    tree.scan(NOW, ())
-    _file(path, "longer")
-    scanned = tree.scan(NOW, [str(path)])
-    assert {key: stamp.size for key, stamp in scanned.stamps.items()} == {str(path): 6}
-
-
 def test_a_watched_file_that_left_and_came_back_within_one_tick_is_found(tmp_path: Path) -> None:
     path = _file(tmp_path / "a.mcap")
     tree = Tree(_aged(tmp_path))

@@ -66,17 +66,6 @@ def test_the_blind_time_of_a_detector_is_found_and_nothing_else() -> None:
     assert silence.end == BEGIN + 6000 * S
 
 
-def test_silences_do_not_depend_on_how_bags_are_kept_in_segments() -> None:
-    bags = [*day(700, range(300, 400))]
-    grown = Timeline.of(bags[:100])
-    for more in (bags[100:101], bags[101:350], bags[350:]):
-        grown = grown.changed((), more)
-    grown = grown.changed(bags[:200], ())
-    anew = Timeline.of(bags[200:])
-    assert [each.first for each in grown.segments] != [each.first for each in anew.segments]
-    assert Snapshot(grown).silences == Snapshot(anew).silences != ()
-
-
 def test_a_topic_of_two_types_is_heard_under_either() -> None:
     bags = [
         split(n, [at("/odom", n, 50), at("/seen", n, 1, "a" if n % 2 else "b")]) for n in range(100)

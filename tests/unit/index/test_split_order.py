@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -12,9 +11,6 @@ from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import (
-    Neighbours,
-    neighbours,
-    split_of,
     steps_of,
 )
 
@@ -41,28 +37,6 @@ def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
-def near(name: str, bags: list[BagFile], size: int = 256) -> Neighbours:
-    return neighbours(f"/bags/rec/{name}", in_parts(bags, size))
-
-
-@pytest.mark.parametrize(
-    ("name", "number"),
-    [
-        ("rec_12.mcap", 12),
-        ("rec_0.db3", 0),
-        ("rec_3.mcap.zstd", 3),
-        ("rec_0007.mcap", 7),
-        ("5.mcap", 5),
-        ("rec_" + "9" * 200 + ".mcap", int("9" * 200)),
-        ("rec.mcap", None),
-        ("rec_1b.mcap", None),
-    ],
-)
-def test_a_split_is_known_by_the_count_in_its_name(name: str, number: int | None) -> None:
-    place = split_of(f"/bags/rec/{name}")
-    assert (None if place is None else place[1]) == number
-
-
 def test_files_that_people_named_tell_nothing_of_a_clock() -> None:
     assert steps([bag("drive_1.mcap", 100, 110), bag("drive_2.mcap", 10, 20)]) == []
 
@@ -81,21 +55,3 @@ def test_steps_are_those_between_neighbours_however_the_history_is_parted(
         if a.end - b.start > S
     ]
     assert sorted(steps(bags, size)) == sorted(expected)
-
-
-@given(
-    st.sets(st.integers(0, 30), min_size=1, max_size=15),
-    st.integers(0, 30),
-    st.integers(1, 5),
-    st.booleans(),
-)
-def test_neighbours_are_the_nearest_by_count_however_the_history_is_parted(
-    numbers: set[int], missing: int, size: int, backwards: bool
-) -> None:
-    sign = -1 if backwards else 1
-    bags = {n: split(n, 1000 + sign * n * 10, 1005 + sign * n * 10) for n in numbers - {missing}}
-    before = bags.get(max((n for n in bags if n < missing), default=-1))
-    after = bags.get(min((n for n in bags if n > missing), default=-1))
-    assert near(f"rec_{missing}.mcap", list(bags.values()), size) == Neighbours(
-        before and before.end, after and after.start
-    )

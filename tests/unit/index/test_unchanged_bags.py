@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.index.bag_table import BagTable
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.recorder.index_manager import IndexManager, Snapshot
@@ -108,16 +107,6 @@ def test_a_bag_that_looks_otherwise_than_it_is_known_is_read(start: Start) -> No
     index, reader = start.index()
     assert index.refresh() == start.read()
     assert [*reader.summaries] == ["rec_3.mcap"]
-
-
-def test_a_sidecar_that_comes_has_the_bags_beside_it_read_again(start: Start) -> None:
-    index, reader = start.index()
-    index.refresh()
-    (start.bag_dir / "rec" / HANDOVER_FILE).write_text("{}", encoding="utf-8")
-    start.age()
-    os.utime(start.bag_dir / "rec", ns=(LONG_AGO + S, LONG_AGO + S))
-    assert index.refresh() == start.read()
-    assert len(reader.summaries) == 6
 
 
 @pytest.mark.parametrize("seed", range(20))
