@@ -461,9 +461,9 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
         return None
     misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
     if not any(asked.overlaps(bag.start, bag.end) for bag in misdated):
-        for first, last in view.gaps(asked):
-            if first < asked.start and asked.stop <= last:
-                return first, last
+        around = view.gap_around(asked)
+        if around is not None:
+            return around
     segments = snapshot.timeline.segments_in(asked)
     bags = (bag for segment in segments for bag in segment.bags if not is_carried(bag.file))
     if any(asked.overlaps(bag.start, bag.end) for bag in bags):
