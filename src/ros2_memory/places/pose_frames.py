@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import Mask
 
 WHEREABOUTS: Final = "where the robot was"
 """What is not known without poses, for sentences."""
@@ -389,8 +390,7 @@ class RobotPlaces:
     def within(self, start: Ns, end: Ns) -> Ns:
         """Returns a time for where the robot stood: the middle; the start, if the map jumps."""
         first, last = np.searchsorted(self._track.times, (start, end)).tolist()
-        has_jumped = jumps(self._track)[max(first - 1, 0) : last].any()
-        return start if has_jumped else (start + end) // 2
+        return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""
@@ -399,6 +399,10 @@ class RobotPlaces:
             return ()
         point = place_at(self._track, time, SILENCE_NS)
         return () if point is None else places_at(places, self.map_frame, *point)
+
+    @cached_property
+    def _jumps(self) -> Mask:
+        return jumps(self._track)
 
     @cached_property
     def _track(self) -> RobotTrack:
