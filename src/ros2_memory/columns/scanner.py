@@ -117,7 +117,7 @@ class Caches:
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
         statics: by session and topics, the static transforms of a timeline.
-        sights: by ten minutes and all that they follow from, what detectors saw, in bytes.
+        sights: by ten minutes and all that they follow from, what detectors saw.
         things: by settings, what was estimated of all bags of a timeline.
     """
 
@@ -130,7 +130,7 @@ class Caches:
     pairs: ByteLru[frozenset[Pair]]
     clock_steps: ByteLru[tuple[ClockStep, ...]]
     statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]]
-    sights: ByteLru[bytes]
+    sights: ByteLru[object]
     things: ByteLru[tuple[Timeline, object]]
 
     @classmethod

@@ -97,8 +97,7 @@ def joined(
     """
     unpacked = _Unpacked(parts)
     spots, looks, hits, scores, beside, unplaced, fixes = unpacked.tables
-    topics = unpacked.renamed(unpacked.topics, [(_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)])
-    labels = unpacked.renamed(unpacked.labels, [(_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)])
+    topics, labels = unpacked.names()
     epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
     slices = unpacked.with_slices_numbered(epoch)
     spot_order = _order(spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL])
@@ -113,6 +112,15 @@ def joined(
         _distinct_fixes(fixes, session[unpacked.part[_FIXES]]),
     )
     return Sights(topics, labels, *tables, slices=len(slices)), slices[:, 1]
+
+
+def united(parts: Sequence[bytes]) -> bytes:
+    """Returns packed parts as one: their rows one after the other."""
+    unpacked = _Unpacked(parts)
+    names = unpacked.names()
+    spots, looks, *_ = (np.arange(len(table)) for table in unpacked.tables)
+    unpacked.renumber_references(spots, looks)
+    return packed(Sights(*names, *unpacked.tables))
 
 
 def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
@@ -183,7 +191,12 @@ class _Unpacked:
         begins: Ints = np.cumsum(sizes) - sizes
         return begins
 
-    def renamed(
+    def names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Returns the names of topics and of labels, having changed their numbers in the tables."""
+        topics = self._renamed(self.topics, [(_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)])
+        return topics, self._renamed(self.labels, [(_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)])
+
+    def _renamed(
         self, names: Sequence[Sequence[str]], columns: Sequence[tuple[int, int]]
     ) -> tuple[str, ...]:
         """Returns the names of all parts, sorted, having changed their numbers in some columns."""

@@ -129,6 +129,13 @@ class View:
         touched = [(start, end) for start, end in gaps if start < last and first < end]
         return without_steps(self, touched) if touched else touched
 
+    def gap_around(self, window: TimeWindow) -> tuple[Ns, Ns] | None:
+        """Returns the one of `gaps` that all of a window lies in; None where there is none."""
+        # A window with an open start lies in none, so that these need not be looked for.
+        gaps = self.snapshot.gaps if window.start > MIN_NS else ()
+        around = [gap for gap in gaps if gap[0] < window.start and window.stop <= gap[1]]
+        return next(iter(without_steps(self, around)), None) if around else None
+
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns what is recorded of a topic under each of its types, each message counted once.
 

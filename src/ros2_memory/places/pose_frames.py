@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.motion.trajectory import Waypoint
     from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import Mask
 
 WHEREABOUTS: Final = "where the robot was"
 """What is not known without poses, for sentences."""
@@ -185,7 +186,7 @@ def placed_waypoints(
     if not moved or own_frame == frame_id or topic != resolve_path_topic(view):
         return tuple(moved)
     try:
-        track = RobotTracks(view, frame_id).over(TimeWindow(moved[0].time, moved[-1].time + 1))
+        track = TrackReader(view, frame_id).over(TimeWindow(moved[0].time, moved[-1].time + 1))
     except QueryTimeoutError:
         view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
         return tuple(moved)
@@ -406,8 +407,7 @@ class RobotPlaces:
     def within(self, start: Ns, end: Ns) -> Ns:
         """Returns a time for where the robot stood: the middle; the start, if the map jumps."""
         first, last = np.searchsorted(self._track.times, (start, end)).tolist()
-        has_jumped = jumps(self._track)[max(first - 1, 0) : last].any()
-        return start if has_jumped else (start + end) // 2
+        return start if self._jumps[max(first - 1, 0) : last].any() else (start + end) // 2
 
     def names_at(self, time: Ns) -> tuple[str, ...]:
         """Returns the named places that the robot was in, if that is known; the smallest first."""
@@ -416,6 +416,10 @@ class RobotPlaces:
             return ()
         point = place_at(self._track, time, SILENCE_NS)
         return () if point is None else places_at(places, self.map_frame, *point)
+
+    @cached_property
+    def _jumps(self) -> Mask:
+        return jumps(self._track)
 
     @cached_property
     def _track(self) -> RobotTrack:

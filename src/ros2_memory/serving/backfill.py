@@ -259,7 +259,7 @@ def _stretches_around(windows: Sequence[TimeWindow], waiting: Sequence[Ns]) -> S
 
 
 def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -> None:
-    """Makes the fragments of a window; sights and outlines where these are not joined of others.
+    """Makes the fragments of a window; outlines where these are not joined of others.
 
     Raises:
         EpisodicError: they cannot be made.
@@ -270,9 +270,8 @@ def _make_fragments_in(memory: Memory, window: TimeWindow, *, is_joined: bool) -
         drive_made(view, window),
         make_tracks(view, window),
         events_made(view, window, topics_with_changes(view)),
+        Watching(view).made(window, is_joined=is_joined),
     ]
-    if not is_joined:
-        fragments.append(Watching(view).made(window))
     # Each goes back in time as far as the others: what they read is still remembered.
     deque(merge(*fragments, reverse=True), maxlen=0)
     if not is_joined:

@@ -31,6 +31,7 @@ from ros2_memory.things.instances import (
     spellings,
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
+from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
@@ -379,14 +380,15 @@ class _Finder:
         """
         sights = self.known.estimate.sights
         best = int(sights.spots[rows, Spot.BEST].max())
-        scores = sights.scores[np.isin(sights.scores[:, Score.SPOT], rows)]
+        # Ordered by spot, and by bin.
+        begin, end = (np.searchsorted(sights.scores[:, Score.SPOT], rows + nth) for nth in (0, 1))
+        scores = sights.scores[in_ranges(begin, end - begin)]
         if not len(scores):
             return None, None
         counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
-        highest = np.full(len(sights.spots), -1, np.int64)
-        np.maximum.at(highest, scores[:, Score.SPOT], scores[:, Score.BIN])
-        in_bin = sights.spots[highest == middle, Spot.BEST]
+        highest = np.where(end > begin, sights.scores[end - 1, Score.BIN], -1)
+        in_bin = sights.spots[rows[highest == middle], Spot.BEST]
         median = int(in_bin.max()) / 1000 if len(in_bin) else (middle + 0.5) / SCORE_BINS
         return best / 1000, min(median, best / 1000)
 

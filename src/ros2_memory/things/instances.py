@@ -19,6 +19,7 @@ from ros2_memory.analysis.sights import (
     SCORE_BINS,
     STOREY_MM,
     Flags,
+    Floats,
     Hit,
     Ints,
     Score,
@@ -184,7 +185,7 @@ class Estimate:
 
         Slices count as a whole; a spot without detections that count is left out.
         """
-        first, last = self.sights.spots[rows][:, [Spot.FIRST, Spot.LAST]].T
+        first, last = (self.sights.spots[rows, column] for column in (Spot.FIRST, Spot.LAST))
         inside = (first < window.stop) & (last >= window.start) & (last < before)
         counting: Ints = rows[inside & (self.counts[rows] > 0)]
         return counting
@@ -419,7 +420,7 @@ class _Observations:
 def _by_spot(table: Ints, sights: Sights) -> tuple[Ints, Ints]:
     """Returns rows ordered by spot, their column 0, and where those of each spot begin."""
     ordered = table[np.argsort(table[:, 0], kind="stable")]
-    return ordered, np.searchsorted(ordered[:, 0], np.arange(len(sights.spots) + 1))
+    return ordered, np.cumsum(np.append(0, np.bincount(table[:, 0], minlength=len(sights.spots))))
 
 
 def _rows_of(spots: Ints, table: Ints, starts: Ints) -> Ints:
@@ -566,7 +567,7 @@ def _remove_false_stays(
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):
-        if number not in hosts.taken and not stay.weak:
+        if not hosts.taken[number] and not stay.weak:
             group.stays.append(stay)
 
 
@@ -574,7 +575,7 @@ class _Hosts:
     """Finds the stays that others are a wrong name of, or the noise around.
 
     Attributes:
-        taken: the numbers of stays that are part of another one.
+        taken: which stays are part of another one.
     """
 
     def __init__(
@@ -583,70 +584,70 @@ class _Hosts:
         observed: _Observations,
         keys: Sequence[str],
     ) -> None:
-        self.taken: set[int] = set()
-        self._stays, self._observed, self._keys = stays, observed, keys
+        self.taken = np.zeros(len(stays), np.bool_)
+        self._stays = stays
         self._beside = _by_spot(observed.sights.beside, observed.sights)
+        distinct = [*dict.fromkeys(keys)]
+        self._key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
         rows = [
-            (stay.x, stay.y, stay.z, stay.first, stay.last, group.epoch, stay.weak)
+            (distinct.index(group.key), group.epoch, stay.count, stay.first, stay.last, stay.weak)
             for group, stay in stays
         ]
-        table = np.array(rows, np.float64).reshape(-1, 7)
-        self._order = np.argsort(table[:, 0], kind="stable")
-        self._columns = table[self._order].T
+        self._columns = np.array(rows, np.int64).reshape(-1, 6).T
+        places = [(stay.x, stay.y, stay.z) for _, stay in stays]
+        self._places = np.array(places, np.float64).reshape(-1, 3).T
+        self._order = np.argsort(self._places[0], kind="stable")
+        self._x = self._places[0, self._order]
+        # The spots of all stays, as numbers in order, and how often these and those before count.
+        sizes = [len(stay.spots) for _, stay in stays]
+        number = np.repeat(np.arange(len(stays)), sizes)
+        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+        self._width = observed.sights.slices + 1
+        self._seen = number * self._width + observed.sights.spots[spots, Spot.SLICE]
+        self._times = np.append(0, np.cumsum(observed.counts[spots]))
+        together = observed.sights.spots[spots, Spot.TOGETHER] > 1
+        self._are_several = 2 * np.bincount(number, together, len(stays)) >= sizes
 
     def take(self, number: int) -> tuple[_Group, PlacedStay] | None:
         """Returns the host of a stay, which is taken then; None where it is none's part."""
-        group, stay = self._stays[number]
-        best, most = None, 0
-        for host_number, hosted in self._candidates(number):
-            host_group, host = self._stays[host_number]
-            share = _HALO_SHARE if host_group is group else _SMALL_SHARE
-            is_tiny = stay.count <= hosted and stay.count <= _TINY_SHARE * host.count
-            if is_tiny and host_group is group:
-                # Where most messages that have one have both of them, this one is no noise.
-                together = self._observed.sights.spots[stay.spots, Spot.TOGETHER]
-                is_tiny = not (2 * stay.count > hosted and np.median(together) > 1)
-            is_part = is_tiny or stay.count <= hosted * share
-            if host_number not in self.taken and is_part and hosted > most:
-                best, most = self._stays[host_number], hosted
-        if best is not None:
-            self.taken.add(number)
-        return best
+        _, stay = self._stays[number]
+        others, away_mm = self._near(number)
+        key, _, counts, *_ = self._columns[:, others]
+        is_same = key == self._columns[0, number]
+        ends = stay.stay.first_slice, stay.stay.last_slice + 1
+        begin, end = (np.searchsorted(self._seen, others * self._width + at) for at in ends)
+        hosted = self._times[end] - self._times[begin]
+        is_tiny = (stay.count <= hosted) & (stay.count <= _TINY_SHARE * counts)
+        # Where most messages that have one have both of them, this one is no noise.
+        if self._are_several[number]:
+            is_tiny &= ~is_same | (2 * stay.count <= hosted)
+        is_part = is_tiny | (stay.count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
+        is_part &= is_same | (away_mm <= _SAME_PLACE_MM)
+        is_part &= (hosted > 0) & ~self.taken[others]
+        if is_part.any():
+            is_part &= is_same | (self._beside_of(stay)[key] < _BESIDE_SHARE * stay.count)
+        if not is_part.any():
+            return None
+        self.taken[number] = True
+        return self._stays[int(others[np.where(is_part, hosted, 0).argmax()])]
 
-    def _candidates(self, number: int) -> Iterator[tuple[int, int]]:
-        """Yields the numbers of stays near one, in order, and how often each was seen meanwhile."""
-        group, stay = self._stays[number]
-        beside: Counter[str] | None = None
-        for other, away_mm in self._near(group, stay):
-            host_group, host = self._stays[other]
-            if other == number:
-                continue
-            if host_group is not group:
-                if away_mm > _SAME_PLACE_MM:
-                    continue
-                beside = self._beside_of(stay) if beside is None else beside
-                if beside[host_group.key] >= _BESIDE_SHARE * stay.count:
-                    continue
-            slices = self._observed.sights.spots[host.spots, Spot.SLICE]
-            ends = stay.stay.first_slice, stay.stay.last_slice + 1
-            meanwhile = host.spots[slice(*np.searchsorted(slices, ends))]
-            yield other, int(self._observed.counts[meanwhile].sum())
-
-    def _near(self, group: _Group, stay: PlacedStay) -> list[tuple[int, float]]:
+    def _near(self, number: int) -> tuple[Ints, Floats]:
         """Returns the numbers of stays near one at that time, in order, and how far (mm)."""
-        start, stop = np.searchsorted(self._columns[0], (stay.x - _HALO_MM, stay.x + _HALO_MM))
-        x, y, z, first, last, epoch, weak = self._columns[:, start:stop]
-        away = np.hypot(x - stay.x, y - stay.y)
-        is_near = (away <= _HALO_MM) & (first <= stay.last) & (last >= stay.first)
-        is_near &= (epoch == group.epoch) & (weak == 0) & (np.abs(z - stay.z) <= STOREY_MM)
-        numbers = self._order[start:stop][is_near].tolist()
-        return sorted(zip(numbers, away[is_near].tolist(), strict=True))
+        x, y, z = self._places[:, number]
+        _, epoch, _, first, last, _ = self._columns[:, number]
+        start, stop = np.searchsorted(self._x, (x - _HALO_MM, x + _HALO_MM))
+        others = np.sort(self._order[start:stop])
+        other_x, other_y, other_z = self._places[:, others]
+        _, epochs, _, firsts, lasts, weak = self._columns[:, others]
+        away = np.hypot(other_x - x, other_y - y)
+        is_near = (away <= _HALO_MM) & (firsts <= last) & (lasts >= first) & (others != number)
+        is_near &= (epochs == epoch) & (weak == 0) & (np.abs(other_z - z) <= STOREY_MM)
+        return others[is_near], away[is_near]
 
-    def _beside_of(self, stay: PlacedStay) -> Counter[str]:
-        """Returns how often its detections had other labels beside them, by the key of these."""
-        counts: Counter[str] = Counter()
-        for _, label, n in _rows_of(stay.spots, *self._beside).tolist():
-            counts[self._keys[label]] += n
+    def _beside_of(self, stay: PlacedStay) -> Ints:
+        """Returns how often its detections had labels of each key beside them."""
+        _, label, n = _rows_of(stay.spots, *self._beside).T
+        counts: Ints = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
         return counts
 
 

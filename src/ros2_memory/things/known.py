@@ -13,7 +13,8 @@ import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import accumulate
-from typing import TYPE_CHECKING, Final
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.analysis.sights import Ints, Spot
 from ros2_memory.columns.sights import joined
@@ -25,14 +26,18 @@ from ros2_memory.history.coverage import unix_text
 from ros2_memory.results import ThingStay
 from ros2_memory.things.instances import Estimate, Mover, estimate
 from ros2_memory.things.labels import Labels
-from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching
+from ros2_memory.things.seen import SIGHTS_NS, SeenStretch, Watching, spots_in
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Mapping, Sequence
+    from collections.abc import Hashable, Iterable, Mapping, Sequence
 
     from ros2_memory.core.model import TimeWindow, Vector3
+    from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Where
+
+T = TypeVar("T", bound="Hashable")
+_Part: TypeAlias = "list[SeenStretch[Session]]"
 
 _MOST_SPOTS: Final = 150_000
 """Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""
@@ -248,7 +253,7 @@ class _Loader:
             try:
                 known = self._things_in(parts, crowded=crowded)
             except _TakesTooLongError:
-                most = max(sum(map(_spots, parts)) // _FEWER, 1)
+                most = max(sum(map(spots_in, parts)) // _FEWER, 1)
                 self._put_most(most)
                 parts, crowded = _newest_within(parts, most), True
             else:
@@ -267,31 +272,31 @@ class _Loader:
         self._cache.put(self._most_key, (self._view.timeline, most), _KEPT_BYTES)
 
     @cached_property
-    def _gathered(self) -> tuple[list[list[SeenStretch]], bool]:
+    def _gathered(self) -> tuple[list[_Part], bool]:
         """The newest stretches, in order, and whether they have as many spots as are compared.
 
         Where reading older ones takes too long, `_read_from` is the start of the oldest.
         """
         most = self._most_spots
-        parts: list[list[SeenStretch]] = []
+        parts: list[_Part] = []
         reading = self._view.call.partial_after(READING_S)
         spots = 0
         try:
-            for part in Watching(self._view).newest_first(min(self._ahead, self._until)):
+            for part in Watching(self._view).newest_first(min(self._ahead, self._until), most):
                 if spots >= most:
                     return parts[::-1], True
                 if parts and reading.expired():
                     self._read_from = parts[-1][0].start
                     break
                 parts.append(part)
-                spots += _spots(part)
+                spots += spots_in(part)
         except QueryTimeoutError:
             if not parts:
                 raise
             self._read_from = parts[-1][0].start
         return parts[::-1], False
 
-    def _things_in(self, parts: Sequence[Sequence[SeenStretch]], *, crowded: bool) -> KnownThings:
+    def _things_in(self, parts: Sequence[_Part], *, crowded: bool) -> KnownThings:
         """Returns the things in some stretches; `crowded` if there are too many before these.
 
         Raises:
@@ -299,9 +304,9 @@ class _Loader:
         """
         stretches = _of_detectors([stretch for part in parts for stretch in part])
         epochs, frames = self._epochs(stretches)
-        sessions: dict[Hashable, int] = {}
+        session_of = _numbers((stretch.start, stretch.session) for stretch in stretches)
         of_parts = [
-            (epoch, sessions.setdefault(stretch.session, len(sessions)))
+            (epoch, session_of[stretch.session])
             for epoch, stretch in zip(epochs, stretches, strict=True)
             for _ in stretch.sights
         ]
@@ -328,21 +333,28 @@ class _Loader:
             things, self._labels, frames, since, has_map, crowded=crowded, until=self._until
         )
 
-    def _epochs(self, stretches: Sequence[SeenStretch]) -> tuple[list[int], tuple[str, ...]]:
+    def _epochs(self, stretches: _Part) -> tuple[list[int], tuple[str, ...]]:
         """Returns the epoch of each stretch, and the frame of each epoch.
 
         All that is in the map is of epoch 0. Odometry starts again in each session.
         """
         map_frame = self._view.limits.map_frame
-        numbers: dict[tuple[str, Hashable], int] = {(map_frame or "", None): 0}
-        epochs = []
-        for frame, session in ((stretch.frame_id, stretch.session) for stretch in stretches):
-            odometry = frame, None if frame == map_frame else session
-            epochs.append(numbers.setdefault(odometry, len(numbers)))
-        return epochs, tuple(frame for frame, _ in numbers)
+        placed: list[tuple[Ns, tuple[str, Session | None]]] = [(MIN_NS, (map_frame or "", None))]
+        for session, start, frame, *_ in stretches:
+            placed.append((start, (frame, None if frame == map_frame else session)))
+        numbers = _numbers(placed)
+        return [numbers[odometry] for _, odometry in placed[1:]], tuple(
+            frame for frame, _ in numbers
+        )
 
 
-def _of_detectors(stretches: Sequence[SeenStretch]) -> list[SeenStretch]:
+def _numbers(timed: Iterable[tuple[Ns, T]]) -> dict[T, int]:
+    """Returns the numbers of values that begin at some times, in the order of these."""
+    in_time = dict.fromkeys(value for _, value in sorted(timed, key=itemgetter(0)))
+    return {value: number for number, value in enumerate(in_time)}
+
+
+def _of_detectors(stretches: _Part) -> _Part:
     """Returns stretches with the sights of topics that have detections in any of them."""
     every_topic = [of_topic for stretch in stretches for of_topic in stretch.sights]
     detectors = {topic for of_topic in every_topic if of_topic.detects for topic in of_topic.topics}
@@ -354,11 +366,7 @@ def _of_detectors(stretches: Sequence[SeenStretch]) -> list[SeenStretch]:
     return found
 
 
-def _spots(part: Sequence[SeenStretch]) -> int:
-    return sum(stretch.spots for stretch in part)
-
-
-def _newest_within(parts: Sequence[list[SeenStretch]], most: int) -> list[list[SeenStretch]]:
+def _newest_within(parts: Sequence[_Part], most: int) -> list[_Part]:
     """Returns the newest parts that have at most so many spots, at least one."""
-    totals = accumulate(_spots(part) for part in reversed(parts))
+    totals = accumulate(spots_in(part) for part in reversed(parts))
     return [*parts[-max(sum(total <= most for total in totals), 1) :]]

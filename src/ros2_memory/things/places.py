@@ -312,10 +312,13 @@ Of the place next to nothing, so that the equations have a solution; of the step
 
 
 def _squares(sums: Floats, visit: Floats | float) -> Floats:
-    """Returns the squares of visits' means, each by its weight; `visit` is their own variance."""
+    """Returns the squares of visits' means, each by its weight; `visit` is their own variance.
+
+    Without those of the place alone, which nothing needs.
+    """
     weight = np.maximum(sums[:, 0], 1e-30)
     scale = 1 / weight / (1 + visit * weight)
-    squares: Floats = sums[:, :, None] * sums[:, None, :] * scale[:, None, None]
+    squares: Floats = sums[:, :3, None] * sums[:, None, :] * scale[:, None, None]
     return squares
 
 
@@ -393,7 +396,7 @@ def _before_and_after(
     ends = np.append(starts, len(series.n))
     sums = np.vstack((np.zeros((1, 5)), np.cumsum(series.rows, axis=0)))
     squares = _squares(np.diff(sums[ends], axis=0), variance[starts])
-    until = np.concatenate((np.zeros((1, 5, 5)), np.cumsum(squares, axis=0)))
+    until = np.concatenate((np.zeros((1, 3, 5)), np.cumsum(squares, axis=0)))
     first = np.searchsorted(starts, begins)
     stop = np.append(first[1:], len(starts))
     visit, thing, own = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]

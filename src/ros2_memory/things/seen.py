@@ -7,20 +7,20 @@ where all that they follow from is in parts of the store: then they are stored b
 
 from __future__ import annotations
 
-import json
+import math
 from collections import defaultdict
 from hashlib import blake2b
-from itertools import chain
-from struct import Struct
-from typing import TYPE_CHECKING, Final, NamedTuple
+from itertools import chain, groupby
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar, cast
 
 import numpy as np
 
 from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS, Flags, Ints
 from ros2_memory.bag_dir.layout import is_carried
-from ros2_memory.columns.fragments import FragmentKey, FragmentKind
-from ros2_memory.columns.sights import packed
+from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
+from ros2_memory.columns.scan import STRETCH_NS
+from ros2_memory.columns.sights import packed, united
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import remembered, scan
@@ -35,12 +35,13 @@ if TYPE_CHECKING:
     from ros2_memory.history.view import View
 
 
+S = TypeVar("S")
+
 VERSION: Final = 5
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
 """Sights of so long are taken from the store at once: the older ones are asked for next."""
-_SIZE: Final = Struct("<I")
 _MANY: Final = 64
 """A bag that spans more stretches may have odd times."""
 _NO_DETECTIONS: Final = frozenset(
@@ -68,21 +69,21 @@ _NO_DETECTIONS: Final = frozenset(
 _TEXT: Final = "std_msgs/msg/String"
 
 
-class SeenStretch(NamedTuple):
-    """The sights of a session in ten minutes of the clock.
+class SeenStretch(NamedTuple, Generic[S]):
+    """The sights of a session in ten minutes of the clock, or in `STRETCH_NS`.
 
     Attributes:
-        start: log time (ns).
+        session: its recordings; of what is stored, its number among those around.
+        start: log time (ns) of the ten minutes, the first ones that have some.
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
-        session: its recordings.
         spots: how many spots there are.
         sights: of each topic.
     """
 
+    session: S
     start: Ns
     frame_id: str
-    session: Session
     spots: int
     sights: tuple[TopicSights, ...]
 
@@ -99,18 +100,23 @@ class TopicSights(NamedTuple):
     packed: bytes
 
 
-class SeenBytes(NamedTuple):
-    """What was seen in a stretch, as `Watching` has it in bytes."""
+class Seen(NamedTuple):
+    """What was seen in a stretch, by the number of the session."""
 
-    data: bytes
+    stretches: tuple[SeenStretch[int], ...]
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 200 + len(self.data)
+        topics = [topic for stretch in self.stretches for topic in stretch.sights]
+        return 200 + sum(200 + len(topic.packed) for topic in topics)
+
+    def of(self, sessions: Sequence[Session]) -> list[SeenStretch[Session]]:
+        """Returns it with these sessions in place of their numbers."""
+        return [SeenStretch(sessions[stretch[0]], *stretch[1:]) for stretch in self.stretches]
 
 
-SIGHTS: Final[FragmentKind[SeenBytes]] = FragmentKind("sights", (SeenBytes,))
+SIGHTS: Final[FragmentKind[Seen]] = FragmentKind("sights", (Seen, SeenStretch, TopicSights))
 """What detectors saw in a stretch."""
 
 
@@ -172,30 +178,51 @@ class Watching:
         self._needed = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
         self._may_be_kept = not view.stream.may_be_relatched(self._topics)
         self._digested: tuple[object, str] = None, ""
+        self._newest = max((segment.latest for segment in timeline.segments), default=MIN_NS)
 
-    def newest_first(self, until: Ns = MAX_NS) -> Iterator[list[SeenStretch]]:
+    def newest_first(
+        self, until: Ns = MAX_NS, most: float = math.inf
+    ) -> Iterator[list[SeenStretch[Session]]]:
         """Yields the sights of all sessions in each stretch with some that begins before a time.
 
+        In that of `STRETCH_NS` at once, if it is not the newest, and there are fewer than `most`
+        spots up to its start.
+
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for around in self._stretches_in(TimeWindow(MIN_NS, until)):
-            data = self._sights(around)
-            if data:
-                yield [*_unpacked(data, around)]
+        spots = 0
+        for nth, together in enumerate(self._together_in(TimeWindow(MIN_NS, until))):
+            whole = self._joined(together) if nth else None
+            is_whole = whole is not None and spots + spots_in(whole) < most
+            for part in [whole] if is_whole else map(self._seen_in, together):
+                if part:
+                    spots += spots_in(part)
+                    yield part
 
-    def made(self, window: TimeWindow) -> Iterator[Ns]:
+    def made(self, window: TimeWindow, *, is_joined: bool = False) -> Iterator[Ns]:
         """Makes the sights that follow from the parts of a window; those of others are left out.
 
-        Yields the log time (ns) of each, the newest first.
+        If `is_joined`, those of each `STRETCH_NS` at once. Yields the log time (ns) of each, the
+        newest first.
 
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for around in self._stretches_in(window.widened(SIGHTS_NS)):
-            if around.parts is not None:
-                self._sights(around)
-            yield around.window.start
+        for together in self._together_in(window.widened(SIGHTS_NS)):
+            start = together[0].window.start // STRETCH_NS * STRETCH_NS
+            if is_joined and window.covers(start, start + STRETCH_NS - 1):
+                self._joined(together)
+            for around in together:
+                if not is_joined and around.parts is not None:
+                    self._seen_in(around)
+                yield around.window.start
+
+    def _together_in(self, window: TimeWindow) -> Iterator[list[_Surroundings]]:
+        """Yields the stretches of each `STRETCH_NS` as `_stretches_in`."""
+        stretches = self._stretches_in(window)
+        by_start = groupby(stretches, lambda around: around.window.start // STRETCH_NS)
+        return ([*together] for _, together in by_start)
 
     def _stretches_in(self, window: TimeWindow) -> Iterator[_Surroundings]:
         """Yields the stretches of a window in which there may be messages, the newest first."""
@@ -287,8 +314,46 @@ class Watching:
             return session
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _sights(self, around: _Surroundings) -> bytes:
-        """Returns what was seen in a stretch, in bytes; from memory where that is known."""
+    def _joined(self, together: Sequence[_Surroundings]) -> list[SeenStretch[Session]] | None:
+        """Returns what was seen in the stretches of a `STRETCH_NS`, as that of one; see `Seen`.
+
+        None where it is not over, or does not follow from parts alone.
+        """
+        start = together[-1].window.start // STRETCH_NS * STRETCH_NS
+        parts = [around.parts for around in together if around.parts is not None]
+        is_over = start + STRETCH_NS <= self._newest
+        if not (is_over and self._may_be_kept and len(parts) == len(together)):
+            return None
+        in_time = chain.from_iterable(around.sessions for around in reversed(together))
+        sessions = sorted(dict.fromkeys(session for session, *_ in in_time), key=min)
+        numbers = {session: number for number, session in enumerate(sessions)}
+        follows_from = [
+            (around.window.start, self._digest(around), [numbers[s] for s, *_ in around.sessions])
+            for around in together
+        ]
+        digest = _hashed(follows_from)
+
+        def make() -> Joined[Seen]:
+            # Which topics are of detectors shows in all of a history, so these stay apart.
+            alike: dict[
+                tuple[int, str, tuple[tuple[str, ...], ...]], list[SeenStretch[Session]]
+            ] = {}
+            for around in reversed(together):
+                for stretch in self._seen_in(around):
+                    topics = tuple(of_topic.topics for of_topic in stretch.sights)
+                    of = numbers[stretch.session], stretch.frame_id, topics
+                    alike.setdefault(of, []).append(stretch)
+            return Joined([Seen(tuple(_as_one(of[0], alike[of]) for of in sorted(alike)))])
+
+        key = FragmentKey(start, digest, tuple(sorted({*chain.from_iterable(parts)})))
+        [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
+        return seen.of(sessions)
+
+    def _seen_in(self, around: _Surroundings) -> list[SeenStretch[Session]]:
+        """Returns what each session saw in a stretch; from memory where that is known."""
+        return self._seen(around).of([lending.session for lending in around.sessions])
+
+    def _seen(self, around: _Surroundings) -> Seen:
         scanner = self._view.memory.scanner
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
         if is_open or not self._may_be_kept:
@@ -300,18 +365,20 @@ class Watching:
                 self._view,
                 SIGHTS,
                 part_key,
-                lambda: SeenBytes(self._read(around)),
+                lambda: self._read(around),
                 also_before=_TOGETHER_NS,
-            ).data
+            )
         # Parts, as these, are of certain recordings.
         key = (around.window.start, digest, tuple(bag.identity for bag in around.bags))
-        data = scanner.caches.sights.get(key)
-        if data is None:
-            before = self._view.notes.added
-            data = self._read(around)
-            if self._view.notes.added == before:
-                scanner.caches.sights.put(key, data, 200 + len(data) + 100 * len(around.bags))
-        return data
+        cached = scanner.caches.sights.get(key)
+        if cached is not None:
+            return cast("Seen", cached)
+        before = self._view.notes.added
+        seen = self._read(around)
+        if self._view.notes.added == before:
+            size = seen.memory_bytes + 100 * len(around.bags)
+            scanner.caches.sights.put(key, seen, size)
+        return seen
 
     def _digest(self, around: _Surroundings) -> str:
         """Returns what tells apart the sights of other settings, static transforms or sessions."""
@@ -345,18 +412,16 @@ class Watching:
                 for of_session in statics
             ]
             settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
-            text = repr((VERSION, settings, transforms, sessions))
-            digest = blake2b(text.encode(), digest_size=12).hexdigest()
+            digest = _hashed((VERSION, settings, transforms, sessions))
             self._digested = (statics, sessions), digest
         return digest
 
-    def _read(self, around: _Surroundings) -> bytes:
-        """Returns what was seen, as `_unpacked` reads it; empty where there are no messages."""
+    def _read(self, around: _Surroundings) -> Seen:
+        """Returns what was seen, by the messages."""
         by_session: dict[Session, list[Rows]] = defaultdict(list)
         for rows in self._rows(around.window):
             by_session[self._sessions.of(rows.recording)].append(rows)
-        head: list[tuple[int, str, int, list[tuple[tuple[str, ...], bool, int]]]] = []
-        data: list[bytes] = []
+        stretches: list[SeenStretch[int]] = []
         for number, (session, lender, slices) in enumerate(around.sessions):
             units = by_session[session]
             if slices is not None:
@@ -366,16 +431,18 @@ class Watching:
                 ]
             seen = self._placer.placed(around.window, session, lender, units)
             if seen is not None:
-                tables = [*map(packed, seen.sights)]
                 spots = sum(len(sights.spots) for sights in seen.sights)
-                topics = [
-                    (sights.topics, not seen.detectors.isdisjoint(sights.topics), len(table))
-                    for sights, table in zip(seen.sights, tables, strict=True)
-                ]
-                head.append((number, seen.frame_id, spots, topics))
-                data += tables
-        packed_head = json.dumps(head).encode()
-        return b"".join((_SIZE.pack(len(packed_head)), packed_head, *data)) if head else b""
+                topics = tuple(
+                    TopicSights(
+                        sights.topics,
+                        not seen.detectors.isdisjoint(sights.topics),
+                        packed(sights),
+                    )
+                    for sights in seen.sights
+                )
+                start = around.window.start
+                stretches.append(SeenStretch(number, start, seen.frame_id, spots, topics))
+        return Seen(tuple(stretches))
 
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
         """Yields the rows in a window that may have detections."""
@@ -383,21 +450,27 @@ class Watching:
             yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
 
 
-def _unpacked(data: bytes, around: _Surroundings) -> Iterator[SeenStretch]:
-    """Yields the sights of each session of a stretch: a head as JSON, then those of each topic.
+def _as_one(number: int, stretches: Sequence[SeenStretch[Session]]) -> SeenStretch[int]:
+    """Returns stretches of one session, which has a number, and the same topics as one."""
+    topics = tuple(
+        TopicSights(
+            of_topic[0].topics,
+            any(sights.detects for sights in of_topic),
+            united([sights.packed for sights in of_topic]),
+        )
+        for of_topic in zip(*(stretch.sights for stretch in stretches), strict=True)
+    )
+    first = stretches[0]
+    return SeenStretch(number, first.start, first.frame_id, spots_in(stretches), topics)
 
-    The head has which of the sessions around it is, the frame, how many spots there are, and of
-    each topic its name, whether it is surely of a detector, and how many bytes its sights take.
-    """
-    [size] = _SIZE.unpack_from(data)
-    begin = _SIZE.size + size
-    for number, frame_id, spots, topics in json.loads(data[_SIZE.size : begin]):
-        sights = []
-        for names, detects, length in topics:
-            sights.append(TopicSights(tuple(names), detects, data[begin : begin + length]))
-            begin += length
-        session = around.sessions[number].session
-        yield SeenStretch(around.window.start, frame_id, session, spots, tuple(sights))
+
+def spots_in(stretches: Iterable[SeenStretch[S]]) -> int:
+    """Returns how many spots there are in some stretches."""
+    return sum(stretch.spots for stretch in stretches)
+
+
+def _hashed(value: object) -> str:
+    return blake2b(repr(value).encode(), digest_size=12).hexdigest()
 
 
 class _Parts(NamedTuple):

@@ -40,7 +40,7 @@ from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.history.view import View
@@ -158,7 +158,7 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     if not asked.labels:
         yield from unplaced_notes(known, (asked.window,))
         others = sorted(known.estimate.names.keys() - asked.found)
-        yield from _too_low([_detected(known, key, asked.window) for key in others], asked)
+        yield from _too_low([*_detected(known, others, asked.window)], asked)
     for key, label in asked.labels.items():
         about = f"{abbreviate(label)}: " if len(asked.labels) > 1 else ""
         for note in _of_label(known, key, asked):
@@ -197,7 +197,7 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
     """
     yield from _labels_left_out(known)
     for window in windows:
-        labels = [_detected(known, key, window) for key in sorted(known.estimate.names)]
+        labels = [*_detected(known, sorted(known.estimate.names), window)]
         unplaced = [
             f"{label.name} ({counted(label.unplaced, 'time')}, "
             f"from {unix_text(label.first)} to {unix_text(label.last)})"
@@ -250,26 +250,27 @@ def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
     return np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
 
 
-def _detected(known: KnownThings, key: str, window: TimeWindow) -> _Detected:
-    """Returns how often a label was detected in a window."""
+def _detected(known: KnownThings, keys: Iterable[str], window: TimeWindow) -> Iterator[_Detected]:
+    """Yields how often each of some labels was detected in a window."""
     estimate, sights = known.estimate, known.estimate.sights
-    has_key = np.array([known.labels.key(label) == key for label in sights.labels], np.bool_)
-    rows = _during(window, sights.spots, Spot.FIRST, Spot.LAST)
-    rows = rows[has_key[sights.spots[rows, Spot.LABEL]]]
-    spots = sights.spots[rows]
-    lost = sights.unplaced[_during(window, sights.unplaced, Unplaced.FIRST, Unplaced.LAST)]
-    lost = lost[has_key[lost[:, Unplaced.LABEL]]]
-    count = int(estimate.counts[rows].sum())
-    return _Detected(
-        name=estimate.names[key],
-        counted=count,
-        low=int(spots[:, Spot.N].sum()) - count,
-        unplaced=int(lost[:, Unplaced.N].sum()),
-        first=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
-        last=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
-        placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
-        together=int(spots[:, Spot.TOGETHER].max(initial=0)),
-    )
+    during = _during(window, sights.spots, Spot.FIRST, Spot.LAST)
+    all_lost = sights.unplaced[_during(window, sights.unplaced, Unplaced.FIRST, Unplaced.LAST)]
+    label, lost_label = sights.spots[during, Spot.LABEL], all_lost[:, Unplaced.LABEL]
+    key_of_label = np.array([known.labels.key(name) for name in sights.labels], object)
+    for key in keys:
+        has_key = key_of_label == key
+        rows, lost = during[has_key[label]], all_lost[has_key[lost_label]]
+        spots, count = sights.spots[rows], int(estimate.counts[rows].sum())
+        yield _Detected(
+            name=estimate.names[key],
+            counted=count,
+            low=int(spots[:, Spot.N].sum()) - count,
+            unplaced=int(lost[:, Unplaced.N].sum()),
+            first=int(lost[:, Unplaced.FIRST].min(initial=MAX_NS)),
+            last=int(lost[:, Unplaced.LAST].max(initial=MIN_NS)),
+            placed=int(spots[:, Spot.LAST].max(initial=MIN_NS)),
+            together=int(spots[:, Spot.TOGETHER].max(initial=0)),
+        )
 
 
 def _too_low(detected: Sequence[_Detected], asked: Asked) -> Iterator[str]:
@@ -289,7 +290,7 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
     if key not in known.estimate.names:
         yield from _labels_left_out(known) or _never_reported(known, key, asked.labels[key])
         return
-    detected = _detected(known, key, asked.window)
+    [detected] = _detected(known, [key], asked.window)
     if unplaced := detected.unplaced:
         lost = counted(unplaced, "detection")
         yield f"{lost} of it could not be placed, and {'is' if unplaced == 1 else 'are'} left out"
@@ -304,9 +305,9 @@ def _of_label(known: KnownThings, key: str, asked: Asked) -> Iterator[str]:
             f"as a thing{asked.inside}: find_matches lists single detections"
         )
     if not detected.total and known.reaches_back(asked.window):
-        total = _detected(known, key, TimeWindow.everything()).total
+        [in_all] = _detected(known, [key], TimeWindow.everything())
         when = known.reach or " in all"
-        yield f"it was detected {counted(total, 'time')}{when}, and not once in this window"
+        yield f"it was detected {counted(in_all.total, 'time')}{when}, and not once in this window"
 
 
 def _never_reported(known: KnownThings, key: str, label: str) -> Iterator[str]:

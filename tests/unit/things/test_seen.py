@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections import deque
 from contextlib import closing
@@ -14,7 +15,7 @@ from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.sights import joined
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
-from ros2_memory.things import placing
+from ros2_memory.things import placing, seen
 from ros2_memory.things.find import find_things
 from ros2_memory.things.seen import SIGHTS_NS, Watching
 from tests.support.bags import write_splits
@@ -54,9 +55,9 @@ def made_in(bag_dir: Path) -> World:
     return world
 
 
-def make(memory: Memory) -> None:
+def make(memory: Memory, *, is_joined: bool = False) -> None:
     assert memory.scanner is not None
-    deque(Watching(View(memory, Call())).made(EVERYTHING), maxlen=0)
+    deque(Watching(View(memory, Call())).made(EVERYTHING, is_joined=is_joined), maxlen=0)
     memory.scanner.write_fragments()
 
 
@@ -91,6 +92,41 @@ def test_another_process_finds_stored_sights_and_reads_no_messages(
     assert {thing.label for thing in plain} == {"cup", "mug"}
     monkeypatch.delattr(placing, "sights_of")  # there is nothing to be made
     assert things_in(another(world)) == plain
+
+
+def test_joined_sights_say_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(seen, "STRETCH_NS", 3 * SIGHTS_NS)
+    for nth in range(9):
+        begin = nth * APART_S - 20  # each recording begins before its ten minutes
+        things = ("mug", 3.0, 0.5), (f"cup {nth}", 2.0, -1.0)
+        write_splits(tmp_path / f"rec_{nth}", looked(begin, begin + 60, HERE, *things), 20.0)
+    plain = World.of(tmp_path).memory
+    tables, things_there, starts = sights_in(plain).tables, things_in(plain), starts_in(plain)
+    world = made_in(tmp_path)
+    make(world.memory, is_joined=True)
+    # Of more spots than are wanted no more are yielded than those of ten minutes.
+    assert starts_in(another(world), most=1) == starts
+    monkeypatch.delattr(placing, "sights_of")
+    for memory in (another(world), another(with_joined_alone(world))):
+        for table, same in zip(tables, sights_in(memory).tables, strict=True):
+            assert table.tolist() == same.tolist()
+        assert things_in(memory) == things_there
+        assert 2 < len(starts_in(memory)) < len(starts)
+
+
+def starts_in(memory: Memory, most: float = math.inf) -> list[int]:
+    watching = Watching(View(memory, Call()))
+    return [part[0].start for part in watching.newest_first(most=most)]
+
+
+def with_joined_alone(world: World) -> World:
+    """The same store without the sights of the single ten minutes that are joined."""
+    with closing(sqlite3.connect(store_file(world.bag_dir))) as base, base:
+        base.execute(
+            "DELETE FROM fragment WHERE kind LIKE 'sights %' AND start_ns <"
+            " (SELECT max(start_ns) FROM fragment WHERE kind LIKE 'sights-joined %')"
+        )
+    return world
 
 
 def test_sights_go_with_the_parts_that_they_follow_from(tmp_path: Path) -> None:
