@@ -1,4 +1,4 @@
-"""What documents name exists."""
+"""What documents name exists, and AGENTS.md and the package's map leave no room out."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import ros2_memory
 from ros2_memory.config import Settings
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.tools.build import build_tools
@@ -15,12 +16,20 @@ from tests.project.reference_tables import configured_keys
 from tests.support.memories import ROOT
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+SOURCE = ROOT / "src" / "ros2_memory"
 DOCUMENTS = sorted([ROOT / "README.md", ROOT / "AGENTS.md", *(ROOT / "docs").rglob("*.md")])
+MAPS = [
+    ROOT / "AGENTS.md",
+    *(ROOT / "docs" / name for name in ("architecture.md", "reference/specification.md")),
+]
 EACH = pytest.mark.parametrize("document", DOCUMENTS, ids=lambda document: document.name)
 
 
-def test_readme_tells_how_many_tools_there_are() -> None:
-    assert f"has {len(build_tools(QuerySettings(), writing=True))} tools" in README
+def test_the_reference_lists_the_tools_in_their_order() -> None:
+    reference = (ROOT / "docs/reference/tools.md").read_text(encoding="utf-8")
+    sections = re.findall(r"^### `(\w+)`$", reference, re.MULTILINE)
+    assert sections == [tool.name for tool in build_tools(QuerySettings(), writing=True)]
+    assert f"has {len(sections)} tools" in README
 
 
 def test_every_key_that_readme_tells_of_exists() -> None:
@@ -51,3 +60,23 @@ def test_every_file_section_and_test_that_a_document_names_exists(document: Path
     ] == []
     for file, name in re.findall(r"(tests/[\w/]+\.py)::(?:\w+::)?(\w+)", text):
         assert re.search(rf"(def|class) {name}\b", (ROOT / file).read_text(encoding="utf-8")), name
+
+
+@pytest.mark.parametrize("document", MAPS, ids=lambda document: document.name)
+def test_every_module_that_a_map_names_exists(document: Path) -> None:
+    text = document.read_text(encoding="utf-8")
+    named = re.findall(r"`([a-z_0-9/.-]+(?:/|\.py|\.toml|\.yaml))(?:::[\w:]+)?`", text)
+    elsewhere = ("moments/", "build/", "tools/mcp.yaml", "topics.yaml", "metadata.yaml")
+    paths = [each for each in named if not each.startswith((*elsewhere, "."))]
+    assert len(paths) > 15
+    assert [
+        each for each in paths if not ((SOURCE / each).exists() or (ROOT / each).exists())
+    ] == []
+
+
+def test_agents_and_the_map_of_the_package_name_every_room() -> None:
+    rooms = {each.parent.name for each in SOURCE.glob("*/__init__.py")}
+    agents = (ROOT / "AGENTS.md").read_text(encoding="utf-8")
+    assert [room for room in rooms if f"`{room}/`" not in agents] == []
+    mapped = re.findall(r"^    ([a-z_]+) ", ros2_memory.__doc__ or "", re.MULTILINE)
+    assert rooms <= {*mapped}

@@ -34,6 +34,7 @@ UNMEASURED: Final = (
     "soak/*.py",
     "demo/test_robot.py",
     "test_any_cut.py",
+    "test_benchmarks.py",
     "test_bins.py::test_a_boolean_is_counted",
     "test_bins.py::test_all_ways",
     "test_bins.py::test_the_metres",
