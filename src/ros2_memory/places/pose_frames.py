@@ -205,7 +205,7 @@ def placed_waypoints(
 def _unreachable(frame_id: str, own_frame: str) -> str:
     return (
         f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-        f"{own_frame or 'a pose without a frame'} at that time; list_frames names the frames"
+        f"{own_frame or 'a pose without a frame'} at that time"
     )
 
 

@@ -431,7 +431,7 @@ def test_the_frame_of_the_robot_is_the_map_or_the_one_asked_for(tmp_path: Path) 
 
     assert robot() == "map"
     assert robot(frame_id="odom") == "odom"
-    with pytest.raises(InvalidArgumentsError, match=r"leads there .* list_frames"):
+    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         robot(frame_id="moon")
 
 
@@ -448,7 +448,7 @@ def test_a_position_is_in_its_own_frame_names_its_place_and_may_be_asked_in_anot
     assert there.pose.position[:2] == pytest.approx(place, abs=0.05)
     reply = asked(memory, tmp_path, "get_position_at", timestamp=at / S, frame_id="map")
     assert reply["in"] == "room"
-    with pytest.raises(InvalidArgumentsError, match=r"leads there .* list_frames"):
+    with pytest.raises(InvalidArgumentsError, match="no transform leads there"):
         position(memory, Call(), AtTime(at_s=at / S), frame_id="moon")
 
 
