@@ -176,8 +176,7 @@ class BagTable:
         for pair in alike_among(self._timeline.bags):
             with suppress(OSError):
                 self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
-        copies = {bag.file: bag for (_, bag), is_same in self._compared.items() if is_same}
-        return tuple(copies.values())
+        return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
 
     def _superseded(self) -> Iterable[BagFile]:
         """Returns the bags in whose place thinned days answer."""

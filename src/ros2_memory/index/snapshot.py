@@ -58,7 +58,7 @@ class Snapshot:
         scanned_at: when the directory was scanned.
         problem: why the bag directory itself could not be read.
         metadata_folders: folders with a metadata.yaml.
-        copies: bags that are copies, whole or cut short, of others in their folder, which answer.
+        copies: bags that are byte for byte the same as others in their folder, which answer.
         older: up to which log time (inclusive) there are older bags, which are not in it: those of
             a lake are shown some days at a time. None where all are.
     """

@@ -10,7 +10,7 @@ import pytest
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.index.scan import ScanResult, Tree
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import odom, write_mcap
 from tests.support.memories import asked, each_way, memory_of
 
 S = 10**9
@@ -172,28 +172,6 @@ def test_a_copy_of_a_bag_beside_it_counts_once(tmp_path: Path, recalls: bool) ->
     path.unlink()
     [odometry] = asked(memory, tmp_path, "list_recorded_topics")
     assert odometry["count"] == 10
-
-
-@each_way
-def test_an_interrupted_copy_of_a_bag_beside_it_does_not_count(
-    tmp_path: Path, recalls: bool
-) -> None:
-    path = tmp_path / "rec" / "rec_0.mcap"
-    begin = 1_784_000_000 * S
-    poses = [odom(begin + n * S, 0.1 * n, 0.0) for n in range(100)]
-    write_mcap(path, poses, McapLayout(chunk_size=4096))
-    content = path.read_bytes()
-    for part in (0.7, 0.4):
-        path.with_name(f"{part}.mcap").write_bytes(content[: int(len(content) * part)])
-    memory = memory_of(tmp_path, recalls=recalls)
-    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
-    assert odometry["count"] == 100
-    assert asked(memory, tmp_path, "data_time_range")["incomplete"] == []
-    path.unlink()
-    [odometry] = asked(memory, tmp_path, "list_recorded_topics")
-    assert 50 < odometry["count"] < 100
-    # Where the bag that was copied is not there, the longest copy answers.
-    assert [bag.file for bag in memory.index.snapshot().bags] == [str(path.with_name("0.7.mcap"))]
 
 
 def test_runs_of_a_simulation_with_equal_times_are_no_copies(tmp_path: Path) -> None:
