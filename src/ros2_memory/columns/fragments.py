@@ -13,6 +13,7 @@ import struct
 import threading
 from collections import deque
 from dataclasses import fields, is_dataclass
+from io import BytesIO
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -22,7 +23,7 @@ from ros2_memory.columns.steps import EXACT, METRES
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -78,28 +79,29 @@ def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """
     numbers = {cls: number for number, cls in enumerate(classes)}
     data: list[bytes] = []
-
-    def plain(value: object) -> object:
-        if isinstance(value, bytes):
-            data.append(value)
-            return [_BYTES, len(value)]
-        if isinstance(value, np.ndarray):
-            codec, least, packed = _packed(value)
-            data.append(packed)
-            return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
-        if type(value) in numbers:
-            parts: object = value
-            if is_dataclass(value):
-                parts = [getattr(value, field.name) for field in fields(value)]
-            return [numbers[type(value)], *map(plain, cast("Iterable[object]", parts))]
-        if isinstance(value, tuple | list):
-            return [_TUPLE, *map(plain, value)]
-        if isinstance(value, dict):
-            return {key: plain(entry) for key, entry in value.items()}
-        return value
-
-    head = json.dumps(plain(fragment))
+    head = json.dumps(_plain(fragment, numbers, data))
     return compressed(b"".join((head.encode(), b"\n", *data)))
+
+
+# A function within a function that calls itself would keep all of this until garbage is looked for.
+def _plain(value: object, numbers: Mapping[type, int], data: list[bytes]) -> object:
+    if isinstance(value, bytes):
+        data.append(value)
+        return [_BYTES, len(value)]
+    if isinstance(value, np.ndarray):
+        codec, least, packed = _packed(value)
+        data.append(packed)
+        return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
+    if isinstance(value, dict):
+        return {key: _plain(entry, numbers, data) for key, entry in value.items()}
+    number, parts = numbers.get(type(value)), value
+    if number is None:
+        if not isinstance(value, tuple | list):
+            return value
+        number = _TUPLE
+    elif is_dataclass(value):
+        parts = [getattr(value, field.name) for field in fields(value)]
+    return [number, *(_plain(part, numbers, data) for part in cast("Iterable[object]", parts))]
 
 
 def from_bytes(data: bytes, classes: Sequence[type]) -> object:
@@ -109,28 +111,25 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
         ValueError, TypeError, LookupError, struct.error: the bytes are none.
     """
     head, tail = decompressed(data).split(b"\n", 1)
-    words: dict[str, str] = {}
-    begin = 0
+    return _restored(json.loads(head), classes, BytesIO(tail), {})
 
-    def restored(value: object) -> object:
-        nonlocal begin
-        if isinstance(value, str):
-            return words.setdefault(value, value)  # equal ones are one object: there are thousands
-        if isinstance(value, dict):
-            return {key: restored(entry) for key, entry in value.items()}
-        if not isinstance(value, list):
-            return value
-        number, *rest = value
-        if number >= 0:
-            return classes[number](*map(restored, rest))
-        if number == _TUPLE:
-            return tuple(map(restored, rest))
+
+def _restored(
+    value: object, classes: Sequence[type], tail: BytesIO, words: dict[str, str]
+) -> object:
+    if isinstance(value, str):
+        return words.setdefault(value, value)  # equal ones are one object: there are thousands
+    if isinstance(value, dict):
+        return {key: _restored(entry, classes, tail, words) for key, entry in value.items()}
+    if not isinstance(value, list):
+        return value
+    number, *rest = value
+    if number < _TUPLE:
         size, *array = rest
-        packed = tail[begin : begin + size]
-        begin += size
+        packed = tail.read(size)
         return packed if number == _BYTES else _unpacked(packed, *array)
-
-    return restored(json.loads(head))
+    parts = [_restored(part, classes, tail, words) for part in rest]
+    return tuple(parts) if number == _TUPLE else classes[number](*parts)
 
 
 def _packed(array: Array) -> tuple[str, float | None, bytes]:

@@ -70,6 +70,11 @@ class TruthValues(NamedTuple):
         return self.perhaps & ~self.surely
 
     @property
+    def is_settled(self) -> bool:
+        """Whether it is known everywhere."""
+        return not self.unsure.any()
+
+    @property
     def is_none(self) -> bool:
         """Whether it stands nowhere."""
         return not self.perhaps.any()

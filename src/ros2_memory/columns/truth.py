@@ -45,6 +45,7 @@ from ros2_memory.columns.shown import (
 )
 from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import (
+    ROWS,
     Kind,
     Leaf,
     LeafNumbers,
@@ -66,6 +67,9 @@ if TYPE_CHECKING:
 _EXACT_BELOW: Final = 2**53
 _ROUNDING: Final = 1e-9
 """How much a distance that numpy computes may differ, relative to the tolerance; far too much."""
+_SHORT: Final = 200
+_MOST_DECIDED: Final = 4_096
+"""Texts of which it is remembered whether they pass."""
 _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 
@@ -86,10 +90,10 @@ class ColumnCondition:
         plan, values = self._plans.of(table), Values(table)
         if plan is None:
             return unknown(values.rows)
-        if values.rows == 0 or not plan.may_match(values.zone):
-            return nowhere(values.rows)
         if plan.counted is None:
             return _any_of(plan.whole, values)
+        if not plan.may_match(values.zone):
+            return nowhere(values.rows)
         texts = tuple(
             t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
         )
@@ -141,11 +145,15 @@ class _Plan(NamedTuple):
 def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> TruthValues:
     """Returns which rows pass any of the tests."""
     surely, perhaps = nowhere(values.rows)
-    for test in tests:
+    for test in tests if values.rows else ():
         if not test.may_match(values.zone):
             continue
         try:
             for level, passing, limits in test.passing(values):
+                if level is ROWS and not limits:
+                    surely |= passing.surely
+                    perhaps |= passing.perhaps
+                    continue
                 certain, possible = map(np.flatnonzero, passing)
                 surely[placed(values, level, certain, limits, surely=True)[1]] = True
                 perhaps[placed(values, level, possible, limits, surely=False)[1]] = True
@@ -172,7 +180,7 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
         for path, leaf, limits in leaves_below(spot):
             # Elements of lists have no name of their own.
             is_element = field is not None and not path
-            leaf_test = _LeafTest(test, leaf, limits, is_element, condition.least_score)
+            leaf_test = _LeafTest(test, leaf, limits, is_element, condition.least_score, {})
             if leaf_test.is_needed:
                 tests.append(leaf_test)
     return tests
@@ -187,6 +195,7 @@ class _LeafTest(NamedTuple):
         limits: where that stands in the value.
         is_element: whether it is what a field leads to, or an element of that.
         least_score: for texts that are JSON.
+        decided: whether texts pass that many parts have.
     """
 
     test: Contains | Equals | Beyond
@@ -194,6 +203,7 @@ class _LeafTest(NamedTuple):
     limits: Limits
     is_element: bool
     least_score: float
+    decided: dict[str, bool]
 
     @property
     def numbers(self) -> tuple[int | float, ...]:
@@ -271,13 +281,23 @@ class _LeafTest(NamedTuple):
             if may is None:
                 raise
             return TruthValues(np.zeros_like(may), may)
-        used = np.bincount(codes if may is None else codes[may], minlength=len(words)) > 0
-        depth = self.leaf.json_depth
-        flags = [
-            is_used and self.passes(_without_low(word, self.least_score, depth))
-            for word, is_used in zip(words, used.tolist(), strict=True)
-        ]
+        if may is None:
+            flags = [*map(self._passes_text, words)]
+        else:
+            used = np.bincount(codes[may], minlength=len(words)) > 0
+            flags = [
+                is_used and self._passes_text(word)
+                for word, is_used in zip(words, used.tolist(), strict=True)
+            ]
         return TruthValues.known(np.array(flags, np.bool_)[codes])
+
+    def _passes_text(self, word: str) -> bool:
+        passes = self.decided.get(word)
+        if passes is None:
+            passes = self.passes(_without_low(word, self.least_score, self.leaf.json_depth))
+            if len(word) <= _SHORT and len(self.decided) < _MOST_DECIDED:
+                self.decided[word] = passes
+        return passes
 
     def _passing_numbers(self, numbers: LeafNumbers) -> TruthValues:
         column, error, exactly = numbers

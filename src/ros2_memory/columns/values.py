@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 import numpy as np
 
 from ros2_memory.columns.stored import StoredTable
-from ros2_memory.columns.table import MAX_NUMBERS, Column, Elements, Table, Texts, Zone
+from ros2_memory.columns.table import IN_PART, MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
@@ -217,6 +217,9 @@ class Values:
         """
         if leaf.level is not ROWS or not isinstance(self.table, StoredTable):
             return None
+        zone = self.table.zone(leaf.sources[0])
+        if zone is None or not (zone.words or "").startswith(IN_PART):
+            return None  # then outlines have none, either
         outline = self.table.outline()
         letters = None if outline is None else outline.letters.get(leaf.sources[0])
         return None if letters is None else letters.may_have(text)

@@ -391,7 +391,8 @@ class BinnedWindow:
         starts, stops = (times[inside].clip(*self._counted_bounds) for times in (starts, stops))
         begins = starts[begun[inside] > 0]
         self.add_counts("count", begins)
-        lasting = united(zip(starts.tolist(), stops.tolist(), strict=True))
+        is_long = starts < stops  # what happened at a moment took no time
+        lasting = united(zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
         last = self._last_held(starts, stops)
@@ -410,7 +411,8 @@ class BinnedWindow:
         first_pieces, last_pieces = self.bins.pieces(starts), self.bins.pieces(stops)
         newest = np.full(len(piece_ends), MIN_NS)
         np.maximum.at(newest, last_pieces, np.minimum(stops, piece_ends[last_pieces]))
-        for first, last in zip(first_pieces.tolist(), last_pieces.tolist(), strict=True):
+        spans = np.stack((first_pieces, last_pieces), axis=1)[first_pieces < last_pieces]
+        for first, last in spans.tolist():
             newest[first:last] = piece_ends[first:last]
         last_of_bins = (int(newest[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
         return [None if last == MIN_NS else last for last in last_of_bins]

@@ -265,10 +265,12 @@ class RowCondition:
             QueryTimeoutError: the call's time is over.
         """
         truth, channel = self._test.truth(rows.table), rows.table.channel
+        is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
+        if not is_stored or channel.type in self._left_to_messages or truth.is_settled:
+            return truth
         index = np.arange(len(rows.table)) if rows.index is None else rows.index
         left = np.flatnonzero(truth.unsure[index])
-        is_stored = isinstance(rows.table, StoredTable) and "" not in rows.table.left_out
-        if not is_stored or left.size <= MOST_UNSURE or channel.type in self._left_to_messages:
+        if left.size <= MOST_UNSURE:
             return truth
         surely, perhaps = truth.surely.copy(), truth.perhaps.copy()
         for positions, decoded in decoded_rows(self._view, rows.some(left)):

@@ -10,6 +10,7 @@ import heapq
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -44,6 +45,9 @@ UNKNOWN: Final = 2
 
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
+_LAST: Final = attrgetter("last")
+_MOST_WAITING: Final = 1 << 14
+"""Messages that are looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -126,19 +130,21 @@ class MatchTester:
 
     def _block(self, topic: str, rows: Rows, window: TimeWindow) -> Block:
         truth = self._test.truth(rows) if rows.may_match else nowhere(len(rows.table))
-        self.ruled_out |= truth.is_none
+        has_match = not truth.is_none
+        self.ruled_out |= not has_match
         first, last = max(rows.first, window.start), min(rows.last, window.stop - 1)
         tested = partial(self._test_rows, topic, rows, truth)
-        return Block(topic, first, last, has_match=not truth.is_none, tested=tested)
+        return Block(topic, first, last, has_match=has_match, tested=tested)
 
     def _test_rows(self, topic: str, rows: Rows, truth: TruthValues) -> Tested:
         """Tests the rows that count: by columns, and by messages where these leave it open."""
-        counting = rows.mask()
-        self.ruled_out |= not truth.perhaps[counting].all()
+        counting = slice(None) if rows.index is None else rows.index
+        surely, perhaps = truth.surely[counting], truth.perhaps[counting]
+        self.ruled_out |= not perhaps.all()
         source = self._source_numbers(topic)[rows.recording, rows.table.channel.type]
         sources = np.full(len(rows), source)
-        met = truth.surely[counting].astype(np.uint8)
-        undecided = np.flatnonzero(truth.unsure[counting])
+        met = surely.astype(np.uint8)
+        undecided = np.flatnonzero(perhaps & ~surely)
         if undecided.size:
             # Messages that lie close together are read at once.
             edges = np.flatnonzero(np.diff(rows.times[undecided]) > _TOGETHER_NS) + 1
@@ -184,8 +190,7 @@ def _block_of(topic: str, tested: Tested) -> Block:
     return Block(topic, first, last, has_match=bool(tested.met.any()), tested=lambda: tested)
 
 
-@dataclass(frozen=True, slots=True)
-class Run:
+class Run(NamedTuple):
     """Consecutive matches on one topic.
 
     Attributes:
@@ -193,7 +198,8 @@ class Run:
         first: log time of the first match.
         last: of the last one.
         messages: how many there are.
-        until: of the next message, which is no match; None where that is not known.
+        until: of the next message, which is no match or comes after a silence; None where that is
+            not known.
         begun: whether what came before the first match is known.
         later: how many matches have the log time of the last one, and come after it.
     """
@@ -239,14 +245,14 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
     starts = np.flatnonzero(new)
     stops = np.r_[starts[1:], rows.size]
-    others = np.flatnonzero(met == NOT_MET)
-    until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1])]
+    others = np.flatnonzero((met == NOT_MET) | begins)
+    until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1], side="right")]
     firsts, lasts = times[rows[starts]], times[rows[stops - 1]]
     later = np.searchsorted(times[rows], lasts, side="right") - stops
     columns = firsts, lasts, stops - starts, np.minimum(until, after), later
     runs = [
         Run(topic, first, last, messages, None if end == MAX_NS else end, later=later_matches)
-        for first, last, messages, end, later_matches in np.stack(columns, axis=1).tolist()
+        for first, last, messages, end, later_matches in np.column_stack(columns).tolist()
     ]
     return BlockRuns(
         runs[::-1],
@@ -276,23 +282,45 @@ class _TopicRuns:
     def __init__(self, topic: str, *, apart: bool) -> None:
         self._topic = topic
         self._apart = apart
-        self.runs: list[Run] = []
+        self._runs: list[Run] = []
         self._is_open = False
         self._begins: Ns = MAX_NS
+        self._waiting: list[Tested] = []
+        self._messages = 0
+
+    @property
+    def runs(self) -> list[Run]:
+        """The runs, the newest first."""
+        self._join()
+        return self._runs
 
     @property
     def closed(self) -> list[Run]:
         """The runs to which no older match can belong."""
-        return self.runs[:-1] if self._is_open else self.runs
+        runs = self.runs
+        return runs[:-1] if self._is_open else runs
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
-        if not block.has_match and not self._is_open:
-            self._begins = MAX_NS
-            return
+        if not block.has_match:
+            self._join()
+            if not self._is_open:
+                self._begins = MAX_NS
+                return
         tested = block.tested()
-        if not tested.times.size:
+        if tested.times.size:
+            # Many small blocks take long one by one.
+            self._waiting.append(tested)
+            self._messages += tested.times.size
+            if self._messages >= _MOST_WAITING:
+                self._join()
+
+    def _join(self) -> None:
+        """Joins the runs in the blocks that were added since to those before."""
+        if not self._waiting:
             return
+        tested = stacked(self._waiting[::-1])
+        self._waiting, self._messages = [], 0
         after, self._begins = self._begins, int(tested.times[0])
         added = runs_of(self._topic, tested, after, apart=self._apart)
         is_near = after - int(tested.times[-1]) <= SILENCE_NS
@@ -300,10 +328,10 @@ class _TopicRuns:
             self._is_open = self._is_open and is_near
             return
         if self._is_open and is_near and added.goes_on:
-            newer, older = self.runs.pop(), added.runs.pop(0)
+            newer, older = self._runs.pop(), added.runs.pop(0)
             messages = newer.messages + older.messages
-            self.runs.append(replace(newer, first=older.first, messages=messages))
-        self.runs += added.runs
+            self._runs.append(newer._replace(first=older.first, messages=messages))
+        self._runs += added.runs
         self._is_open = added.goes_back
 
     def end_in(self, view: View, gap: TimeWindow) -> None:
@@ -311,14 +339,14 @@ class _TopicRuns:
 
         Then, and where no run goes on, what follows an older run is not known.
         """
+        self._join()
         if not self._is_open or _has_messages(view, self._topic, gap):
             self._is_open, self._begins = False, MAX_NS
 
     def cut(self) -> list[Run]:
         """Returns the runs, of which the oldest may have begun earlier than is known."""
-        if not self._is_open:
-            return self.runs
-        return [*self.runs[:-1], replace(self.runs[-1], begun=False)]
+        runs = self.runs
+        return [*runs[:-1], runs[-1]._replace(begun=False)] if self._is_open else runs
 
 
 def find_runs(
@@ -370,8 +398,10 @@ def find_runs(
         if not runs:
             raise
         parts = [*_parts_in(view, runs, scope, latched)]
-        return SearchedRuns(sorted(parts, key=_by_last), reached, is_over=True)
-    runs = sorted(_parts_in(view, _newest_first(runs_by_topic), scope, latched), key=_by_last)
+        return SearchedRuns(sorted(parts, key=_LAST, reverse=True), reached, is_over=True)
+    runs = sorted(
+        _parts_in(view, _newest_first(runs_by_topic), scope, latched), key=_LAST, reverse=True
+    )
     if enough is not None and len(runs) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
         search.note_untested(replace(scope.window, start=runs[enough - 1].first))
@@ -441,9 +471,6 @@ def _has_enough(runs_by_topic: dict[str, _TopicRuns], enough: int, reached: Ns) 
 def _newest_first(runs_by_topic: dict[str, _TopicRuns]) -> list[Run]:
     return sorted(
         (run for topic_runs in runs_by_topic.values() for run in topic_runs.runs),
-        key=_by_last,
+        key=_LAST,
+        reverse=True,
     )
-
-
-def _by_last(run: Run) -> Ns:
-    return -run.last
