@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 from mcp.types import TextContent
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import boolean, detections, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, detections, odom, tf, transform, write_mcap
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -101,7 +102,12 @@ CALLS: list[tuple[str, dict[str, Any]]] = [
 
 def write_run(bag_dir: Path) -> None:
     """Twelve seconds of a robot: odometry, transforms, one sighting, one bump."""
-    messages = []
+    write_mcap(bag_dir / "run" / "run_0.mcap", _run())
+
+
+@cache
+def _run() -> list[Msg]:
+    messages: list[Msg] = []
     for n in range(LENGTH_S * 50):
         at = T0 + n * NS_PER_S // 50
         messages.append(odom(at, math.sin(n / 50), n / 100, 0.3, vx=0.5, wz=0.1))
@@ -111,7 +117,7 @@ def write_run(bag_dir: Path) -> None:
     messages.append(tf(T0, fixed, topic="/tf_static"))
     messages.append(detections(T0 + 5 * NS_PER_S, ["scissors", "cup"]))
     messages.append(boolean(T0 + 6 * NS_PER_S, data=True))
-    write_mcap(bag_dir / "run" / "run_0.mcap", messages)
+    return messages
 
 
 async def ask(client: Client, name: str, given: dict[str, Any]) -> tuple[Any, bool]:
