@@ -6,6 +6,7 @@ import shutil
 import signal
 import sys
 from collections.abc import Generator, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING
@@ -18,6 +19,7 @@ from xdist.remote import Producer
 
 from tests.support.composed import composed_once
 from tests.support.examples import examples
+from tests.support.forked_commands import ADDRESS, forking
 from tests.support.measured import (
     foreign_untraced,
     is_measured,
@@ -78,6 +80,14 @@ def pytest_collection() -> Generator[None, object, object]:
     finally:
         gc.freeze()
         gc.enable()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers fork programs from what the first process of all began."""
+    if ADDRESS not in os.environ:
+        stack = ExitStack()
+        stack.enter_context(forking())
+        config.add_cleanup(stack.close)
 
 
 def pytest_unconfigure() -> None:

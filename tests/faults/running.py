@@ -7,7 +7,6 @@ import json
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
@@ -17,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from tests.faults.world import T0_S
+from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 
 if TYPE_CHECKING:
@@ -109,18 +109,9 @@ def start(
     ours = ("MEMORY_", "MCP_", "ROS_")
     kept = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
     env = kept | {"MEMORY_BAG_DIR": str(bag_dir), "MCP_TRANSPORT": "sse", "MCP_PORT": "0"}
-    argv = [
-        sys.executable,
-        "-m",
-        "ros2_memory.server",
-        "data.now=latest",
-        "reader.index_refresh_s=0.1",
-        *overrides,
-    ]
+    given = ("data.now=latest", "reader.index_refresh_s=0.1", *overrides)
     with log.open("wb") as stderr:
-        process = subprocess.Popen(
-            argv, env=env | (environment or {}), stdout=subprocess.DEVNULL, stderr=stderr
-        )
+        process = Forked("ros2-memory-server", *given, env=env | (environment or {}), stderr=stderr)
     running = Running(process, 0, log)
 
     def listening() -> bool:

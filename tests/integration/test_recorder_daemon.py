@@ -29,6 +29,7 @@ from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.bags import odom, write_mcap
+from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.timing import in_time
 
@@ -112,22 +113,11 @@ class Site:
             "retention.min_free_gb=0",
         )
 
-    def run(self, *overrides: str, wait: bool = True, **options: Any) -> Daemon:
+    def run(self, *overrides: str, wait: bool = True) -> Daemon:
         log = self.folder / f"log{len(self.daemons)}"
+        given = (*self.settings, *overrides)
         with log.open("wb") as stream:
-            process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-m",
-                    "ros2_memory.recorder",
-                    *self.settings,
-                    *overrides,
-                ],
-                env=self.env,
-                stderr=stream,
-                stdin=subprocess.DEVNULL,
-                **options,
-            )
+            process = Forked("ros2-memory-recorder", *given, env=self.env, stderr=stream)
         daemon = Daemon(process, self.bag_dir, log)
         self.daemons.append(daemon)
         if wait:

@@ -20,6 +20,7 @@ from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.server import _show_page, main
+from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
 from tests.timing import in_time
@@ -79,16 +80,18 @@ class Served:
 
 @contextmanager
 def serving(
-    bag_dir: Path, log: Path, *overrides: str, program: Sequence[str] = PROGRAM, **more: str
+    bag_dir: Path, log: Path, *overrides: str, program: Sequence[str] = (), **more: str
 ) -> Iterator[Served]:
     """The server over HTTP on a free port, from when it answers `/health`.
 
-    `more` joins its environment.
+    `program`: what is started; none: it is forked. `more` joins its environment.
     """
     env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT="0", **more)
     with log.open("wb") as stderr:
-        process = subprocess.Popen(
-            [*program, *overrides], env=env, stdout=subprocess.PIPE, stderr=stderr
+        process: subprocess.Popen[Any] = (
+            subprocess.Popen([*program, *overrides], env=env, stdout=subprocess.PIPE, stderr=stderr)
+            if program
+            else Forked("ros2-memory-server", "data.now=latest", *overrides, env=env, stderr=stderr)
         )
     try:
         served = Served(process, 0, log)
@@ -180,7 +183,7 @@ async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: P
         async with Client(stdio_client(alone, errlog=log)) as client:
             await ask_everything(client)
             expected = await replies(client)
-    with serving(bag_dir, tmp_path / "log") as served:
+    with serving(bag_dir, tmp_path / "log", program=PROGRAM) as served:
         async with Client(served.url("/mcp")) as client:
             assert await replies(client) == expected
         async with Client(served.url("/mcp"), mode="legacy") as client:
@@ -218,7 +221,7 @@ def test_a_signal_ends_it_with_clients_connected(
 
 
 async def _end_with_clients(bag_dir: Path, tmp_path: Path, number: signal.Signals) -> None:
-    with serving(bag_dir, tmp_path / "log") as served:
+    with serving(bag_dir, tmp_path / "log", program=PROGRAM) as served:
         connected = anyio.Event()
 
         async def stay() -> None:

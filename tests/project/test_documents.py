@@ -26,7 +26,7 @@ from ros2_memory import cli
 from ros2_memory.config import load_settings
 from ros2_memory.serving.web_app import STREAM_PATH
 from tests.support.documented_history import START_S, write_history
-from tests.support.forked_commands import forked_commands
+from tests.support.forked_commands import write_command
 from tests.support.memories import ROOT
 
 if TYPE_CHECKING:
@@ -111,9 +111,10 @@ def history(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def commands(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    with forked_commands(tmp_path_factory.mktemp("commands")) as folder:
-        yield folder
+def commands(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("commands")
+    write_command(folder)
+    return folder
 
 
 @pytest.fixture

@@ -37,6 +37,7 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.integration.test_server_process import Served, serving
+from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.support.real_recorder import env_without_ros
 from tests.support.robot_run import ask
@@ -217,23 +218,26 @@ class Machine:
         listed.write_text("topics:\n" + "".join(f"  - {topic}\n" for topic in topics))
         bags = bag_dir or self.bag_dir(name)
         log = shelf / f"recorder{len(self.recorders)}.log"
-        program = shutil.which("ros2-memory-recorder", path=Path(sys.executable).parent)
-        assert program is not None, "the package is not installed in this environment"
+        given = [
+            f"recording.bag_dir={bags}",
+            f"recording.topics_file={listed}",
+            *([f"recorder.setup_files=[{self.env['ROS2_LIVE_SETUP']}]"] * (env is None)),
+            "retention.min_free_gb=0",
+            *overrides,
+        ]
+        known = dict(self.plain_env if env is None else env)
         with log.open("wb") as stream:
-            process = subprocess.Popen(
-                [
-                    *through,
-                    program,
-                    f"recording.bag_dir={bags}",
-                    f"recording.topics_file={listed}",
-                    *([f"recorder.setup_files=[{self.env['ROS2_LIVE_SETUP']}]"] * (env is None)),
-                    "retention.min_free_gb=0",
-                    *overrides,
-                ],
-                env=dict(self.plain_env if env is None else env),
-                stdin=subprocess.DEVNULL,
-                stderr=stream,
-            )
+            if through:
+                program = shutil.which("ros2-memory-recorder", path=Path(sys.executable).parent)
+                assert program is not None, "the package is not installed in this environment"
+                process = subprocess.Popen(
+                    [*through, program, *given],
+                    env=known,
+                    stdin=subprocess.DEVNULL,
+                    stderr=stream,
+                )
+            else:
+                process = Forked("ros2-memory-recorder", *given, env=known, stderr=stream)
         recorder = LiveRecorder(bags, log, process)
         self.recorders.append(recorder)
         return recorder
