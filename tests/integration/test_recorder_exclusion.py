@@ -118,10 +118,13 @@ def test_nothing_of_it_is_ever_served(
         wait_for(is_enough, what, timeout_s=PATIENCE_S, alive=recorder.process)
 
     def has_excluded_a_split() -> bool:
-        """Of what this recorder began: more than the second in which the mode was not known."""
+        """Of what this recorder began: more than the second in which the mode was not known.
+
+        In that come 50 messages at most; on a busy machine the robot sends fewer in each second.
+        """
         began = {each["recording"] for each in recorder.events("recorder_started")}
         return any(
-            each["messages"] > 80 and each["recording"] in began
+            each["messages"] > 60 and each["recording"] in began
             for each in recorder.events("messages_excluded")
         )
 
