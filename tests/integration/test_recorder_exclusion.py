@@ -12,7 +12,7 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
-from ros2_memory.bag_dir.state_files import read_gate
+from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.core.timebase import WallClock
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
@@ -151,8 +151,8 @@ def test_nothing_of_it_is_ever_served(
     assert {*range(last + 75, last + 150)} <= found
     everywhere = set().union(*map(numbers, recorder.bag_dir.rglob("rec_*.mcap")))
     assert everywhere == found
-    gate = read_gate(recorder.bag_dir)
-    assert not any(gate.holds_some(each.name) for each in recorder.bag_dir.glob("rec_*"))
+    withheld = read_withheld(recorder.bag_dir)
+    assert not any(withheld.holds_some(each.name) for each in recorder.bag_dir.glob("rec_*"))
 
 
 def test_a_latched_message_of_an_excluded_time_is_not_asked_for_again(

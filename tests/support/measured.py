@@ -1,7 +1,7 @@
 """In which tests coverage is measured, which takes up to five times as long as the test itself.
 
 Measured is the first example of each plain test; what the others run, tests of the same room or of
-the tools above it run as well: 92 % of all lines and branches together, the gate is 85 %. 1,977
+the tools above it run as well: 92 % of all lines and branches together, the withheld is 85 %. 1,977
 tests of `unit` and `project` that were measured once take 88 s of processor time now; it was 244 s.
 """
 

@@ -10,7 +10,7 @@ from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.layout import utc_stamp
-from ros2_memory.bag_dir.state_files import read_gate
+from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.exclusion import ExclusionRule
@@ -109,11 +109,11 @@ class ScreenedBags:
 
     def served(self) -> list[Path]:
         """The bags that are not held back."""
-        gate = read_gate(self.bag_dir)
+        withheld = read_withheld(self.bag_dir)
         return [
             path
             for path in sorted(self.bag_dir.glob("rec_*/*.mcap"))
-            if not gate.holds(path.parent.name, path.name)
+            if not withheld.holds(path.parent.name, path.name)
         ]
 
     def seconds(self, topic: str = "/chatter") -> list[float]:

@@ -15,7 +15,7 @@ counts is one rule over the whole memory:
   between two, as one that starts late each time, only those count that last `UNUSUAL` times as long
   as half of them do.
 
-Presences of parts of a memory add up exactly, in whichever parts it is cut.
+Activities of parts of a memory add up exactly, in whichever parts it is cut.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class Spacing(NamedTuple):
     intervals: int = 0
 
 
-class Presence(NamedTuple):
+class Activity(NamedTuple):
     """When some bags hold a topic, and how often.
 
     Attributes:
@@ -95,15 +95,15 @@ class Silence(NamedTuple):
         return Silence(self.topic, first, last, min(self.length, last - first), goes_on)
 
 
-def joined(parts: Sequence[Presence]) -> Presence:
-    """Returns the presence in all of these parts together; at least one."""
+def joined(parts: Sequence[Activity]) -> Activity:
+    """Returns the activity in all of these parts together; at least one."""
     spacings: dict[int, Spacing] = {}
     for part in parts:
         for octave, spacing in part.spacings.items():
             both = zip(spacings.get(octave, Spacing()), spacing, strict=True)
             spacings[octave] = Spacing(*map(sum, both))
     runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
-    return Presence(
+    return Activity(
         tuple(runs),
         spacings,
         sum(part.messages for part in parts),
@@ -116,39 +116,39 @@ def shortest_silence(period: Ns) -> Ns:
     return max(SHORTEST_NS, PERIODS * period)
 
 
-def usual_period(presence: Presence) -> Ns | None:
+def usual_period(activity: Activity) -> Ns | None:
     """Returns the usual time between two messages; None for a topic without a usual rate."""
-    octaves = sorted(presence.spacings)
-    bags = [*accumulate(presence.spacings[octave].bags for octave in octaves)]
+    octaves = sorted(activity.spacings)
+    bags = [*accumulate(activity.spacings[octave].bags for octave in octaves)]
     if not bags:
         return None
     median = next(
         octave for octave, upto in zip(octaves, bags, strict=True) if 2 * upto >= bags[-1]
     )
-    spacing = presence.spacings[median]
+    spacing = activity.spacings[median]
     period = spacing.span // spacing.intervals
-    return period if 2 * presence.messages * period >= presence.length else None
+    return period if 2 * activity.messages * period >= activity.length else None
 
 
-def usual_periods(presences: Mapping[str, Presence]) -> dict[str, Ns]:
+def usual_periods(activities: Mapping[str, Activity]) -> dict[str, Ns]:
     """Returns the usual period of each topic that has one."""
-    periods = ((topic, usual_period(presence)) for topic, presence in presences.items())
+    periods = ((topic, usual_period(activity)) for topic, activity in activities.items())
     return {topic: period for topic, period in periods if period is not None}
 
 
 def silences(
-    presences: Mapping[str, Presence],
+    activities: Mapping[str, Activity],
     together: Iterable[Iterable[str]],
     gaps: Sequence[Span] = (),
 ) -> list[Silence]:
     """Returns the silences of all topics, in order of time.
 
     Args:
-        presences: by topic, in the whole memory.
+        activities: by topic, in the whole memory.
         together: the topics of each bag; of bags with the same topics once is enough.
         gaps: when nothing was recorded, in order: also pauses of less than `SHORTEST_NS`.
     """
-    periods = usual_periods(presences)
+    periods = usual_periods(activities)
     companions: dict[str, set[str]] = {}
     for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
@@ -158,9 +158,9 @@ def silences(
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in robot_on:
-            robot_on[others] = _heard([presences[other].runs for other in sorted(others)])
+            robot_on[others] = _heard([activities[other].runs for other in sorted(others)])
         limit = shortest_silence(period)
-        runs = united(presences[topic].runs, limit)
+        runs = united(activities[topic].runs, limit)
         found = _silences_of(topic, runs, robot_on[others], limit, gaps)
         reported += _without_habit([*found], runs)
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))

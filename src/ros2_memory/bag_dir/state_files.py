@@ -636,7 +636,7 @@ class ScreenState:
     excluded: list[Excluded] = field(default_factory=list)
 
 
-class Gate(NamedTuple):
+class Withheld(NamedTuple):
     """Which files are not served yet.
 
     `state` is None where the file cannot be read: then no file of a recording is.
@@ -660,24 +660,24 @@ class Gate(NamedTuple):
         return screen is not None and not screen.done
 
 
-OPEN_GATE: Final = Gate(ScreenState())
+NOTHING_WITHHELD: Final = Withheld(ScreenState())
 """Holds nothing back."""
 SCREENED: Final = JsonDocument(SCREENED_FILE, ScreenState, most_bytes=MOST_BYTES)
 
 
 @until_changed(SCREENED_FILE)
 def _screen_state(bag_dir: Path) -> ScreenState | None:
-    return SCREENED.read(bag_dir) or OPEN_GATE.state
+    return SCREENED.read(bag_dir) or NOTHING_WITHHELD.state
 
 
-def read_gate(bag_dir: Path) -> Gate:
+def read_withheld(bag_dir: Path) -> Withheld:
     """Returns what is held back at this moment. Raises nothing."""
-    return Gate(_screen_state(bag_dir))
+    return Withheld(_screen_state(bag_dir))
 
 
 def excluded_between(bag_dir: Path, start: Ns, stop: Ns) -> list[Excluded]:
     """Returns the stretches that were excluded between two log times."""
-    state = read_gate(bag_dir).state
+    state = read_withheld(bag_dir).state
     stretches = () if state is None else state.excluded
     return [stretch for stretch in stretches if stretch.start < stop and start < stretch.stop]
 

@@ -25,14 +25,14 @@ from ros2_memory.columns.units import (
     Rows,
     Unit,
     copies_among,
-    relatched_among,
+    repeated_among,
 )
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME, UNHASHED
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.segment import in_time
-from ros2_memory.storage.base import RELATCHED_NS, IntArray
+from ros2_memory.storage.base import REPEATED_NS, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -74,7 +74,7 @@ class ScanRequest:
         timeline: the bags.
         decode: decodes a topic of a bag that is not stored.
         shared: the half-open spans in which different recordings may hold copies, in order.
-        relatches: whether recordings may have received a message again, as of a latched topic.
+        repeats_latched: whether recordings may have received a message again, as a latched one.
         may_match: says by zones which parts may have rows that are wanted, of each or of all;
             the others are left out.
         may_not_match: whether the others are yielded, too, as such.
@@ -92,7 +92,7 @@ class ScanRequest:
     timeline: Timeline
     decode: Decode
     shared: Sequence[tuple[Ns, Ns]] = ()
-    relatches: bool = False
+    repeats_latched: bool = False
     may_match: Callable[[PartZones], bool | Mask] | None = None
     may_not_match: bool = False
     may_be_empty: bool = False
@@ -152,11 +152,11 @@ class Scan:
         self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
-        self._relatched: dict[object, IntArray] = {}
-        self._relatched_since = MAX_NS
+        self._latched_again: dict[object, IntArray] = {}
+        self._latched_again_since = MAX_NS
         self._together: list[PartHead] = []
         reach = request.window
-        if request.relatches:
+        if request.repeats_latched:
             reach = TimeWindow.everything()
         elif self._shared:
             reach = reach.widened(2 * COPY_HORIZON_NS)
@@ -257,7 +257,11 @@ class Scan:
         With them those that latched messages in the window may have been received in before.
         """
         parts = self._parts_reaching_into(window)
-        late = [part for part in parts or () if self._request.relatches and self._may_be_late(part)]
+        late = [
+            part
+            for part in parts or ()
+            if self._request.repeats_latched and self._may_be_late(part)
+        ]
         if not late:
             return parts
         published = min(self._published[part][0] for part in late)
@@ -337,7 +341,7 @@ class Scan:
         spans = [TimeWindow(*span) for span in self._shared]
         shared = {id(source) for span in spans for source in self._sources_in(span)}
         for source in self._sources:
-            may_be_late = self._request.relatches and self._may_be_late(source.number)
+            may_be_late = self._request.repeats_latched and self._may_be_late(source.number)
             if not may_be_late and id(source) not in shared:
                 continue
             self._request.check(source.first)
@@ -411,7 +415,7 @@ class Scan:
     def _units_of_bag(self, bag: BagFile) -> list[BagUnit]:
         """Returns the tables of a bag, which is decoded unless it was one of the last."""
         if bag.file not in self._decoded:
-            hashed = bool(self._shared) or self._request.relatches
+            hashed = bool(self._shared) or self._request.repeats_latched
             tables = self._request.decode(bag, self._request.topic, hashed)
             held = _without_columns_if_large(tables)
             units = [BagUnit(bag, table, nth) for nth, table in enumerate(held) if len(table)]
@@ -462,7 +466,7 @@ class Scan:
                     end = min(begin + _SLICE_NS, stop)
                     self._compare(TimeWindow(start, stop), TimeWindow(begin, end))
         copies = self._copies.get(unit.key, [])
-        if self._request.relatches:
+        if self._request.repeats_latched:
             copies = [*copies, self._received_again(unit)]
         return np.concatenate(copies) if copies else np.empty(0, np.int64)
 
@@ -500,18 +504,18 @@ class Scan:
         if identities is None:
             return none
         published, _ = identities
-        is_late = unit.times() - published > RELATCHED_NS
+        is_late = unit.times() - published > REPEATED_NS
         if not is_late.any():
             return none
         since = max(int(published[is_late].min()) - COPY_HORIZON_NS, MIN_NS)
-        if since < self._relatched_since:
+        if since < self._latched_again_since:
             # As much again before it: late messages come many at once, of about the same age.
-            self._relatched_since = max(since - (unit.last - since), MIN_NS)
-            window = TimeWindow(self._relatched_since, MAX_NS)
-            for late, rows in self._judged(window, relatched_among):
+            self._latched_again_since = max(since - (unit.last - since), MIN_NS)
+            window = TimeWindow(self._latched_again_since, MAX_NS)
+            for late, rows in self._judged(window, repeated_among):
                 if late.table.channel.latched:
-                    self._relatched[late.key] = rows
-        return self._relatched.get(unit.key, none)
+                    self._latched_again[late.key] = rows
+        return self._latched_again.get(unit.key, none)
 
     @cached_property
     def _delays(self) -> dict[int | None, tuple[float, float]]:
@@ -527,7 +531,7 @@ class Scan:
 
     def _may_be_late(self, part: int | None) -> bool:
         """Returns whether a part, or a bag, may have messages that were received long after."""
-        return self._delays.get(part, (0.0, math.inf))[1] > RELATCHED_NS
+        return self._delays.get(part, (0.0, math.inf))[1] > REPEATED_NS
 
     def _sources_in(self, window: TimeWindow) -> list[_Source]:
         # They are in the order of their first times, and reach beyond the next ones.

@@ -25,7 +25,7 @@ from ros2_memory.core.arrays import Groups, distinct_rows
 from ros2_memory.core.errors import BusyError
 from ros2_memory.core.spans import COPY_HORIZON_NS
 from ros2_memory.index.segment import in_time
-from ros2_memory.storage.base import RELATCHED_NS, IntArray
+from ros2_memory.storage.base import REPEATED_NS, IntArray
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Container, Iterator
@@ -274,7 +274,7 @@ def copies_among(messages: Identities) -> NDArray[np.bool_]:
     return copies
 
 
-def relatched_among(messages: Identities) -> NDArray[np.bool_]:
+def repeated_among(messages: Identities) -> NDArray[np.bool_]:
     """Returns which messages were received again: late, and before by another recording."""
     order = np.lexsort(
         (messages.recordings, messages.log_times, messages.hashes, messages.publish_times)
@@ -283,15 +283,15 @@ def relatched_among(messages: Identities) -> NDArray[np.bool_]:
     is_first = np.ones(order.size, np.bool_)
     is_first[1:] = (np.diff(ordered.publish_times) != 0) | (np.diff(ordered.hashes) != 0)
     first = np.maximum.accumulate(np.where(is_first, np.arange(order.size), 0))
-    is_late = ordered.log_times - ordered.publish_times > RELATCHED_NS
+    is_late = ordered.log_times - ordered.publish_times > REPEATED_NS
     is_again = (
         is_late
         & (ordered.log_times > ordered.log_times[first])
         & (ordered.recordings != ordered.recordings[first])
     )
-    relatched = np.zeros(order.size, np.bool_)
-    relatched[order] = is_again
-    return relatched
+    repeated = np.zeros(order.size, np.bool_)
+    repeated[order] = is_again
+    return repeated
 
 
 def _shared_by_recordings(messages: Identities) -> IntArray:

@@ -3,7 +3,7 @@
 Messages of one log time are in the order of their recordings' names, then of their bags.
 
 Recordings overlap (see `duplicates`), and a new recording receives latched messages again: with a
-new log time and the original publish time. Such a relatched message counts once too, at its
+new log time and the original publish time. Such a repeated message counts once too, at its
 earliest log time, however long ago that is.
 """
 
@@ -131,13 +131,13 @@ class MergedStream:
             messages = (message for message in once if window.contains(message.time))
         else:
             messages = self.merged(bags, topics, window, newest_first=newest_first)
-        if self.may_be_relatched(topics):
-            messages = (message for message in messages if not self._is_relatched(message))
+        if self.may_be_repeated(topics):
+            messages = (message for message in messages if not self._is_repeated(message))
         if all(span.bag.state is BagState.CLOSED for span in bags):
             return messages
         return self.bags.track_sources(messages)
 
-    def may_be_relatched(self, topics: Iterable[str]) -> bool:
+    def may_be_repeated(self, topics: Iterable[str]) -> bool:
         """Whether two recordings may have received one latched message of these topics."""
         return any(
             topic in self._timeline.transient_local and len(self._timeline.recordings(topic)) > 1
@@ -147,15 +147,15 @@ class MergedStream:
     def find_first_copy(self, stored: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
         topic, window = stored.topic, _since_published(stored)
-        if stored.record.may_be_relatched and self.may_be_relatched([topic]):
+        if stored.record.may_be_repeated and self.may_be_repeated([topic]):
             bags = self.overlapping_bags([topic], window)
             copies = self.merged(bags, [topic], window)
             key = copy_key(stored.record)
             next((copy for copy in copies if copy_key(copy.record) == key), None)
 
-    def _is_relatched(self, stored: StoredMessage) -> bool:
+    def _is_repeated(self, stored: StoredMessage) -> bool:
         record = stored.record
-        if not record.may_be_relatched:
+        if not record.may_be_repeated:
             return False
         self._find_first_copies(stored)
         own = stored.time, stored.bag.recording

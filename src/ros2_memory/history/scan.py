@@ -100,9 +100,9 @@ def open_scan(
         view.bags.check_deadline()
 
     wanted.setdefault("shared", () if copies else view.timeline.shared_times)
-    relatches = not copies and view.stream.may_be_relatched([topic])
+    repeats_latched = not copies and view.stream.may_be_repeated([topic])
     asked = ScanRequest(
-        topic, window, view.timeline, decode, relatches=relatches, check=check, **wanted
+        topic, window, view.timeline, decode, repeats_latched=repeats_latched, check=check, **wanted
     )
     return Scan(view.memory.scanner, asked)
 
@@ -302,7 +302,7 @@ def count_messages(
     """
     size = len(edges) + 1
     counted = Counted(np.zeros(size, np.int64), np.full(size, MAX_NS), np.full(size, MIN_NS))
-    if view.stream.may_be_relatched([topic]):
+    if view.stream.may_be_repeated([topic]):
         for rows in scan(view, topic, window, columns=proves):
             counted.add_times(rows.times, edges)
         return counted

@@ -40,7 +40,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import bag_kind
 from ros2_memory.bag_dir.metadata_yaml import read_listing
-from ros2_memory.bag_dir.state_files import Gate, read_gate
+from ros2_memory.bag_dir.state_files import Withheld, read_withheld
 from ros2_memory.core.errors import BagError, BagUnreachableError, BagVanishedError
 from ros2_memory.core.model import BagFile, BagState, SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -113,12 +113,12 @@ class ScanContext:
     _finished: dict[Path, frozenset[str]] = field(default_factory=dict)
 
     @cached_property
-    def gate(self) -> Gate:
+    def withheld(self) -> Withheld:
         """What the recorder has not released yet.
 
         That is looked up after the directory was listed: what was found there is known by then.
         """
-        return read_gate(self.root)
+        return read_withheld(self.root)
 
     def may_be_recorded(self, path: Path) -> bool:
         """Returns whether no live heartbeat shows that this file's recording is over."""
@@ -226,7 +226,7 @@ def classify(notes: FileNotes, reader: BagReader, context: ScanContext) -> Class
     """
     if not reader.reads(notes.path):
         return _set_aside(FileState.UNREAD, notes, reason_unread(notes.path))
-    if context.gate.holds(notes.path.parent.name, notes.path.name):
+    if context.withheld.holds(notes.path.parent.name, notes.path.name):
         return Classification(FileState.HELD_BACK, aside=SetAside(notes.path, HELD_BACK))
     try:
         if notes.closing is None and notes.fault is None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.silences import Presence, usual_periods
+from ros2_memory.analysis.silences import Activity, usual_periods
 from ros2_memory.bag_dir.layout import is_thinned
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
@@ -77,11 +77,11 @@ class Rhythm:
     """How often the topics of bags have a message.
 
     Args:
-        presences: when the bags of a memory hold each topic.
+        activities: when the bags of a memory hold each topic.
     """
 
-    def __init__(self, presences: Mapping[str, Presence]) -> None:
-        self._periods = usual_periods(presences)
+    def __init__(self, activities: Mapping[str, Activity]) -> None:
+        self._periods = usual_periods(activities)
 
     def gaps(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses that are gaps."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.silences import SHORTEST_NS, Presence, Spacing
+from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
 from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -346,7 +346,7 @@ class Segment:
         return TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
 
     @cached_property
-    def presences(self) -> dict[str, Presence]:
+    def activities(self) -> dict[str, Activity]:
         """By topic, when the bags hold it and how often."""
         columns = _topic_columns(self)
         lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
@@ -355,7 +355,7 @@ class Segment:
             for topic, pauses in bag.summary.schema.absences:
                 absences.setdefault(topic, {})[row] = pauses
         return {
-            topic: _presence_of(column, lengths, absences.get(topic, {}))
+            topic: _activity_of(column, lengths, absences.get(topic, {}))
             for topic in sorted(columns.topics)
             if (column := columns.of(topic)) is not None
         }
@@ -472,9 +472,9 @@ def _topic_columns(segment: Segment) -> _TopicColumns:
     return _TopicColumns(segment.bags)
 
 
-def _presence_of(
+def _activity_of(
     column: TopicColumn, lengths: _Times, absences: Mapping[int, Sequence[CountedPause]]
-) -> Presence:
+) -> Activity:
     """Returns when bags hold a topic, and how often.
 
     `lengths` (ns) are those of all bags, `absences` where some of them hold none of the topic.
@@ -490,7 +490,7 @@ def _presence_of(
         firsts, lasts, counts = np.array(parts, np.int64).T
         length -= sum(end - start for pauses in absences.values() for start, end, _ in pauses)
     spacings = _spacings(counts, lasts - firsts)
-    return Presence(_runs(firsts, lasts), spacings, int(counts.sum()), length)
+    return Activity(_runs(firsts, lasts), spacings, int(counts.sum()), length)
 
 
 def _parts(
@@ -506,7 +506,7 @@ def _parts(
 
 
 def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:
-    """Returns the runs of a topic; see `Presence`."""
+    """Returns the runs of a topic; see `Activity`."""
     order = np.argsort(firsts, kind="stable")
     begins, reach = firsts[order], np.maximum.accumulate(lasts[order])
     breaks = np.flatnonzero(begins[1:] - reach[:-1] > SHORTEST_NS)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import (
     LONGEST_OFF_NS,
-    Presence,
+    Activity,
     Silence,
     joined,
     length_in,
@@ -128,12 +128,12 @@ class Snapshot:
         return dated_segments
 
     @cached_property
-    def _presences(self) -> dict[str, Presence]:
+    def _activities(self) -> dict[str, Activity]:
         """When bags hold each topic; not of logs, whose lines come when something happens."""
-        by_topic: dict[str, list[Presence]] = {}
+        by_topic: dict[str, list[Activity]] = {}
         for part in filter(None, (segment.unthinned for segment in self._dated_segments)):
-            for topic, presence in part.presences.items():
-                by_topic.setdefault(topic, []).append(presence)
+            for topic, activity in part.activities.items():
+                by_topic.setdefault(topic, []).append(activity)
         is_log = self.timeline.is_log
         return {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
 
@@ -143,17 +143,17 @@ class Snapshot:
         together = frozenset(
             chain.from_iterable(segment.together for segment in self._dated_segments)
         )
-        return tuple(silences(self._presences, together, self.gaps))
+        return tuple(silences(self._activities, together, self.gaps))
 
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic must have no message to count as silent."""
-        presence = self._presences.get(topic)
-        return shortest_silence((presence and usual_period(presence)) or 0)
+        activity = self._activities.get(topic)
+        return shortest_silence((activity and usual_period(activity)) or 0)
 
     def longest_silence(self, topic: str) -> Ns:
         """Returns for how long others were recorded, at most, between two messages of a topic."""
-        presence = self._presences.get(topic)
-        pauses = () if presence is None else pairwise(presence.runs)
+        activity = self._activities.get(topic)
+        pauses = () if activity is None else pairwise(activity.runs)
         return max(
             (stop - start - length_in(self.gaps, start, stop) for (_, start), (stop, _) in pauses),
             default=0,
@@ -210,7 +210,7 @@ class Snapshot:
 
     @cached_property
     def _rhythm(self) -> Rhythm:
-        return Rhythm(self._presences)
+        return Rhythm(self._activities)
 
     @cached_property
     def _pauses(self) -> Sequence[Pause]:

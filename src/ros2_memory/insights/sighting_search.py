@@ -453,7 +453,7 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
         return False
     bags = view.stream.overlapping_bags([topic], gap)
     is_alone = len({bag.bag.recording for bag in bags}) == 1
-    counts = is_alone and not view.stream.may_be_relatched([topic])
+    counts = is_alone and not view.stream.may_be_repeated([topic])
     if counts and any(gap.contains(bag.first) or gap.contains(bag.last) for bag in bags):
         return True
     return bool(bags) and view.stream.first([topic], gap) is not None

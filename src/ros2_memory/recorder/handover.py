@@ -44,7 +44,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
-from ros2_memory.bag_dir.state_files import OPEN_GATE, read_gate
+from ros2_memory.bag_dir.state_files import NOTHING_WITHHELD, read_withheld
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
@@ -494,8 +494,10 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
     before, after = handover_to_change(old), handover_to_change(new)
     if after.compared is not False or after.previous != old.name:
         return True
-    gate, is_void = read_gate(old.parent), after.state is Counting.VOID
-    written = [path for path in (old, new) if path.name in running or gate.holds_some(path.name)]
+    withheld, is_void = read_withheld(old.parent), after.state is Counting.VOID
+    written = [
+        path for path in (old, new) if path.name in running or withheld.holds_some(path.name)
+    ]
     if after.state is Counting.PENDING or (new if is_void else old) in written:
         return False
     old_cut = Handover()
@@ -608,11 +610,12 @@ def bags_of(
         BagUnreachableError: the disk fails.
     """
     summaries: dict[str, BagSummary] = {}
-    gate = read_gate(recording.parent) if only_closed else OPEN_GATE
+    withheld = read_withheld(recording.parent) if only_closed else NOTHING_WITHHELD
     for path in _bag_files(recording, reader):
         try:
             if only_closed and (
-                gate.holds(recording.name, path.name) or reader.closing(path) is not Closing.CLOSED
+                withheld.holds(recording.name, path.name)
+                or reader.closing(path) is not Closing.CLOSED
             ):
                 continue
             summary = reader.summarize(path)

@@ -24,8 +24,8 @@ from ros2_memory.retention.disk import RETRIED_S, free_bytes
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
     DeletionPlan,
+    DirContents,
     RetentionLimits,
-    RetentionStock,
     StoredBag,
     ages,
     by_hours,
@@ -222,19 +222,19 @@ class GarbageCollector:
         run = _Pass(urgent=free_bytes_wanted is not None)
         result, needed = run.result, self._needed(snapshot)
         while True:
-            stock = replace(self._stock(known, limits, run), needed=needed)
+            contents = replace(self._contents(known, limits, run), needed=needed)
             if free_bytes_wanted is not None:
-                stock = replace(stock, free_bytes=self._measure_free(self._bag_dir))
-            plan = plan_deletions(stock, limits)
-            result.foreign_bytes, result.state_bytes = stock.foreign_bytes, stock.state_bytes
-            result.saved_bytes = sum(file.size for file in stock.saved)
+                contents = replace(contents, free_bytes=self._measure_free(self._bag_dir))
+            plan = plan_deletions(contents, limits)
+            result.foreign_bytes, result.state_bytes = contents.foreign_bytes, contents.state_bytes
+            result.saved_bytes = sum(file.size for file in contents.saved)
             result.total_bytes, result.fits = plan.total_bytes, plan.fits
             result.most_free = plan.most_free
-            going = plan.to_delete if self._memory is None else by_hours(plan, stock)
+            going = plan.to_delete if self._memory is None else by_hours(plan, contents)
             to_delete = going[: MOST_AT_ONCE - len(run.deleted)]
             if to_delete:
-                self._delete_bags(to_delete, stock, snapshot, run, plan)
-                run.unshipped += sorted(stock.unshipped & run.deleted)
+                self._delete_bags(to_delete, contents, snapshot, run, plan)
+                run.unshipped += sorted(contents.unshipped & run.deleted)
             elif plan.fits or not run.waiting:
                 break
             else:
@@ -242,9 +242,9 @@ class GarbageCollector:
                 run.remaining -= run.waiting
                 run.waiting.clear()
         self._remove_emptied(known, run)
-        self._limit_memory(snapshot, is_synchronised=stock.synchronised)
+        self._limit_memory(snapshot, is_synchronised=contents.synchronised)
         if free_bytes_wanted is None and result.fits:
-            self._cut_topics(stock, limits, snapshot, run)
+            self._cut_topics(contents, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
             relative_recording(path, self._bag_dir)
@@ -263,34 +263,34 @@ class GarbageCollector:
         except (EpisodicError, OSError) as error:
             _log.error("memory_not_limited", reason=str(error))
 
-    def _stock(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> RetentionStock:
+    def _contents(self, known: KnownBags, limits: RetentionLimits, run: _Pass) -> DirContents:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
-        stock = self._inventory.stock(known, deleted=run.deleted, remaining=run.remaining)
+        contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self._bag_dir}{os.sep}"
         names = {
-            bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in stock.bags
+            bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in contents.bags
         }
         since = self._recorded.since(names.values())
         doubtful = self._recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self._own.in_order())}
         missing = frozenset[str]()
         if limits.require_shipped:
-            bags = ((bag.path.removeprefix(root), bag.size) for bag in stock.bags)
+            bags = ((bag.path.removeprefix(root), bag.size) for bag in contents.bags)
             missing = frozenset(root + path for path in unshipped(self._bag_dir, bags))
-        stock = replace(
-            stock,
+        contents = replace(
+            contents,
             recorded_since={path: since[name] for path, name in names.items()},
             doubtful=frozenset(path for path, name in names.items() if name in doubtful),
             places={path: order[name] for path, name in names.items() if name in order},
             unshipped=missing,
         )
-        old = ages(stock, limits)
+        old = ages(contents, limits)
         # Asking starts a program, so only where it matters.
         if old.by_dates != old.by_recording or self._recorded.asks_for_clock():
             self._ask_clock(run)
         synchronised = bool(run.synchronised)
         run.result.held = len(old.held(synchronised=synchronised) - missing)
-        return replace(stock, synchronised=synchronised)
+        return replace(contents, synchronised=synchronised)
 
     def _ask_clock(self, run: _Pass) -> None:
         if run.synchronised is None:
@@ -299,31 +299,31 @@ class GarbageCollector:
                 self._recorded.confirm_clock()
 
     def _cut_topics(
-        self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot, run: _Pass
+        self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot, run: _Pass
     ) -> None:
         """Cuts topics with a shorter life out of bags that stay."""
         if self._cutter is None:
             return
         self._ask_clock(run)
-        stock = replace(
-            stock,
+        contents = replace(
+            contents,
             synchronised=bool(run.synchronised),
-            bags=[bag for bag in stock.bags if bag.path not in run.deleted],
+            bags=[bag for bag in contents.bags if bag.path not in run.deleted],
         )
         try:
-            run.result.cut = self._cutter.cut(stock, limits, snapshot)
+            run.result.cut = self._cutter.cut(contents, limits, snapshot)
         except OSError as error:
             _log.error("topics_not_cut", reason=error.strerror or str(error))
 
     def _delete_bags(
         self,
         to_delete: Sequence[StoredBag],
-        stock: RetentionStock,
+        contents: DirContents,
         snapshot: Snapshot,
         run: _Pass,
         plan: DeletionPlan,
     ) -> None:
-        saved = {file.inode for file in stock.saved}
+        saved = {file.inode for file in contents.saved}
         run.saved |= {
             bag.path for bag in to_delete if any(file.inode in saved for file in bag.files)
         }

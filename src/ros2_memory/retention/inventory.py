@@ -32,7 +32,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.file_state import FileState
 from ros2_memory.index.segment import Pace, TopicTotals
 from ros2_memory.retention.delete import beside_bags, size_of
-from ros2_memory.retention.policy import RetentionStock, StoredBag, StoredFile
+from ros2_memory.retention.policy import DirContents, StoredBag, StoredFile
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator
@@ -138,7 +138,7 @@ class _Folder(NamedTuple):
 
 
 class Inventory:
-    """The stock of one bag directory. Not thread-safe.
+    """The contents of one bag directory. Not thread-safe.
 
     Args:
         root: the bag directory.
@@ -159,9 +159,9 @@ class Inventory:
         self._unchanged: dict[str, StoredBag] = {}
         self._folders: dict[str, _Folder] = {}
 
-    def stock(
+    def contents(
         self, known: KnownBags, *, deleted: Collection[str] = (), remaining: Collection[str] = ()
-    ) -> RetentionStock:
+    ) -> DirContents:
         """Returns the bags that may be deleted, and the size of everything else.
 
         A bag that is being written must not be deleted, nor one that cannot be read: its age is
@@ -214,7 +214,7 @@ class Inventory:
             self._folder_at(recording, known.now).size for recording in occupied - emptied
         )
         saved = self._moment_files(known)
-        return RetentionStock(
+        return DirContents(
             bags,
             known.now,
             sidecars,

@@ -14,13 +14,13 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
 - A bag dated in the future, before there was ROS 2, or longer than any recording counts as
   undated: it makes no other bag old, and is itself as old as its file.
 - A pause longer than both `max_age_ns` and a day is a robot that was off or a clock that was set,
-  and nothing distinguishes the two. It separates two eras; a bag ages only against its own era.
+  and nothing distinguishes the two. It separates two periods; a bag ages only against its own.
 - Nothing is older than what was recorded before it: a bag that is dated before the newest of an
   earlier recording has a wrong date, and counts as recorded with the next that has a right one.
   Likewise no more was recorded after a recording than after any that was listed before it.
 
-The budget deletes the oldest first: a dated bag of the present era by its newest message, any other
-by the time of its file. A file dated further ahead of now than history is kept goes first, since
+The budget deletes the oldest first: a dated bag of the present period by its newest message, any
+other by the time of its file. A file dated further ahead of now than history is kept goes first, since
 its time means nothing and it would otherwise stay for good. A file dated before there was ROS 2,
 while the clock is there as well, is being recorded now and goes last. The newest bag always stays.
 """
@@ -45,7 +45,7 @@ GB: Final = 10**9
 """Bytes of a gigabyte, as configuration keys that end in `_gb` count them."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
 SHORTEST_PAUSE_NS: Final[Ns] = 24 * 3600 * NS_PER_S
-"""A shorter pause never parts two eras, however little history is kept."""
+"""A shorter pause never parts two periods, however little history is kept."""
 
 
 def small_budget(max_total_gb: float) -> str:
@@ -129,7 +129,7 @@ class StoredBag(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class RetentionStock:
+class DirContents:
     """Everything that this program wrote to the bag directory.
 
     Attributes:
@@ -199,47 +199,47 @@ class DeletionPlan(NamedTuple):
     newest: str = ""
 
 
-def ages(stock: RetentionStock, limits: RetentionLimits) -> Ages:
+def ages(contents: DirContents, limits: RetentionLimits) -> Ages:
     """Returns the bags that are too old by either clock."""
-    stock = _with_consistent_dates(stock, limits)
-    return _ages_in_eras(stock, _eras(stock, limits), limits.max_age_ns)
+    contents = _with_consistent_dates(contents, limits)
+    return _ages_in_periods(contents, _periods(contents, limits), limits.max_age_ns)
 
 
-def older_than(max_age_ns: Ns, stock: RetentionStock, limits: RetentionLimits) -> frozenset[str]:
+def older_than(max_age_ns: Ns, contents: DirContents, limits: RetentionLimits) -> frozenset[str]:
     """Returns the bags that age could delete if it were so much, by the clock that is right."""
-    stock = _with_consistent_dates(stock, limits)
-    return _deleted_by_age(stock, _eras(stock, limits), max_age_ns)
+    contents = _with_consistent_dates(contents, limits)
+    return _deleted_by_age(contents, _periods(contents, limits), max_age_ns)
 
 
-def plan_deletions(stock: RetentionStock, limits: RetentionLimits) -> DeletionPlan:
+def plan_deletions(contents: DirContents, limits: RetentionLimits) -> DeletionPlan:
     """Plans which bags to delete: all that are too old, then no more than the limits need.
 
     Where deleting everything that may go would not free enough of the disk, nothing is deleted for
     that: it would cost all history, and recording would still have to pause.
     """
-    ordered = _with_consistent_dates(stock, limits)
+    ordered = _with_consistent_dates(contents, limits)
     plan, free = _plan_and_free_bytes(ordered, limits)
     if not (plan.fits or free is None or free >= limits.min_free_bytes):
         plan, _ = _plan_and_free_bytes(replace(ordered, free_bytes=None), limits)
         plan = plan._replace(fits=False, most_free=free)
-    if not plan.to_delete or ordered is stock:
+    if not plan.to_delete or ordered is contents:
         return plan
-    given = {bag.path: bag for bag in stock.bags}
+    given = {bag.path: bag for bag in contents.bags}
     return plan._replace(to_delete=tuple(given[bag.path] for bag in plan.to_delete))
 
 
 def _plan_and_free_bytes(
-    stock: RetentionStock, limits: RetentionLimits
+    contents: DirContents, limits: RetentionLimits
 ) -> tuple[DeletionPlan, int | None]:
     """Returns a plan, and how much of the disk is free after it."""
-    left = _Remaining(stock)
+    left = _Remaining(contents)
     total = left.total
-    eras = _eras(stock, limits)
-    aged = _deleted_by_age(stock, eras, limits.max_age_ns)
+    periods = _periods(contents, limits)
+    aged = _deleted_by_age(contents, periods, limits.max_age_ns)
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True), left.free
-    order = _oldest_first(stock, limits, eras[-1] if eras else [])
-    newest = _newest(order, eras)
+    order = _oldest_first(contents, limits, periods[-1] if periods else [])
+    newest = _newest(order, periods)
     going = {bag.path for bag in order if bag.path in aged and bag is not newest}
     for bag in order:
         if bag.path in going:
@@ -256,27 +256,27 @@ def _plan_and_free_bytes(
     return DeletionPlan(deleted, total, fits, aged=aged & going, newest=kept), left.free
 
 
-def _newest(order: Sequence[StoredBag], eras: Sequence[_Era]) -> StoredBag | None:
+def _newest(order: Sequence[StoredBag], periods: Sequence[_Period]) -> StoredBag | None:
     """Returns the bag that stays: the newest dated one, else the last written with messages."""
-    if eras:
-        return max(eras[-1], key=attrgetter("end", "path"))
+    if periods:
+        return max(periods[-1], key=attrgetter("end", "path"))
     with_messages = [bag for bag in order if bag.has_dates]
     return next(reversed(with_messages or order), None)
 
 
-def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]:
+def by_hours(plan: DeletionPlan, contents: DirContents) -> tuple[StoredBag, ...]:
     """Returns what a plan deletes, in whole hours, so that what stays of an hour is written once.
 
     Age waits until all bags of an hour are too old; to make room the rest of an hour goes, too, but
     for bags that are needed, and for the hour of the newest bag. Those keep no other one.
     """
-    stays = stock.needed | stock.unshipped | {plan.newest}
+    stays = contents.needed | contents.unshipped | {plan.newest}
     going = {bag.path for bag in plan.to_delete}
     hours: dict[Ns, list[StoredBag]] = {}
-    for bag in stock.bags:
+    for bag in contents.bags:
         if bag.path not in stays or bag.path in going:
             hours.setdefault(bag.date // HOUR_NS, []).append(bag)
-    last = next((bag.end // HOUR_NS for bag in stock.bags if bag.path == plan.newest), None)
+    last = next((bag.end // HOUR_NS for bag in contents.bags if bag.path == plan.newest), None)
     deleted: list[StoredBag] = []
     for hour, bags in sorted(hours.items()):
         bags.sort(key=attrgetter("date"))
@@ -291,15 +291,15 @@ def by_hours(plan: DeletionPlan, stock: RetentionStock) -> tuple[StoredBag, ...]
 class _Remaining:
     """Counts what is left when some bags are deleted."""
 
-    def __init__(self, stock: RetentionStock) -> None:
+    def __init__(self, contents: DirContents) -> None:
         # A file of a moment counts once, and stays when its other name is deleted.
-        self._saved = {file.inode for file in stock.saved}
-        self._bags_in = Counter(bag.recording for bag in stock.bags)
-        self._sidecars = stock.sidecars
-        bags = sum(file.size for bag in stock.bags for file in self._freed_by(bag))
-        saved = sum(file.size for file in stock.saved)
-        self.total = stock.other_bytes + saved + bags + sum(stock.sidecars.values())
-        self.free = stock.free_bytes
+        self._saved = {file.inode for file in contents.saved}
+        self._bags_in = Counter(bag.recording for bag in contents.bags)
+        self._sidecars = contents.sidecars
+        bags = sum(file.size for bag in contents.bags for file in self._freed_by(bag))
+        saved = sum(file.size for file in contents.saved)
+        self.total = contents.other_bytes + saved + bags + sum(contents.sidecars.values())
+        self.free = contents.free_bytes
 
     def _freed_by(self, bag: StoredBag) -> list[StoredFile]:
         return [file for file in bag.files if file.inode not in self._saved]
@@ -326,19 +326,19 @@ class _Remaining:
         return enough and self.total <= limits.max_total_bytes
 
 
-def _with_consistent_dates(stock: RetentionStock, limits: RetentionLimits) -> RetentionStock:
-    """Returns the stock without ages that contradict the order of the recordings.
+def _with_consistent_dates(contents: DirContents, limits: RetentionLimits) -> DirContents:
+    """Returns the contents without ages that contradict the order of the recordings.
 
     A bag whose date does, by its messages or else by its file, gets the newest date of the next
     recording that has a right one; of the newest of all, if there is none.
     """
-    if not stock.places:
-        return stock
+    if not contents.places:
+        return contents
     newest: dict[str, Ns] = {}
-    for bag in _credibly_dated(stock, limits):
+    for bag in _credibly_dated(contents, limits):
         newest[bag.recording] = max(bag.end, newest.get(bag.recording, MIN_NS))
-    names = sorted(stock.places, key=stock.places.__getitem__)
-    since, least = {**stock.recorded_since}, MAX_NS
+    names = sorted(contents.places, key=contents.places.__getitem__)
+    since, least = {**contents.recorded_since}, MAX_NS
     reached, latest = dict[str, Ns](), MIN_NS
     for name in names:
         reached[name] = latest  # by the recordings before it
@@ -352,87 +352,95 @@ def _with_consistent_dates(stock: RetentionStock, limits: RetentionLimits) -> Re
         instead[name] = latest
     bags = [
         bag.dated(instead[bag.recording]) if bag.date < reached.get(bag.recording, MIN_NS) else bag
-        for bag in stock.bags
+        for bag in contents.bags
     ]
-    return replace(stock, bags=bags, recorded_since=since)
+    return replace(contents, bags=bags, recorded_since=since)
 
 
-_Era: TypeAlias = "list[StoredBag]"
+_Period: TypeAlias = "list[StoredBag]"
 
 
-def _eras(stock: RetentionStock, limits: RetentionLimits) -> list[_Era]:
-    """Splits the dated bags where a pause is too long; the last era is the present one."""
+def _periods(contents: DirContents, limits: RetentionLimits) -> list[_Period]:
+    """Splits the dated bags where a pause is too long; the last period is the present one."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    dated = _credibly_dated(stock, limits)
+    dated = _credibly_dated(contents, limits)
     if not dated:
         return []
     reach, end = min(bag.start for bag in dated), max(bag.end for bag in dated)
     if end - reach <= longest:
         return [dated]
     dated.sort(key=attrgetter("start"))
-    eras: list[_Era] = [[]]
+    periods: list[_Period] = [[]]
     for bag in dated:
         if bag.start - reach > longest:
-            eras.append([])
-        eras[-1].append(bag)
+            periods.append([])
+        periods[-1].append(bag)
         reach = max(reach, bag.end)
-    return eras
+    return periods
 
 
-def _credibly_dated(stock: RetentionStock, limits: RetentionLimits) -> list[StoredBag]:
+def _credibly_dated(contents: DirContents, limits: RetentionLimits) -> list[StoredBag]:
     """Returns the bags whose dates are believed."""
     longest = max(limits.max_age_ns, SHORTEST_PAUSE_NS)
-    latest = stock.now + FUTURE_NS
+    latest = contents.now + FUTURE_NS
     return [
         bag
-        for bag in stock.bags
+        for bag in contents.bags
         if FIRST_BAGS_NS <= bag.start <= bag.end <= latest and bag.end - bag.start <= longest
     ]
 
 
-def _deleted_by_age(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> frozenset[str]:
-    old = _ages_in_eras(stock, eras, max_age_ns)
-    aged = old.by_dates if stock.synchronised else old.by_recording
-    return aged - stock.needed - stock.unshipped
+def _deleted_by_age(
+    contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
+) -> frozenset[str]:
+    old = _ages_in_periods(contents, periods, max_age_ns)
+    aged = old.by_dates if contents.synchronised else old.by_recording
+    return aged - contents.needed - contents.unshipped
 
 
-def _ages_in_eras(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> Ages:
-    old = {name for name, since in stock.recorded_since.items() if since > max_age_ns}
-    by_recording = frozenset(bag.path for bag in stock.bags if bag.recording in old)
-    doubtful = {bag.path for bag in stock.bags if bag.recording in stock.doubtful}
-    by_dates = _too_old_by_dates(stock, eras, max_age_ns) - doubtful | by_recording & doubtful
+def _ages_in_periods(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns) -> Ages:
+    old = {name for name, since in contents.recorded_since.items() if since > max_age_ns}
+    by_recording = frozenset(bag.path for bag in contents.bags if bag.recording in old)
+    doubtful = {bag.path for bag in contents.bags if bag.recording in contents.doubtful}
+    by_dates = _too_old_by_dates(contents, periods, max_age_ns) - doubtful | by_recording & doubtful
     return Ages(frozenset(by_dates), by_recording)
 
 
-def _too_old_by_dates(stock: RetentionStock, eras: Sequence[_Era], max_age_ns: Ns) -> set[str]:
-    """Returns the bags that are too old compared with the newest of their era, by their dates.
+def _too_old_by_dates(
+    contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
+) -> set[str]:
+    """Returns the bags that are too old compared with the newest of their period, by their dates.
 
     Dates in the future, of a clock that was ahead for a while, make no other bag older.
-    An undated bag belongs to the present era if it was written in it, else to none.
+    An undated bag belongs to the present period if it was written in it, else to none.
     """
     aged: set[str] = set()
-    for era in eras:
-        cutoff = min(max(bag.end for bag in era), stock.now) - max_age_ns
-        aged.update(bag.path for bag in era if bag.end < cutoff)
-        if era is eras[-1]:
-            begun = min(bag.start for bag in era)
-            undated = _outside_eras(stock.bags, *eras)
+    for period in periods:
+        cutoff = min(max(bag.end for bag in period), contents.now) - max_age_ns
+        aged.update(bag.path for bag in period if bag.end < cutoff)
+        if period is periods[-1]:
+            begun = min(bag.start for bag in period)
+            undated = _outside_periods(contents.bags, *periods)
             aged.update(bag.path for bag in undated if begun <= bag.written < cutoff)
     return aged
 
 
-def _oldest_first(stock: RetentionStock, limits: RetentionLimits, present: _Era) -> list[StoredBag]:
+def _oldest_first(
+    contents: DirContents, limits: RetentionLimits, present: _Period
+) -> list[StoredBag]:
     """Sorts all bags, oldest first."""
-    odd = _outside_eras(stock.bags, present)
-    keys = {bag.path: _file_time_key(bag, stock.now, limits) for bag in odd}
-    return sorted(stock.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path))
+    odd = _outside_periods(contents.bags, present)
+    keys = {bag.path: _file_time_key(bag, contents.now, limits) for bag in odd}
+    return sorted(
+        contents.bags, key=lambda bag: (*keys.get(bag.path, (bag.end, bag.end)), bag.path)
+    )
 
 
-def _outside_eras(bags: Sequence[StoredBag], *eras: _Era) -> Sequence[StoredBag]:
-    """Returns the bags that are in none of some eras."""
-    if len(bags) == sum(map(len, eras)):
+def _outside_periods(bags: Sequence[StoredBag], *periods: _Period) -> Sequence[StoredBag]:
+    """Returns the bags that are in none of some periods."""
+    if len(bags) == sum(map(len, periods)):
         return ()
-    there = {bag.path for era in eras for bag in era}
+    there = {bag.path for period in periods for bag in period}
     return [bag for bag in bags if bag.path not in there]
 
 

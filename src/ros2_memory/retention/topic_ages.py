@@ -27,7 +27,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
-from ros2_memory.retention.policy import RetentionLimits, RetentionStock, older_than
+from ros2_memory.retention.policy import DirContents, RetentionLimits, older_than
 from ros2_memory.retention.repair import left_in, rewritten
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class TopicCut(NamedTuple):
 
 def plan_cuts(
     topic_ages: Sequence[TopicAge],
-    stock: RetentionStock,
+    contents: DirContents,
     limits: RetentionLimits,
     snapshot: Snapshot,
     static_topics: Collection[str],
@@ -73,8 +73,10 @@ def plan_cuts(
     index shows it.
     """
     timeline = snapshot.timeline
-    saved = {file.inode for file in stock.saved}
-    alone = {bag.path for bag in stock.bags if saved.isdisjoint(file.inode for file in bag.files)}
+    saved = {file.inode for file in contents.saved}
+    alone = {
+        bag.path for bag in contents.bags if saved.isdisjoint(file.inode for file in bag.files)
+    }
     going: defaultdict[str, set[str]] = defaultdict(set)
     for topic_age in topic_ages:
         topics = [
@@ -82,7 +84,7 @@ def plan_cuts(
             for topic in match_topics(timeline.topics(), topic_age.topics)
             if topic not in static_topics and not timeline.is_transient_state(topic)
         ]
-        old = older_than(topic_age.max_age_ns, stock, limits) if topics else ()
+        old = older_than(topic_age.max_age_ns, contents, limits) if topics else ()
         for path in alone.intersection(old):
             going[path].update(topics)
     return [
@@ -129,7 +131,7 @@ class TopicCutter:
         self._done: dict[str, tuple[Ns, frozenset[str]]] = {}
         self._waits_since_s: float | None = None
 
-    def cut(self, stock: RetentionStock, limits: RetentionLimits, snapshot: Snapshot) -> int:
+    def cut(self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot) -> int:
         """Cuts what is too old until `SLICE_S` is over; returns how many bags were cut.
 
         None while messages are being forgotten, nor while the machine is busy (for `PATIENCE_S`
@@ -141,7 +143,7 @@ class TopicCutter:
             OSError: the free space cannot be measured, or a folder or the receipts of `ship` not be
                 read.
         """
-        cuts = plan_cuts(self._topic_ages, stock, limits, snapshot, self._static_topics)
+        cuts = plan_cuts(self._topic_ages, contents, limits, snapshot, self._static_topics)
         done = self._done
         waiting = [cut for cut in cuts if done.get(cut.bag.file) != (cut.bag.mtime_ns, cut.topics)]
         self._done = {cut.bag.file: done[cut.bag.file] for cut in cuts if cut.bag.file in done}

@@ -36,7 +36,7 @@ T = TypeVar("T")
 IntArray: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.int64]]"
 Mask: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 
-RELATCHED_NS: Final[Ns] = NS_PER_S
+REPEATED_NS: Final[Ns] = NS_PER_S
 """A latched message logged so long after it was published may have been received before."""
 ROS2_PROFILE: Final = "ros2"
 """The profile of every rosbag2 file; other readers of ROS 2 bags refuse every other."""
@@ -99,9 +99,9 @@ class Record(NamedTuple):
     payload: bytes
 
     @property
-    def may_be_relatched(self) -> bool:
+    def may_be_repeated(self) -> bool:
         """Whether another recording may have received this very message before."""
-        return self.channel.latched and self.log_time - self.publish_time > RELATCHED_NS
+        return self.channel.latched and self.log_time - self.publish_time > REPEATED_NS
 
 
 @dataclass(frozen=True, slots=True, eq=False)

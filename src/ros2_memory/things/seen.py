@@ -176,7 +176,7 @@ class Watching:
         limits = view.limits
         localisers = (topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic))
         self._needed = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
-        self._may_be_kept = not view.stream.may_be_relatched(self._topics)
+        self._may_be_kept = not view.stream.may_be_repeated(self._topics)
         self._digested: tuple[object, str] = None, ""
         self._newest = max((segment.latest for segment in timeline.segments), default=MIN_NS)
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
     LONGEST_OFF_NS,
-    Presence,
+    Activity,
     Silence,
     Spacing,
     joined,
@@ -20,24 +20,24 @@ MINUTE, HOUR = 60 * S, 3600 * S
 ODOM, SEEN = "/odom", "/seen"
 
 
-def heard(*runs: tuple[int, int], hz: int = 1) -> Presence:
+def heard(*runs: tuple[int, int], hz: int = 1) -> Activity:
     """A topic that is recorded at a rate during runs."""
     length = sum(last - first for first, last in runs)
     count = length * hz // S
-    return Presence(runs, {0: Spacing(len(runs), length, max(count, 1))}, count, length)
+    return Activity(runs, {0: Spacing(len(runs), length, max(count, 1))}, count, length)
 
 
-def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Presence) -> list[Silence]:
+def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Activity) -> list[Silence]:
     return silences({f"/{name}": each for name, each in runs.items()}, [together])
 
 
 DAY = (0, 9 * HOUR)
 GAPPED = (0, 2 * HOUR), (5 * HOUR, 9 * HOUR)
 DRIVES = tuple((at * HOUR, at * HOUR + 20 * MINUTE) for at in range(9))
-SLOW = Presence(
+SLOW = Activity(
     ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)), {0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR
 )
-BURST = Presence(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
+BURST = Activity(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
 
 
 @pytest.mark.parametrize(
@@ -75,23 +75,23 @@ BURST = Presence(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 3
     ids=count(),
 )
 def test_a_topic_is_silent_while_others_are_heard(
-    odom: Presence, seen: Presence, expected: tuple[int, int, int] | None
+    odom: Activity, seen: Activity, expected: tuple[int, int, int] | None
 ) -> None:
     assert found(odom=odom, seen=seen) == ([] if expected is None else [Silence(SEEN, *expected)])
 
 
 def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
-    presences = {
+    activities = {
         ODOM: heard((0, 99 * S), (128 * S, 200 * S)),
         SEEN: heard((0, 98 * S), (129 * S, 200 * S)),
     }
-    [silence] = silences(presences, [presences])
+    [silence] = silences(activities, [activities])
     assert silence.length == 31 * S
     gap = (99 * S, 128 * S)
-    assert silences(presences, [presences], [gap]) == []
+    assert silences(activities, [activities], [gap]) == []
     # What is silent before and after it is so in all.
-    presences[SEEN] = heard((0, 80 * S), (150 * S, 200 * S))
-    [silence] = silences(presences, [presences], [(0, S), gap, (180 * S, 190 * S)])
+    activities[SEEN] = heard((0, 80 * S), (150 * S, 200 * S))
+    [silence] = silences(activities, [activities], [(0, S), gap, (180 * S, 190 * S)])
     assert (silence.start, silence.end, silence.length) == (80 * S, 150 * S, 41 * S)
 
 
@@ -106,19 +106,19 @@ def test_no_silence_goes_on_behind_a_gap_after_which_another_robot_may_be_record
 
 
 def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
-    presences = {
+    activities = {
         "/a/odom": heard((0, HOUR)),
         "/a/seen": heard((0, HOUR)),
         "/b/odom": heard((0, 9 * HOUR)),
         "/b/seen": heard((0, 9 * HOUR)),
     }
-    assert silences(presences, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
+    assert silences(activities, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
 
 
 def test_one_of_many_topics_does_not_show_that_the_robot_is_on() -> None:
     many = {f"/{name}": heard((0, HOUR), (5 * HOUR, 9 * HOUR)) for name in "abcde"}
-    presences = {**many, "/battery": heard((0, 9 * HOUR))}
-    assert silences(presences, [presences]) == []
+    activities = {**many, "/battery": heard((0, 9 * HOUR))}
+    assert silences(activities, [activities]) == []
 
 
 def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:

@@ -40,9 +40,9 @@ from ros2_memory.bag_dir.state_files import (
     append_receipts,
     read_deleted,
     read_forgettings,
-    read_gate,
     read_losses,
     read_receipts,
+    read_withheld,
     unshipped,
 )
 from tests.support.examples import examples
@@ -364,14 +364,14 @@ def test_where_a_file_cannot_be_read_nothing_is_lost_or_shipped_and_all_is_held_
     tmp_path: Path,
 ) -> None:
     name = "rec_20261120T043000Z"
-    assert not read_gate(tmp_path).holds_some(name)
+    assert not read_withheld(tmp_path).holds_some(name)
     for file in (LOST, DELETED, SHIPPED, SCREENED):
         (tmp_path / file.name).mkdir(parents=True)
     assert read_losses(tmp_path, 0, 9) == []
     assert read_deleted(tmp_path) == {}
     assert unshipped(tmp_path, [("a", 1)]) == {"a"}
-    assert read_gate(tmp_path).holds(name, "a.mcap")
-    assert not read_gate(tmp_path).holds("copied", "a.mcap")
+    assert read_withheld(tmp_path).holds(name, "a.mcap")
+    assert not read_withheld(tmp_path).holds("copied", "a.mcap")
 
 
 class TestForgotten:

@@ -9,7 +9,7 @@ import pytest
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
-from ros2_memory.bag_dir.state_files import SCREENED, read_gate
+from ros2_memory.bag_dir.state_files import SCREENED, read_withheld
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
@@ -53,9 +53,9 @@ class TestSessions:
         world = World(tmp_path, housekeeper=house, session_duration_s=20).started()
         for _ in range(12):
             world.run(5)
-            gate = read_gate(tmp_path)
+            withheld = read_withheld(tmp_path)
             newest = world.heartbeat()["recordings"][-1]
-            assert gate.holds(newest, f"{newest}_0.mcap") or (tmp_path / newest).exists()
+            assert withheld.holds(newest, f"{newest}_0.mcap") or (tmp_path / newest).exists()
         world.supervisor.stop()
         if unknown:
             assert not world.published(counting=False)
@@ -63,7 +63,7 @@ class TestSessions:
             assert_each_counts_once(world)
         names = [each.name for each in tmp_path.glob("rec_*")]
         assert len(names) > 2
-        assert not any(read_gate(tmp_path).holds_some(each) for each in names)
+        assert not any(read_withheld(tmp_path).holds_some(each) for each in names)
         # Compared when they were released, and not before.
         assert [read_handover(tmp_path / each).handover.compared for each in sorted(names)[1:]] == [
             True

@@ -22,7 +22,7 @@ from ros2_memory.retention.latched_carry import (
     MessageIdentity,
     worth_carrying,
 )
-from ros2_memory.storage.base import RELATCHED_NS
+from ros2_memory.storage.base import REPEATED_NS
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, odom, text, tf, transform, write_db3, write_mcap
@@ -435,4 +435,4 @@ def test_what_is_carried_is_carried_on_whatever_the_order(data: st.DataObject) -
 
 
 def test_what_may_have_been_received_before_is_what_questions_take_for_it() -> None:
-    assert RECEIVED_AGAIN_NS <= RELATCHED_NS
+    assert RECEIVED_AGAIN_NS <= REPEATED_NS

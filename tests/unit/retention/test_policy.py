@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.retention.policy import (
+    DirContents,
     RetentionLimits,
-    RetentionStock,
     StoredBag,
     StoredFile,
     by_hours,
@@ -52,18 +52,18 @@ def another_name(of: StoredBag, file: StoredFile) -> StoredBag:
     return of._replace(device=device, inode=inode, size=file.size)
 
 
-def stock(
+def contents(
     *bags: StoredBag,
     now: int = NOW,
     sidecars: dict[str, int] | None = None,
     other_bytes: int = 0,
     free_bytes: int | None = None,
-) -> RetentionStock:
-    return RetentionStock(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
+) -> DirContents:
+    return DirContents(bags, now, sidecars or {}, other_bytes, free_bytes, synchronised=True)
 
 
-def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
-    return plan_deletions(stock, limits).to_delete
+def expired(contents: DirContents, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+    return plan_deletions(contents, limits).to_delete
 
 
 def names(bags: Iterable[StoredBag]) -> list[str]:
@@ -77,14 +77,14 @@ def hourly(hours: int, *, until: int = NOW, size: int = 10) -> list[StoredBag]:
 
 class TestAge:
     def test_what_is_older_than_the_limit_is_deleted_oldest_first(self) -> None:
-        deleted = expired(stock(*hourly(172)), LIMITS)
+        deleted = expired(contents(*hourly(172)), LIMITS)
         assert names(deleted) == ["h171", "h170", "h169"]
-        deleted = expired(stock(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
+        deleted = expired(contents(bag("old", NOW - 10 * HOUR), bag("new", NOW)), hours(1))
         assert names(deleted) == ["old"]
 
     def test_whole_hours_go_to_make_room_but_for_what_is_needed_and_the_newest_hour(self) -> None:
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(200)]
-        held = replace(stock(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
+        held = replace(contents(*minutes), needed=frozenset({"rec/m170", "rec/m199"}))
         plan = plan_deletions(held, budget(1900))
         going = set(names(by_hours(plan, held)))
         assert set(names(plan.to_delete)) <= going
@@ -100,39 +100,39 @@ class TestAge:
     def test_a_future_date_has_no_newest_hour(self) -> None:
         ahead = bag("ahead", NOW + 900 * DAY)
         minutes = [bag(f"m{ago}", NOW - ago * 60 * S) for ago in range(30)]
-        held = stock(*minutes, ahead)
+        held = contents(*minutes, ahead)
         plan = plan_deletions(held, budget(200))
         going = by_hours(plan, held)
         assert plan.newest not in {each.path for each in going}
 
     def test_a_robot_that_was_off_for_two_weeks_does_not_erase_itself_when_it_wakes(self) -> None:
         before, after = hourly(100, until=NOW - 14 * DAY), bag("new", NOW)
-        assert expired(stock(*before, after), LIMITS) == ()
+        assert expired(contents(*before, after), LIMITS) == ()
 
     def test_a_bag_that_a_bad_clock_dated_is_as_old_as_its_file(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY, written=NOW - 170 * HOUR)
         boot = bag("boot", 60 * S, written=NOW - 171 * HOUR)
         fresh = bag("fresh", 60 * S, written=NOW - HOUR)
-        deleted = expired(stock(ahead, boot, fresh, *hourly(172)), LIMITS)
+        deleted = expired(contents(ahead, boot, fresh, *hourly(172)), LIMITS)
         assert names(deleted) == ["boot", "h171", "ahead", "h170", "h169"]
 
     def test_a_bag_without_messages_does_not_age_others_and_goes_with_its_time(self) -> None:
         old = bag("empty", None, written=NOW - 170 * HOUR + 1)
-        deleted = expired(stock(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
+        deleted = expired(contents(old, bag("later", None, written=NOW), *hourly(172)), LIMITS)
         assert names(deleted) == ["h171", "h170", "empty", "h169"]
 
 
 class TestBudget:
     def test_the_oldest_are_deleted_and_no_more_than_needed(self) -> None:
         for size, count in ((75, 3), (100, 0)):
-            deleted = expired(stock(*hourly(10)), budget(size))
+            deleted = expired(contents(*hourly(10)), budget(size))
             assert names(deleted) == ["h9", "h8", "h7"][:count]
-        deleted = expired(stock(*hourly(10), other_bytes=15), budget(100))
+        deleted = expired(contents(*hourly(10), other_bytes=15), budget(100))
         assert names(deleted) == ["h9", "h8"]
 
     def test_the_newest_by_its_data_stays_though_another_was_written_later(self) -> None:
         copied = bag("copied", NOW - 5 * DAY, written=NOW + HOUR)
-        deleted = expired(stock(bag("new", NOW), copied), budget(0))
+        deleted = expired(contents(bag("new", NOW), copied), budget(0))
         assert names(deleted) == ["copied"]
 
     def test_bags_without_a_date_go_by_the_time_of_their_file(self) -> None:
@@ -145,25 +145,25 @@ class TestBudget:
             bag("new", NOW),
         ]
         limits = replace(LIMITS, max_total_bytes=0)
-        assert names(expired(stock(*bags), limits)) == ["a", "b", "c", "d", "e"]
+        assert names(expired(contents(*bags), limits)) == ["a", "b", "c", "d", "e"]
 
     def test_a_file_from_a_far_future_goes_first_and_is_not_kept_for_good(self) -> None:
         ahead = bag("ahead", NOW + 3650 * DAY)
         limits = RetentionLimits(max_total_bytes=30, max_age_ns=168 * HOUR)
-        assert names(expired(stock(*hourly(3), ahead), limits)) == ["ahead"]
+        assert names(expired(contents(*hourly(3), ahead), limits)) == ["ahead"]
 
     def test_files_dated_a_little_ahead_of_a_clock_that_is_behind_keep_their_order(self) -> None:
         last_hours = hourly(5, until=NOW + 10 * HOUR)
-        assert names(expired(stock(*last_hours), budget(30))) == ["h4", "h3"]
+        assert names(expired(contents(*last_hours), budget(30))) == ["h4", "h3"]
 
     def test_while_the_clock_is_not_set_what_it_dates_is_newest(self) -> None:
         boot = [bag(f"boot{n}", n * 60 * S) for n in (1, 2)]
-        deleted = expired(stock(*hourly(3), *boot, now=200 * S), budget(20))
+        deleted = expired(contents(*hourly(3), *boot, now=200 * S), budget(20))
         assert names(deleted) == ["h2", "h1", "h0"]
 
     def test_the_last_bag_of_a_recording_takes_its_sidecars_along(self) -> None:
         bags = [bag("a", NOW - 2 * HOUR, recording="old"), *hourly(2)]
-        held = stock(*bags, sidecars={"old": 20, "rec": 5})
+        held = contents(*bags, sidecars={"old": 20, "rec": 5})
         assert plan_deletions(held, LIMITS).total_bytes == 55
         assert names(expired(held, budget(25))) == ["a"]
         assert names(expired(held, budget(54))) == ["a"]
@@ -186,7 +186,7 @@ moments = st.one_of(
 
 
 @st.composite
-def stocks(draw: st.DrawFn) -> RetentionStock:
+def stocks(draw: st.DrawFn) -> DirContents:
     """Bags by good and bad clocks, in several recordings."""
     bags: dict[str, StoredBag] = {}
     for number in range(draw(st.integers(0, 12))):
@@ -199,7 +199,7 @@ def stocks(draw: st.DrawFn) -> RetentionStock:
             length=draw(st.sampled_from([S, 10 * S, 300 * DAY])),
         )
         bags[made.path] = made
-    return RetentionStock(
+    return DirContents(
         tuple(draw(st.permutations(list(bags.values())))),
         draw(st.sampled_from([NOW, 5 * HOUR, NOW + 900 * DAY])),
         sidecars=draw(st.dictionaries(st.sampled_from("ABC"), st.integers(0, 20))),
@@ -220,7 +220,7 @@ all_limits = st.builds(
 )
 
 
-def without(held: RetentionStock, deleted: Iterable[StoredBag]) -> RetentionStock:
+def without(held: DirContents, deleted: Iterable[StoredBag]) -> DirContents:
     """What lies there after these bags, and the sidecars of emptied recordings, are deleted."""
     gone = {each.path for each in deleted}
     bags = [each for each in held.bags if each.path not in gone]
@@ -240,7 +240,7 @@ def without(held: RetentionStock, deleted: Iterable[StoredBag]) -> RetentionStoc
     return replace(held, bags=bags, sidecars=sidecars, free_bytes=free)
 
 
-def fits(held: RetentionStock, limits: RetentionLimits) -> bool:
+def fits(held: DirContents, limits: RetentionLimits) -> bool:
     enough = held.free_bytes is None or held.free_bytes >= limits.min_free_bytes
     return enough and plan_deletions(held, limits).total_bytes <= limits.max_total_bytes
 
@@ -248,7 +248,7 @@ def fits(held: RetentionStock, limits: RetentionLimits) -> bool:
 class TestAlways:
     @given(stocks(), all_limits)
     def test_the_budget_is_held_unless_the_newest_alone_is_too_large(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         left = without(held, expired(held, limits))
         files = {each.files for each in left.bags}
@@ -258,7 +258,7 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_what_cannot_be_reached_costs_no_bag(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         found = plan_deletions(held, limits)
         if found.most_free is not None:
@@ -268,7 +268,7 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_something_is_left_where_there_was_something(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         left = without(held, expired(held, limits)).bags
         assert bool(left) == bool(held.bags)
@@ -276,7 +276,7 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_no_more_is_deleted_than_needed(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         aged = expired(held, replace(limits, max_total_bytes=PLENTY, min_free_bytes=0))
         deleted = [each for each in expired(held, limits) if each not in aged]
@@ -286,14 +286,14 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_the_order_of_what_is_known_does_not_matter(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         turned = replace(held, bags=tuple(reversed(held.bags)))
         assert expired(turned, limits) == expired(held, limits)
 
     @given(stocks(), all_limits, st.sets(st.integers(0, 20)))
     def test_what_is_not_shipped_waits_for_the_budget_alone_which_is_held_all_the_same(
-        self, held: RetentionStock, limits: RetentionLimits, numbers: set[int]
+        self, held: DirContents, limits: RetentionLimits, numbers: set[int]
     ) -> None:
         unshipped = frozenset(each.path for n, each in enumerate(held.bags) if n in numbers)
         waiting = replace(held, unshipped=unshipped)
@@ -308,20 +308,20 @@ class TestAlways:
 
     @given(stocks(), all_limits)
     def test_after_it_is_applied_nothing_more_is_to_delete(
-        self, held: RetentionStock, limits: RetentionLimits
+        self, held: DirContents, limits: RetentionLimits
     ) -> None:
         assert expired(without(held, expired(held, limits)), limits) == ()
 
     @given(stocks(), all_limits, st.integers(0, 400))
     def test_a_larger_budget_deletes_nothing_that_a_smaller_one_keeps(
-        self, held: RetentionStock, limits: RetentionLimits, more: int
+        self, held: DirContents, limits: RetentionLimits, more: int
     ) -> None:
         larger = replace(limits, max_total_bytes=limits.max_total_bytes + more)
         assert set(expired(held, larger)) <= set(expired(held, limits))
 
     @given(stocks(), st.lists(moments, min_size=1, max_size=5))
     def test_bags_of_bad_clocks_change_nothing_in_the_age_of_others(
-        self, held: RetentionStock, ends: list[int]
+        self, held: DirContents, ends: list[int]
     ) -> None:
         odd = [
             bag(f"odd{number}", end, written=end, recording="ODD")
@@ -342,7 +342,7 @@ class TestMoments:
     def test_room_on_the_disk_is_not_hoped_for_from_what_is_kept(self) -> None:
         bags = hourly(3)
         limits = replace(LIMITS, min_free_bytes=10)
-        found = plan_deletions(replace(stock(*bags, free_bytes=0), saved=bags[-1].files), limits)
+        found = plan_deletions(replace(contents(*bags, free_bytes=0), saved=bags[-1].files), limits)
         assert (names(found.to_delete), found.fits) == (["h1"], True)
 
     @given(
@@ -366,7 +366,7 @@ class TestMoments:
         ]
         limits = replace(LIMITS, max_total_bytes=most)
         files = tuple(file(inode) for inode in kept)
-        found = plan_deletions(replace(stock(*bags), saved=files), limits)
+        found = plan_deletions(replace(contents(*bags), saved=files), limits)
 
         def shown(left: list[StoredBag]) -> int:
             return sum({each.inode: each.size for each in (*files, *_files(left))}.values())

@@ -14,8 +14,8 @@ from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.retention.policy import (
     SHORTEST_PAUSE_NS,
+    DirContents,
     RetentionLimits,
-    RetentionStock,
     StoredBag,
     plan_deletions,
 )
@@ -31,8 +31,8 @@ AGE = 20 * MINUTE
 """Histories of minutes are as good as weeks, and short enough to try many of them."""
 
 
-def expired(stock: RetentionStock, limits: RetentionLimits) -> tuple[StoredBag, ...]:
-    return plan_deletions(stock, limits).to_delete
+def expired(contents: DirContents, limits: RetentionLimits) -> tuple[StoredBag, ...]:
+    return plan_deletions(contents, limits).to_delete
 
 
 def bag(recording: str, inode: int, start: int, end: int) -> StoredBag:
@@ -62,7 +62,7 @@ def test_a_clock_that_was_behind_ages_nothing_young(
         if is_behind:
             doubtful.add(bags[-1].recording)
     places = {each.recording: place for place, each in enumerate(bags)}
-    stock = RetentionStock(
+    contents = DirContents(
         bags,
         now,
         places=places,
@@ -70,7 +70,7 @@ def test_a_clock_that_was_behind_ages_nothing_young(
         recorded_since={each.recording: now - true_ends[each.path] for each in bags},
         doubtful=frozenset(doubtful),
     )
-    aged = set(expired(stock, limits))
+    aged = set(expired(contents, limits))
     old = {each for each in bags if now - true_ends[each.path] > limits.max_age_ns}
     assert aged <= old
     assert len({each for each in old if each.recording in doubtful} - aged) <= 1, "the newest stays"
@@ -171,9 +171,9 @@ class Life:
             self.recorded.confirm_clock()
         self.recorded.note([recording], self.bytes_written, self.monotonic_s, self.wall)
 
-    def stock(self, *, synchronised: bool) -> RetentionStock:
+    def contents(self, *, synchronised: bool) -> DirContents:
         names = {bag.recording for bag in self.bags}
-        return RetentionStock(
+        return DirContents(
             tuple(self.bags),
             self.wall,
             recorded_since=self.recorded.since(names),
@@ -240,7 +240,7 @@ def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(
                 life.wall -= life.lead
                 life.lead = 0
             synchronised = has_server and not life.lead
-            held = life.stock(synchronised=synchronised)
+            held = life.contents(synchronised=synchronised)
             aged = set(expired(held, RetentionLimits(PLENTY, AGE)))
             assert all(life.true_now - life.true_ends[bag.path] > AGE for bag in aged)
             right = life.right if synchronised else set[str]()
@@ -254,7 +254,7 @@ def test_over_any_life_age_deletes_by_a_right_clock_alone_and_the_budget_holds(
             old = {bag for bag in doubtful if life.recorded_after(bag) > sure}
             assert len(old - aged) <= 1, "the newest alone stays"
             life.delete(expired(held, limits))
-            left = life.stock(synchronised=synchronised)
+            left = life.contents(synchronised=synchronised)
             assert plan_deletions(left, limits).total_bytes <= size or len(life.bags) == 1
 
 
@@ -285,7 +285,7 @@ def test_where_the_clock_was_always_right_age_deletes_by_dates_whatever_was_rest
             else:
                 (life.root / RECORDED_FILE).unlink(missing_ok=True)
                 life.boot()
-            aged = expired(life.stock(synchronised=True), limits)
+            aged = expired(life.contents(synchronised=True), limits)
             expected = too_old_by_dates(life.bags, life.wall, AGE)
             assert {bag.path for bag in aged} == expected
             life.delete(aged)

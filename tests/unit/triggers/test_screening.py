@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.conditions import parse_condition
 from ros2_memory.bag_dir.layout import METADATA_FILE, SCREENED_FILE
-from ros2_memory.bag_dir.state_files import SCREENED, excluded_between, read_gate
+from ros2_memory.bag_dir.state_files import SCREENED, excluded_between, read_withheld
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.retention import repair
@@ -63,7 +63,7 @@ def test_a_split_is_served_when_the_next_one_was_read(bags: ScreenedBags) -> Non
     assert [path.name for path in bags.served()] == [f"{name}_0.mcap"]
     bags.end()
     assert bags.seconds() == halves(0, 20)
-    assert not read_gate(bags.bag_dir).holds_some(name)
+    assert not read_withheld(bags.bag_dir).holds_some(name)
 
 
 def test_what_it_excludes_is_cut_with_its_margin(bags: ScreenedBags) -> None:
@@ -257,7 +257,7 @@ def test_a_split_that_cannot_be_read_stays_held_back(bags: ScreenedBags) -> None
     # Since it may have said that the condition holds, the next one is unknown.
     assert bags.seconds() == halves(0, 9)
     assert f"{name}_1.mcap" in (bags.screening.problem() or "")
-    assert read_gate(bags.bag_dir).holds(name, f"{name}_1.mcap")
+    assert read_withheld(bags.bag_dir).holds(name, f"{name}_1.mcap")
 
 
 def test_a_split_that_the_disk_never_gives_holds_others_back_for_a_day(
