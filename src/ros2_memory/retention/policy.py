@@ -20,9 +20,10 @@ switched off does not erase itself when it wakes. Clocks step, so not every date
   Likewise no more was recorded after a recording than after any that was listed before it.
 
 The budget deletes the oldest first: a dated bag of the present period by its newest message, any
-other by the time of its file. A file dated further ahead of now than history is kept goes first, since
-its time means nothing and it would otherwise stay for good. A file dated before there was ROS 2,
-while the clock is there as well, is being recorded now and goes last. The newest bag always stays.
+other by the time of its file. A file dated further ahead of now than history is kept goes first,
+since its time means nothing and it would otherwise stay for good. A file dated before there was ROS
+2, while the clock is there as well, is being recorded now and goes last. The newest bag always
+stays.
 """
 
 from __future__ import annotations
