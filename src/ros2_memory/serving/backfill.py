@@ -228,10 +228,16 @@ def make_fragments(
         for window in windows
         for stop in range(window.stop, window.start, -STRETCH_NS)
     ]
+    _make_each(memory, pieces, is_joined=False)
+    # What these are joined of is written by now: not all of it is still remembered.
+    _make_each(memory, stretches, is_joined=True)
+
+
+def _make_each(memory: Memory, windows: Sequence[TimeWindow], *, is_joined: bool) -> None:
     unwritten: Ns = 0
-    for nth, window in enumerate([*pieces, *stretches]):
+    for window in windows:
         try:
-            _make_fragments_in(memory, window, is_joined=nth >= len(pieces))
+            _make_fragments_in(memory, window, is_joined=is_joined)
         except EpisodicError as error:
             log.warning("fragments_not_made", reason=str(error))
         # Of a store that has changed, all bags are looked up again: so several at once.

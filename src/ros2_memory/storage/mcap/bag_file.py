@@ -253,11 +253,13 @@ class McapBags:
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        if wanted:
-            self._require_beside(file, index, window)
         chunks = [*_with_any(index, wanted, window)]
         indexed = [chunk for chunk in chunks if chunk.index_places is not None]
         together = [chunk for chunk in indexed if not chunk.channels.isdisjoint(read)]
+        if wanted:
+            # Those of which all is wanted are compared when they are read.
+            whole = {chunk.offset for chunk in together if chunk.channels <= wanted.keys()}
+            self._require_beside(file, index, window, passed=whole)
         for group in read_groups(file, together, self._limit):
             yield from self._batches_of_group(file, group, wanted, window, passed)
             del group  # before the next is read
@@ -450,14 +452,25 @@ class McapBags:
                 self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
         return [*columns, *read.values()]
 
-    def _require_beside(self, file: OpenFile, index: McapIndex, window: TimeWindow) -> None:
+    def _require_beside(
+        self,
+        file: OpenFile,
+        index: McapIndex,
+        window: TimeWindow,
+        *,
+        passed: Collection[int] = (),
+    ) -> None:
         """Compares the chunks beside a window with their records, each once.
+
+        Not those at the offsets `passed`, which are compared anyway.
 
         Raises:
             _ContradictedError: the indexes of one of them do not agree with its records.
         """
         for chunk in _beside(index, window):
-            if chunk.index_places is None or self._indexes.get((file.key, chunk.offset, _COMPARED)):
+            if chunk.index_places is None or chunk.offset in passed:
+                continue
+            if self._indexes.get((file.key, chunk.offset, _COMPARED)):
                 continue
             data = self._readable_data(file, chunk)
             if data is None:
