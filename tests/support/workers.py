@@ -36,7 +36,7 @@ The first three mostly wait for real time, for about the same time. "heavy" burn
 one such test at a time leaves some to those that wait.
 """
 
-WORKERS: Final = 7
+WORKERS: Final = 5
 """On two cores: three mostly wait for real time at first, and the others leave no core idle."""
 
 PUNCTUAL: Final = ("live", "stalls", "recorder")

@@ -185,20 +185,26 @@ def placed_waypoints(
         view.notes.add(f"{left_out} left out: no transform leads to {frame_id} at that time")
     if not moved or own_frame == frame_id or topic != resolve_path_topic(view):
         return tuple(moved)
+    return _with_jumps(view, moved, frame_id)
+
+
+def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tuple[Waypoint, ...]:
+    """Returns waypoints of the robot's path with `jump` at the first after each jump of a frame."""
+    window = TimeWindow(waypoints[0].time, waypoints[-1].time + 1)
     try:
-        track = TrackReader(view, frame_id).over(TimeWindow(moved[0].time, moved[-1].time + 1))
+        track = TrackReader(view, frame_id).over(window).track
     except QueryTimeoutError:
         view.notes.add_lack(f"there was no time to look where {frame_id} jumped")
-        return tuple(moved)
-    jumped = track.track.times[1:][jumps(track.track)[:-1]]
-    reached = np.searchsorted(jumped, [waypoint.time for waypoint in moved], side="right")
+        return tuple(waypoints)
+    jumped = track.times[1:][jumps(track)[:-1]]
+    reached = np.searchsorted(jumped, [waypoint.time for waypoint in waypoints], side="right")
     is_after = np.diff(reached, prepend=reached[0]) > 0
     if is_after.any():
         across = counted(int(is_after.sum()), "waypoint")
-        view.notes.add(f"{frame_id} jumped before {across}: nobody drove there from the one before")
+        view.notes.add(f"{frame_id} jumped before {across}: the line to there was not driven")
     return tuple(
         replace(waypoint, jump=waypoint.jump or after)
-        for waypoint, after in zip(moved, is_after.tolist(), strict=True)
+        for waypoint, after in zip(waypoints, is_after.tolist(), strict=True)
     )
 
 

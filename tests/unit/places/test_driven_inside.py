@@ -128,7 +128,7 @@ def test_no_drawn_way_leads_across_a_jump_of_the_map(tmp_path: Path, recalls: bo
         (0.0, False),
         (10.0, True),
     ]
-    note = "map jumped before 1 waypoint: nobody drove there from the one before"
+    note = "map jumped before 1 waypoint: the line to there was not driven"
     assert note in moved["notes"]
     assert note not in own["notes"]
 
