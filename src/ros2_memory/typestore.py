@@ -61,7 +61,8 @@ int64 sequence_number
 _SERVICE: Final = re.compile(r"^---[ \t]*$", re.MULTILINE)
 _MSG_NOISE: Final = re.compile(r"^[ \t]*(?:#[^\n]*)?\n", re.MULTILINE)
 _IDL_PIECE: Final = re.compile(
-    r'"(?:\\.|[^"\\])*"|/\*.*?\*/|//[^\n]*|@[A-Za-z_]\w*(?:[ \t]*\()?|[()]|[^"/@()]+|.', re.DOTALL
+    r'"(?:\\.|[^"\\])*"?|/\*(?:.*?\*/|.*)|//[^\n]*|@[A-Za-z_]\w*(?:[ \t]*\()?|[()]|[^"/@()]+|.',
+    re.DOTALL,
 )
 _IDL_DIRECTIVE: Final = re.compile(r"^[ \t]*#[^\n]*", re.MULTILINE)
 _IDL_NESTED_SEQUENCE: Final = re.compile(r"sequence\s*<\s*sequence")
@@ -326,12 +327,12 @@ def _plain_idl(text: str) -> str:
     kept: list[str] = []
     depth = 0
     for piece in _IDL_PIECE.findall(text):
-        if depth:
+        if piece.startswith(("//", "/*")):
+            kept.append(" ")
+        elif depth:
             depth += (piece[-1] == "(") - (piece == ")")
         elif piece[0] == "@":
             depth = int(piece[-1] == "(")
-        elif piece.startswith(("//", "/*")):
-            kept.append(" ")
         elif piece == "(":
             raise _UnusableError(
                 "its IDL contains an expression in parentheses, which is not supported"

@@ -144,8 +144,8 @@ module a_msgs {{
       const octet LIMIT = 5;
       const string NAME = "a (b)";
     }};
-    @verbatim (language="comment", text=
-      "A is (nested (twice))")
+    @verbatim (language="comment", // of (
+      text="A is (nested (twice))")
     struct A {{
       @unit (value="m")
       double x;
@@ -274,6 +274,12 @@ class TestHostileDefinitions:
     def test_idl_on_which_the_parser_would_not_come_to_an_end(self, statement: str) -> None:
         whole = f"module a_msgs {{ module msg {{ {statement} struct A {{ long y; }}; }}; }};"
         assert "is not supported" in reason(lookup("a_msgs/msg/A", whole, "ros2idl"))
+
+    @pytest.mark.parametrize(
+        "text", ["/* " * 200_000, '"' + r"\"" * 200_000, "@a(" * 200_000], ids=["/*", '"', "@"]
+    )
+    def test_idl_in_which_much_is_begun_and_nothing_ended(self, text: str) -> None:
+        assert reason(lookup("a_msgs/msg/A", text, "ros2idl"))
 
     @pytest.mark.parametrize(
         "name", ["", "/", "a//b", "a_msgs/msg/A\nuint8 x", "../../etc/passwd", "a" * 100_000]

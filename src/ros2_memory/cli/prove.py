@@ -270,6 +270,6 @@ def _differing(one: JsonValue, other: JsonValue) -> tuple[list[str], list[str]]:
     """Returns the keys in which two replies differ: those on files, and the others."""
     one, other = (_NEVER if reply is None else reply for reply in (one, other))
     if not isinstance(one, dict) or not isinstance(other, dict):
-        return [], [] if one == other else ["all"]
+        return [], ([] if one == other else ["all"])
     keys = [key for key in dict.fromkeys((*one, *other)) if one.get(key) != other.get(key)]
     return [key for key in keys if key in _BESIDE], [key for key in keys if key not in _BESIDE]

@@ -96,11 +96,11 @@ def decoded(
 ) -> Iterator[list[Table]]:
     """Yields the messages of a bag as tables, in groups.
 
-    In one group there is one table for each topic, type and definition with messages; a bag that
-    decompresses to less than `GROUP_BYTES` is one group. Tables of later groups may overlap earlier
-    ones in time, as the chunks of the file do, but a table has all messages of a log time. Lazy:
-    nothing is opened before the first group is requested. In memory are one group and one buffer
-    of the reader.
+    In one group there is one table for each topic, type and definition with messages; a bag whose
+    messages and tables take less than `GROUP_BYTES` is one group. Tables of later groups may
+    overlap earlier ones in time, as the chunks of the file do, but a table has all messages of a
+    log time. Lazy: nothing is opened before the first group is requested. In memory are one group
+    and one buffer of the reader.
 
     Args:
         reader: reads the bag.
@@ -228,13 +228,15 @@ class _Group:
     _bytes: int = 0
 
     def is_full_before(self, batch: Batch) -> bool:
-        """Returns whether a batch belongs to the next group: only with a buffer one begins."""
+        """Returns whether a batch begins the next group; only the first of a buffer may."""
         if batch.buffer is self._buffer or not self._parts:
             return False
-        size = self._bytes + len(batch.buffer)
-        if GROUP_BYTES // 4 < size <= GROUP_BYTES:
-            size = sum(part.memory_bytes for parts in self._parts.values() for part in parts)
-        return size > GROUP_BYTES
+        payload_bytes = self._bytes + len(batch.buffer)
+        # Tables may take more than the payloads, but hardly four times as much.
+        if payload_bytes <= GROUP_BYTES // 4 or payload_bytes > GROUP_BYTES:
+            return payload_bytes > GROUP_BYTES
+        tables = (part for parts in self._parts.values() for part in parts)
+        return sum(table.memory_bytes for table in tables) > GROUP_BYTES
 
     def add(self, kind: _Kind, batch: Batch) -> None:
         """Decodes a batch."""

@@ -268,7 +268,7 @@ class Call:
     stored: bool = False
 
     def saw(self, snapshot: Snapshot) -> None:
-        """Notes that the call was shown what a snapshot has."""
+        """Lowers `older` to that of a snapshot that the call was shown; None once one had all."""
         if snapshot.older is None or self.older is None:
             self.older = None
         else:

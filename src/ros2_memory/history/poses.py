@@ -157,15 +157,15 @@ class PoseReader:
         return joined_poses([self.poses(some) for some in counting if len(some)])
 
     def _without_others(self, rows: Rows) -> Rows:
-        """Returns the rows that others do not have the time of."""
+        """Returns the rows without those whose time another recording has."""
         for beside in self._held_by_others(rows):
-            out = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
+            is_held = (rows.times >= beside.span.start) & (rows.times < beside.span.stop)
             if beside.bags:
-                positions = [where for bag, where in rows.bag_rows() if bag.file in beside.bags]
                 is_of_bags = np.zeros(len(rows), np.bool_)
-                is_of_bags[np.concatenate([np.empty(0, np.int64), *positions])] = True
-                out &= is_of_bags
-            rows = rows.some(np.flatnonzero(~out))
+                for bag, positions in rows.bag_rows():
+                    is_of_bags[positions] = bag.file in beside.bags
+                is_held &= is_of_bags
+            rows = rows.some(np.flatnonzero(~is_held))
         return rows
 
     def _held_by_others(self, rows: Rows) -> list[ParallelRecordings]:

@@ -191,7 +191,8 @@ class Tree:
     ) -> None:
         self._root = str(root)
         self._setting = setting
-        self._only = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
+        self._only = only
+        self._only_path = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
         self._named = None if only is None else paths_named(self._root, only)
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
@@ -345,7 +346,7 @@ class Tree:
                 if (
                     self._named is None
                     or self._named.fullmatch(entry.path)
-                    or (self._only or "").startswith(f"{entry.path}/")
+                    or (self._only_path or "").startswith(f"{entry.path}/")
                 ):
                     folder.enter(entry, stamps)
         return folder

@@ -32,7 +32,6 @@ from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import Reason, counted
-from ros2_memory.core.timebase import Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.scan import (
     blocks,
@@ -96,7 +95,7 @@ def events_back(
 def _timed_events_back(
     view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
 ) -> Iterator[tuple[Ns, TopicEvents]]:
-    """Yields as `events_back`, each with a log time (ns) that none of it is earlier than."""
+    """Yields as `events_back`, each with a log time (ns) before which none of its events is."""
     columns = StatedColumns(view.extractor)
     opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
 

@@ -315,8 +315,10 @@ class Screening:
                 raise _UselessRuleError(refusal)
         screen.heard = heard_by_rule
         # Latched messages may be written again with the times that they had.
-        start = min((topic.first for topic in summary.topics if not topic.latched), default=MAX_NS)
-        was_set_back = screen.end is not None and start < screen.end - OUT_OF_ORDER_NS
+        first_unlatched = min(
+            (topic.first for topic in summary.topics if not topic.latched), default=MAX_NS
+        )
+        was_set_back = screen.end is not None and first_unlatched < screen.end - OUT_OF_ORDER_NS
         if was_set_back or summary.schema.set_back:
             screen.unclear.append((summary.start, summary.end + 1))
         screen.start = min(summary.start, MAX_NS if screen.start is None else screen.start)

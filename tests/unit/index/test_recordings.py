@@ -37,6 +37,11 @@ def comparable(snapshot: Snapshot) -> tuple[object, ...]:
     return files, replace(snapshot, problem=None, scanned_at=0)
 
 
+def test_a_recording_that_is_not_there_is_named_as_it_was_asked_for(tmp_path: Path) -> None:
+    write(tmp_path, "a/a_0")
+    assert index_of(tmp_path, "b").refresh().problem == "no bag is named b (data.recording)"
+
+
 @pytest.mark.parametrize("name", ["a", "a_1", "run", "run_1", "deep", "deep/b", "loose", "nothing"])
 def test_a_filter_leaves_what_a_scan_of_one_recording_finds(tmp_path: Path, name: str) -> None:
     bags = ["a/a_0", "a/a_1", "a_1/0", "run_0", "run_1", "run_10", "loose", "loose_x"]

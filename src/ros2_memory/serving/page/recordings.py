@@ -105,7 +105,7 @@ class Recordings:
         """Returns a path for each robot, where recordings are plainly of several; else none.
 
         Each is of one recording, or of a folder of recordings that do not overlap each other.
-        Those that overlap come first, then the newest.
+        Of more than `MOST_PATHS` those that overlap are there, then the newest; in order of name.
         """
         names = _robots(chosen, call, window)
         robot_paths: list[JsonValue] = []

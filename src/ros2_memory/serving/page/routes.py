@@ -218,7 +218,7 @@ def box_asked(given: QueryParams) -> Box:
     Raises:
         InvalidArgumentsError: a number is missing or invalid, or a pixel has no size.
     """
-    match _numbers(given, "x0", "y0", "x1", "y1", "pixel", unit=" of metres"):
+    match _numbers(given, "x0", "y0", "x1", "y1", "pixel", unit="metres"):
         case [x0, y0, x1, y1, pixel_m] if pixel_m > 0:
             return Box(x0, y0, x1, y1, max(pixel_m, _LEAST_PIXEL_M))
     raise InvalidArgumentsError("give x0, y0, x1, y1 and pixel (above 0), in metres")
@@ -247,13 +247,13 @@ def _short(given: QueryParams, name: str, longest: int) -> str:
     return text
 
 
-def _numbers(given: QueryParams, *names: str, unit: str = " of seconds") -> list[float]:
+def _numbers(given: QueryParams, *names: str, unit: str = "seconds") -> list[float]:
     """Returns those of some numbers that are given."""
     numbers = [_number(given, name, unit) for name in names]
     return [number for number in numbers if number is not None]
 
 
-def _number(given: QueryParams, name: str, unit: str = " of seconds") -> float | None:
+def _number(given: QueryParams, name: str, unit: str = "seconds") -> float | None:
     text = given.get(name)
     if text is None:
         return None
@@ -262,5 +262,5 @@ def _number(given: QueryParams, name: str, unit: str = " of seconds") -> float |
     except ValueError:
         number = math.nan
     if not math.isfinite(number):
-        raise InvalidArgumentsError(f"{name} must be a number{unit}, not {text[:40]!r}")
+        raise InvalidArgumentsError(f"{name} must be a number of {unit}, not {text[:40]!r}")
     return number
