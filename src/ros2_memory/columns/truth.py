@@ -69,7 +69,7 @@ _ROUNDING: Final = 1e-9
 """How much a distance that numpy computes may differ, relative to the tolerance; far too much."""
 _SHORT: Final = 200
 _MOST_DECIDED: Final = 4_096
-"""Texts of which it is remembered whether they pass."""
+"""So many texts are remembered with whether they pass."""
 _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 

@@ -32,7 +32,7 @@ _FEW_ROWS: Final = 24
 """Of more than `_MANY` elements, in fewer rows on average, each is sooner decoded alone than nth by
 nth."""
 _MANY_ROWS: Final = 100
-"""Of a text that so many rows have, these are found together."""
+"""The rows of one text are found together where so many have it."""
 MAX_COUNTED_BYTES: Final = 256 << 10
 """In a larger message the decoder counts strings and messages, and may refuse it."""
 _HEADER_BYTES: Final = 4

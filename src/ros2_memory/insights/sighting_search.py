@@ -47,7 +47,7 @@ _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
 _LAST: Final = attrgetter("last")
 _MOST_WAITING: Final = 1 << 14
-"""Messages that are looked at together."""
+"""So many messages are looked at together."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

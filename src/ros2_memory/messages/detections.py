@@ -45,7 +45,7 @@ _NAMED_IN_TYPES: Final = {
     frozenset({"marker_id", "pose"}): "marker_id",  # aruco_opencv_msgs
     frozenset({"Class", "probability"}): "Class",  # darknet_ros_msgs of ROS 1
 }
-"""The name of an object that has these fields, for types that tell what was seen by no label."""
+"""The name of an object that has these fields, for types in which no label says what was seen."""
 _MAX_JSON_CHARS: Final = 4 << 20
 MAX_DEPTH: Final = 7
 """Lists, objects and texts that are JSON around a detection, and it."""

@@ -60,7 +60,7 @@ def refusal_of(error: Exception) -> JSONRPCError | None:
     if isinstance(inputs[0], str):
         is_blank = not inputs[0].strip()
         return None if is_blank else _refusal(request_id(inputs[0]), PARSE_ERROR, reason)
-    # Of a request that is wrong inside, another kind of message would need a field of the whole.
+    # The errors say of each kind of message what is missing; some have the whole line as input.
     known = [given["id"] for given in inputs if isinstance(given, dict) and "id" in given]
     number = known[0] if known and isinstance(known[0], int | str) else None
     return _refusal(number, INVALID_REQUEST, reason)

@@ -67,7 +67,7 @@ _SPREAD: Final = (0.6, 2.0)
 _LEFT: Final = 6.0
 """A robot left a place when it is more than so many standard deviations away."""
 _AHEAD: Final = 64
-"""The next place that a robot left for is looked for among so many, then among twice as many."""
+"""So many positions are searched at first for the next place, then twice as many."""
 _ROOT_MEAN: Final = (2**0.25 * math.gamma(0.75) / math.sqrt(math.pi)) ** 2
 """The squared mean square root of a standard normal variable's magnitude."""
 _GROWTH: Final = math.sqrt(math.comb(2 * _ORDER, _ORDER))
