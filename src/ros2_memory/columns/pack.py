@@ -157,20 +157,20 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
     return _from_ordered(whole, stored, rounded=is_rounded).astype(dtype, copy=False)
 
 
-class _Own(threading.local):
-    """What packs and unpacks in one thread: new ones take longer than most columns."""
+class _Codecs(threading.local):
+    """A compressor and a decompressor a thread: making new ones takes longer than most columns."""
 
     def __init__(self) -> None:
         self.compressor = zstandard.ZstdCompressor(level=LEVEL, write_checksum=True)
         self.decompressor = zstandard.ZstdDecompressor()
 
 
-_OWN: Final = _Own()
+_CODECS: Final = _Codecs()
 
 
 def compressed(data: bytes) -> bytes:
     """Returns the bytes as a zstd frame that states its size and has a checksum."""
-    return _OWN.compressor.compress(data)
+    return _CODECS.compressor.compress(data)
 
 
 def is_large(data: bytes) -> bool:
@@ -188,7 +188,7 @@ def decompressed(data: bytes) -> bytes:
         ValueError: it is no such frame, or a damaged one.
     """
     try:
-        return _OWN.decompressor.decompress(data)
+        return _CODECS.decompressor.decompress(data)
     except (zstandard.ZstdError, MemoryError) as error:  # a damaged frame may state any size
         raise ValueError(f"packed columns cannot be decompressed: {error}") from error
 

@@ -77,7 +77,7 @@ def unreadable_bounds(
 
 
 def _last_written(written: Ns | None, now: Ns) -> Ns | None:
-    """Returns the end of what a file can contain by its mtime; None where that is implausible."""
+    """Returns the latest log time that a file can have, by its mtime; None where that cannot be."""
     if written is None or not FIRST_BAGS_NS <= written <= max_plausible(now):
         return None
     return min(written + FUTURE_NS, MAX_NS)

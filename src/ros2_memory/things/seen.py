@@ -73,7 +73,7 @@ class SeenStretch(NamedTuple, Generic[S]):
     """The sights of a session in ten minutes of the clock, or in `STRETCH_NS`.
 
     Attributes:
-        session: its recordings; of what is stored, its number among those around.
+        session: its recordings; in the store a number, see `Seen.of`.
         start: log time (ns) of the ten minutes, the first ones that have some.
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
@@ -112,7 +112,7 @@ class Seen(NamedTuple):
         return 200 + sum(200 + len(topic.packed) for topic in topics)
 
     def of(self, sessions: Sequence[Session]) -> list[SeenStretch[Session]]:
-        """Returns it with these sessions in place of their numbers."""
+        """Returns the stretches with these sessions in place of their numbers."""
         return [SeenStretch(sessions[stretch[0]], *stretch[1:]) for stretch in self.stretches]
 
 
@@ -341,16 +341,16 @@ class Watching:
             for around in reversed(together):
                 for stretch in self._seen_in(around):
                     topics = tuple(of_topic.topics for of_topic in stretch.sights)
-                    of = numbers[stretch.session], stretch.frame_id, topics
-                    alike.setdefault(of, []).append(stretch)
-            return Joined([Seen(tuple(_as_one(of[0], alike[of]) for of in sorted(alike)))])
+                    key = numbers[stretch.session], stretch.frame_id, topics
+                    alike.setdefault(key, []).append(stretch)
+            return Joined([Seen(tuple(_as_one(key[0], alike[key]) for key in sorted(alike)))])
 
         key = FragmentKey(start, digest, tuple(sorted({*chain.from_iterable(parts)})))
         [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
         return seen.of(sessions)
 
     def _seen_in(self, around: _Surroundings) -> list[SeenStretch[Session]]:
-        """Returns what each session saw in a stretch; from memory where that is known."""
+        """Returns what each session saw in a stretch; from the cache where it is there."""
         return self._seen(around).of([lending.session for lending in around.sessions])
 
     def _seen(self, around: _Surroundings) -> Seen:
