@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from tests.integration.test_server_process import Served, serving
+from tests.integration.test_server_process import PROGRAM, Served, serving
 from tests.support.robot_run import write_run
 
 HERE: Final = Path(__file__).parent
@@ -56,11 +56,12 @@ def main(arguments: Sequence[str] = ()) -> int:
         folder = Path(scratch)
         write_run(folder / "bags")
         failed = 0
-        with serving(folder / "bags", folder / "log") as served:
+        with serving(folder / "bags", folder / "log", program=PROGRAM) as served:
             for name in APPLYING:
                 failed += _told(name, _scenario(name, served, folder / name))
             failed += _clients(served, ())
-        with serving(folder / "bags", folder / "log", MEMORY_API_TOKEN=TOKEN) as served:
+        token = {"MEMORY_API_TOKEN": TOKEN}
+        with serving(folder / "bags", folder / "log", program=PROGRAM, **token) as served:
             failed += _clients(served, (TOKEN,))
     return 1 if failed else 0
 
