@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import errno
+import fcntl
+import os
 import shutil
 import tempfile
 import threading
+import time
 import weakref
 from collections import OrderedDict
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -33,9 +36,12 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import Closing
 
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+_PREFIX = "ros2-memory-unpacked-"
+_UNLOCKED_S = 60
+"""A folder of less age may be of a program that is about to lock it."""
 
 
-@dataclass(slots=True, weakref_slot=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Entry:
     lock: threading.Lock = field(default_factory=threading.Lock)
     folder: Path | None = None
@@ -48,7 +54,8 @@ class Scratch:
     """Folders for temporary files, bounded in bytes. Safe to use from several threads.
 
     The least recently used are deleted first, never one in use. All are deleted with the reader, or
-    when the program ends.
+    when the program ends. A program that is killed leaves its folders: the next deletes those that
+    nobody has locked.
 
     Args:
         max_bytes: what all files together may take.
@@ -56,6 +63,8 @@ class Scratch:
 
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
+        self._root: Path | None = None
+        self._root_lock = threading.Lock()
         self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
@@ -96,12 +105,25 @@ class Scratch:
     ) -> tuple[Path, str]:
         self._empty(entry)
         try:
-            return fill(_new_folder(entry), lambda size: self._reserve(entry, size))
+            entry.folder = self._new_folder()
+            return fill(entry.folder, lambda size: self._reserve(entry, size))
         except BaseException as error:
             self._empty(entry)
             if isinstance(error, OSError) and error.errno in _DISK_FULL:
                 raise _disk_full(error) from error
             raise
+
+    def _new_folder(self) -> Path:
+        try:
+            with self._root_lock:
+                if self._root is None or not self._root.exists():
+                    _delete_abandoned()
+                    self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
+                    descriptor = _lock(self._root)
+                    weakref.finalize(self, _delete_locked, self._root, descriptor)
+                return Path(tempfile.mkdtemp(dir=self._root))
+        except OSError as error:
+            raise _disk_full(error) from error
 
     def _empty(self, entry: _Entry) -> None:
         if entry.folder is not None:
@@ -129,14 +151,32 @@ class Scratch:
             entry.size += size
 
 
-def _new_folder(entry: _Entry) -> Path:
-    """Makes a folder that is deleted with the entry, or when the program ends."""
+def _delete_abandoned() -> None:
+    """Deletes the folders of programs that were killed: no process has them locked any more."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError):  # of another user, or in use
+            if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
+                _delete_locked(folder, _lock(folder))
+
+
+def _lock(folder: Path) -> int:
+    """Locks a folder while this process lives, and returns its descriptor.
+
+    Raises:
+        OSError: another has it, or it cannot be locked.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:
-        entry.folder = Path(tempfile.mkdtemp(prefix="ros2-memory-"))
-    except OSError as error:
-        raise _disk_full(error) from error
-    weakref.finalize(entry, shutil.rmtree, entry.folder, ignore_errors=True)
-    return entry.folder
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _delete_locked(folder: Path, descriptor: int) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    os.close(descriptor)
 
 
 def _disk_full(error: OSError) -> UnreachableError:

@@ -3,7 +3,10 @@ from __future__ import annotations
 import gc
 import os
 import sqlite3
+import subprocess
+import sys
 import tempfile
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +39,15 @@ if TYPE_CHECKING:
 
 EVERYTHING = TimeWindow.everything()
 STRING = "std_msgs/msg/String"
+UNPACKING = """\
+import sys
+from pathlib import Path
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+reader = Rosbag2Reader()
+reader.summarize(Path(sys.argv[1]))
+print("unpacked", flush=True)
+sys.stdin.read()
+"""
 
 
 @pytest.fixture
@@ -382,6 +394,37 @@ class TestCompressedFiles:
         del reader
         gc.collect()
         assert list(scratch_root.iterdir()) == []
+
+
+def test_what_a_killed_program_had_unpacked_is_deleted_by_the_next(
+    tmp_path: Path, scratch_root: Path
+) -> None:
+    path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))
+    program = [sys.executable, "-c", UNPACKING, str(path)]
+    env = os.environ | {"TMPDIR": str(scratch_root)}
+    pipe = subprocess.PIPE
+
+    def unpacked(program: subprocess.Popen[bytes], *others: Path) -> Path:
+        assert program.stdout is not None
+        assert program.stdout.readline() == b"unpacked\n"
+        (folder,) = {*scratch_root.iterdir()} - {*others}
+        an_hour_ago = time.time() - 3600
+        os.utime(folder, (an_hour_ago, an_hour_ago))
+        return folder
+
+    with subprocess.Popen(program, stdin=pipe, stdout=pipe, env=env) as killed:
+        abandoned = unpacked(killed)
+        killed.kill()
+    with subprocess.Popen(program, stdin=pipe, stdout=pipe, env=env) as living:
+        in_use = unpacked(living, abandoned)
+        reader = Rosbag2Reader()
+        reader.summarize(path)
+        assert not abandoned.exists()
+        assert size_of(in_use) > 0
+        living.communicate()
+    del reader
+    gc.collect()
+    assert [*scratch_root.iterdir()] == []
 
 
 def _block_starts(data: bytes) -> list[int]:
