@@ -4,6 +4,7 @@ Times are Unix seconds. No window is opened, and nothing is written but the pict
 list of fonts.
 """
 
+import atexit
 import logging
 import math
 import os
@@ -16,6 +17,7 @@ from datetime import datetime
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
+from shutil import rmtree
 from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
@@ -304,7 +306,9 @@ def _font_folder() -> str:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
             return str(folder)
-    return mkdtemp(prefix="ros2-memory-")
+    folder = mkdtemp(prefix="ros2-memory-")
+    atexit.register(rmtree, folder, ignore_errors=True)
+    return folder
 
 
 def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
@@ -70,6 +73,23 @@ def test_where_the_poses_are_on_several_other_topics_it_names_the_option(
         "set data.pose_topic to one of them, or give --topic"
         in exits(2, f"plot path {tmp_path} --out {tmp_path}/x.svg").err
     )
+
+
+def test_where_no_cache_can_be_written_a_plot_leaves_nothing_in_the_temporary_folder(
+    bags: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "no_folder").write_text("")
+    (tmp_path / "temporary").mkdir()
+    env = os.environ | {
+        "XDG_CACHE_HOME": str(tmp_path / "no_folder"),
+        "TMPDIR": str(tmp_path / "temporary"),
+    }
+    env.pop("MPLCONFIGDIR", None)
+    program = [sys.executable, "-m", "ros2_memory.cli", "plot", "path", str(bags)]
+    out = tmp_path / "path.svg"
+    subprocess.run([*program, "--out", str(out)], env=env, check=True, capture_output=True)
+    assert out.is_file()
+    assert [*(tmp_path / "temporary").iterdir()] == []
 
 
 def test_without_poses_the_path_is_that_of_the_transforms(tmp_path: Path) -> None:
