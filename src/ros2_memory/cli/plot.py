@@ -306,9 +306,9 @@ def _font_folder() -> str:
         folder.mkdir(parents=True, exist_ok=True)
         if os.access(folder, os.W_OK):
             return str(folder)
-    folder = mkdtemp(prefix="ros2-memory-")
-    atexit.register(rmtree, folder, ignore_errors=True)
-    return folder
+    temporary = mkdtemp(prefix="ros2-memory-")
+    atexit.register(rmtree, temporary, ignore_errors=True)
+    return temporary
 
 
 def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.conditions import (
+    Beyond,
     Condition,
     Equals,
     NearPosition,
@@ -65,8 +66,9 @@ MOST_UNSURE: Final = 32
 """Messages of a part that are read one by one, where its columns leave open what they meet."""
 _MOST_LEFT: Final = 0.5
 """Where a bag's columns leave open more of them, those of its type are left to the messages."""
-_MOST_FRAMES: Final = 3
-"""Topics whose frame is named: each costs one message."""
+_MOST_LOOKED_AT: Final = 3
+"""Topics whose newest message is looked at, for its frame or its scale."""
+_PERCENT: Final = 100
 _TOGETHER_NS: Final[Ns] = NS_PER_S
 """Messages that may match and are no farther apart are read at once."""
 _MOST_TOGETHER: Final = 256
@@ -95,8 +97,8 @@ def condition_of(
     memory = view.memory
     limits = memory.limits
     least = limits.min_score if min_score is None else min_score
-    timeline = view.timeline
-    types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
+    topics = matching_topics(view, pattern)
+    types = frozenset(chain.from_iterable(map(view.timeline.types_of, topics)))
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
@@ -105,10 +107,34 @@ def condition_of(
         value = level_number(value, field, type_name)
         value = _constant_number(view, value, field, type_name)
     try:
-        return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
+        tolerance_m = limits.position_tolerance_m
+        condition = parse_condition(condition_type, value, tolerance_m, field, least)
     except InvalidArgumentsError as error:
         hint = unknown_name_hint(value, field, types)
         raise InvalidArgumentsError(f"{error}{hint}") from error
+    _note_fraction(view, topics, condition)
+    return condition
+
+
+def _note_fraction(view: View, topics: Sequence[str], condition: Condition) -> None:
+    """Notes that a field named as a percentage holds a fraction, if a condition asks for percent.
+
+    Such is `percentage` of `sensor_msgs/msg/BatteryState`: of 0.9 to say that it is below 20 is
+    true, and never what was meant.
+    """
+    test, field = condition.test, condition.field or ""
+    if not isinstance(test, Beyond) or not 1 < test.limit <= _PERCENT or "percent" not in field:
+        return
+    for topic in topics[:_MOST_LOOKED_AT]:
+        stored = view.stream.last(topic)
+        message = None if stored is None else view.bags.decode(stored)
+        if stored is not None and message is not None:
+            newest = view.extractor.exact_at(message, stored.type, field)
+            if isinstance(newest, float | int) and 0 <= newest <= 1:
+                view.notes.add(
+                    f"{field} of {topic} is {newest:.2g} in its newest message: if that is a "
+                    f"fraction, ask with {test.limit / _PERCENT:g} for {test.limit:g} %"
+                )
 
 
 def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
@@ -192,7 +218,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
 
 def _frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Returns the first topics that have positions, and the frames of these."""
-    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_LOOKED_AT]]
     return [(topic, of_topic) for topic, of_topic in frames if of_topic]
 
 

@@ -88,6 +88,29 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
         newest("POWER_SUPPLY_STATUS_EMPTY")
 
 
+@pytest.mark.parametrize(
+    ("charge", "limit", "note"),
+    [
+        pytest.param(0.87, 20, "percentage of /battery_state is 0.87 in its newest", id="fraction"),
+        pytest.param(87.0, 20, None, id="percent"),
+        pytest.param(0.87, 0.2, None, id="asked_as_fraction"),
+    ],
+)
+def test_percent_of_a_battery_that_states_fractions_is_noted(
+    tmp_path: Path, charge: float, limit: float, note: str | None
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0 + n * NS_PER_S, charge) for n in range(9)])
+    memory = memory_of(tmp_path)
+    below = ("/battery_state", "below", limit)
+    newest = queries.find_last_match(memory, Call(), *below, field="percentage")
+    ranges = find_matches(memory, Call(), *below, field="percentage")
+    for notes in (newest.notes, ranges.notes):
+        assert [text for text in notes if "fraction" in text] == [
+            text for text in notes if note and text.startswith(note)
+        ]
+        assert (note is not None) == any(text.endswith("ask with 0.2 for 20 %") for text in notes)
+
+
 def last(
     memory: Memory,
     condition_type: str,
