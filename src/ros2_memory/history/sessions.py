@@ -32,7 +32,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.history.context import Note
+from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.scan import (
     joined_back,
     messages_of,
@@ -414,11 +414,18 @@ class Sessions:
         """Every parent and child pair that was recorded, sorted; `static` where published so.
 
         A pair that was published in both directions appears once, as moving. A pair with an unnamed
-        frame is invalid in tf2, and is left out with a note.
+        frame is invalid in tf2, and is left out with a note; so are those that only bags have for
+        which there was no time.
         """
         view = self._view
+        reading = view.call.partial_after(READING_S)
         pairs = dict.fromkeys(self.pairs(view.static_topics), True)
-        pairs |= dict.fromkeys(self.pairs(view.moving_topics), False)
+        for topic in view.moving_topics:
+            for found in self.pairs_back(topic, None):
+                if reading.expired():
+                    view.notes.add_lack("out of time: frames that only older bags have are missing")
+                    break
+                pairs |= dict.fromkeys(found, False)
         edges = [
             FrameEdge(*pair, is_static)
             for pair, is_static in sorted(pairs.items())

@@ -6,7 +6,8 @@ import gc
 import math
 import weakref
 from dataclasses import replace
-from itertools import pairwise
+from functools import partial
+from itertools import chain, groupby, pairwise, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -21,7 +22,7 @@ from ros2_memory.analysis.frames import static_at
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, unix_from_ns
+from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.transforms import frames_over
 from ros2_memory.history.view import AtTime, TimeRange, View
@@ -439,6 +440,30 @@ def test_a_value_of_another_recording_than_the_match_is_noted(tmp_path: Path) ->
     reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
     assert reply.value is not None
     assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
+
+
+def test_frames_are_those_of_the_newest_bags_where_there_is_no_time_for_all(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number, child in enumerate(["gone", "old", "new"]):
+        record(tmp_path / f"r{number}", moving(T0 + number * 60 * S, 20, "odom", child, 0.0, 0.0))
+
+    def children(looks: int) -> tuple[list[str], bool]:
+        clock = chain([0.0] * (looks + 1), repeat(math.inf))
+        deadline = Deadline.after(1.0, partial(next, clock))
+        monkeypatch.setattr(Call, "partial_after", lambda *_: deadline)
+        found = frames(memory_of(tmp_path), Call())
+        return [edge.child for edge in found.edges], any("older bags" in it for it in found.notes)
+
+    answers = [children(looks) for looks in range(1, 12)]
+    named = [names for names, _ in answers]
+    assert [names for names, _ in groupby(named)] == [
+        ["new"],
+        ["new", "old"],
+        ["gone", "new", "old"],
+    ]
+    assert all(is_partial for names, is_partial in answers if "gone" not in names)
+    assert answers[-1] == (["gone", "new", "old"], False)
 
 
 def test_a_frame_without_a_name_is_none(tmp_path: Path) -> None:
