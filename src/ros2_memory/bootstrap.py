@@ -402,17 +402,6 @@ def build_repairer() -> Repairer:
     return Repairer(McapReader(), McapWriter())
 
 
-def claim(own: OwnRecordings) -> None:
-    """Completes the list of a bag directory's own recordings; nobody may be recording there.
-
-    Raises:
-        RecorderError: the list cannot be read, or the bag directory cannot be listed.
-    """
-    from ros2_memory.storage.mcap.salvage import custom_data
-
-    own.claim(custom_data)
-
-
 class SharedParts(NamedTuple):
     """What memories of the same settings can share: the reader and the decoder, with their caches.
 

@@ -2,7 +2,6 @@
 
 Only those are ever deleted. The file has one JSON object a line:
 
-    {"bag_dir_id": "5f0c..."}                                       random, of this bag directory
     {"recording": "rec_A"}                                          before its child is started
     {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
     {"recording": "rec_A", "inode": 7, ..., "splits": 60, "ended": true}
@@ -25,14 +24,13 @@ import os
 import stat
 import threading
 import time
-import uuid
 from bisect import bisect_left
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final
 
-from pydantic import AfterValidator, Field, StrictBool
+from pydantic import AfterValidator, StrictBool
 
 from ros2_memory.bag_dir.durable_write import (
     append_lines,
@@ -73,16 +71,6 @@ if TYPE_CHECKING:
         Sequence,
     )
 
-    CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
-    """Returns what `ros2 bag record` embedded in a bag file; None where that is unreadable.
-
-    May raise OSError.
-    """
-
-RECORDED_BY: Final = "recorded_by"
-BAG_DIR_ID: Final = "bag_dir_id"
-PROGRAM: Final = "ros2-memory"
-
 _SPARE_LINES: Final = 1000
 _MAX_NAMED: Final = 5
 _LOCK_WAIT_S: Final = 2.0
@@ -100,7 +88,7 @@ def _checked_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListRow:
-    """One line of the list: the id of the bag directory, or a recording.
+    """One line of the list: a recording.
 
     `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
     and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
@@ -108,7 +96,6 @@ class ListRow:
     messages are listed like adopted ones.
     """
 
-    bag_dir_id: Annotated[str, Field(pattern=r"^[0-9a-f]{8,64}$")] = ""
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
     inode: Int64 | None = None
     generation: Int64 | None = None
@@ -167,7 +154,6 @@ class OwnRecordings:
         self._bag_dir = bag_dir
         self._path = bag_dir / LIST_FILE
         self._lock = threading.RLock()
-        self._id = ""
         self._rows: dict[str, ListRow] = {}
         self._lines = 0
         self._stamp: tuple[int, ...] | None = None
@@ -266,15 +252,10 @@ class OwnRecordings:
         """A value that changes when the list is read again."""
         return self._stamp
 
-    @property
-    def bag_dir_id(self) -> str | None:
-        """The random id of this bag directory, which recordings carry; None before there is one."""
-        return self._id or None
-
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
 
-    def claim(self, custom_data: CustomDataOf) -> None:
+    def claim(self) -> None:
         """Brings the list up to date before anything is recorded.
 
         Without a list it makes one, and names what looks like recordings: nothing shows whether
@@ -295,7 +276,7 @@ class OwnRecordings:
                 )
             except OSError as error:
                 raise self._failure(error, "read") from error
-            rows = self._find_completed(custom_data)
+            rows = self._find_completed()
             self._add(rows)
             rows += self._find_ended()
             if left:
@@ -306,7 +287,7 @@ class OwnRecordings:
             for name, row in self._rows.items():
                 if row.identity is None and (self._bag_dir / name).is_dir():
                     _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
-            if exists and self._id and not (rows or self._missing_on_disk(self._rows)):
+            if exists and not (rows or self._missing_on_disk(self._rows)):
                 return
             try:
                 self._rewrite(rows)
@@ -334,7 +315,7 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._append([ListRow("", name, *identity, splits=0)])
+        self._append([ListRow(name, *identity, splits=0)])
         return True
 
     def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
@@ -379,7 +360,7 @@ class OwnRecordings:
         row = self._rows.get(name)
         if row is not None and row.lists(identity):
             return row
-        row = ListRow("", name, *identity)
+        row = ListRow(name, *identity)
         return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
@@ -413,28 +394,18 @@ class OwnRecordings:
         # A new dictionary: another thread may iterate over this one.
         self._rows = self._rows | _by_recording(rows)
 
-    def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
+    def _find_completed(self) -> list[ListRow]:
         """Returns the entries without a directory whose directory our child made after all.
 
-        Every file there that holds a byte carries what our child embeds, with the id of this bag
-        directory; or, as with distributions that embed nothing, no file carries anything, and the
-        heartbeat names the recording.
+        Those that the last heartbeat names: it named them before the child was started.
         """
-        ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
-        named = read_heartbeat(self._bag_dir).recordings
         completed: list[ListRow] = []
-        for name, row in self._rows.items():
-            if row.identity is not None:
-                continue
-            with suppress(OSError):
-                identity = identity_of(self._bag_dir / name)
-                if identity is None:
-                    continue
-                files = [path for path in bags_in(self._bag_dir / name) if path.stat().st_size]
-                embedded = [custom_data(path) or {} for path in files]
-                is_ours = all(ours.items() <= data.items() for data in embedded)
-                if embedded and (is_ours or (name in named and not any(embedded))):
-                    completed.append(ListRow("", name, *identity, splits=0))
+        for name in read_heartbeat(self._bag_dir).recordings:
+            row = self._rows.get(name)
+            if row is not None and row.identity is None:
+                with suppress(OSError):
+                    if identity := identity_of(self._bag_dir / name):
+                        completed.append(ListRow(name, *identity, splits=0))
         return completed
 
     def _find_ended(self) -> list[ListRow]:
@@ -479,11 +450,10 @@ class OwnRecordings:
             return False
         except ValueError as error:
             raise OSError(f"{self._path}: {error}") from error
-        rows = [line.row or ListRow() for line in lines]
-        listed = _by_recording(row for row in rows if row.recording and not row.bag_dir_id)
+        rows = [line.row for line in lines if line.row is not None]
+        listed = _by_recording(row for row in rows if row.recording)
         self._rows, self._lines, self._stamp = listed | self._unwritten, len(lines), stamp
-        self._id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
-        damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
+        damaged = len(lines) - len(rows)
         if damaged > self._reported_damaged:
             self._reported_damaged = damaged
             _log.warning("recordings_list_damaged", path=str(self._path), lines=damaged)
@@ -495,7 +465,7 @@ class OwnRecordings:
         try:
             with self._lock:
                 exists = self._read_if_changed()
-                if not exists or self._lines > self._max_lines or not self._id:
+                if not exists or self._lines > self._max_lines:
                     self._rewrite(rows)
                 else:
                     with self._locked() as descriptor:
@@ -509,7 +479,7 @@ class OwnRecordings:
 
     def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
-        before = self._rows, self._id
+        before = self._rows
         try:
             with self._locked() as descriptor:
                 if descriptor is not None:
@@ -517,27 +487,26 @@ class OwnRecordings:
                     self._stamp = None
                     self._read_if_changed()
                 # What was known and what is listed now, but for what has no directory yet.
-                merged = before[0] | {
+                merged = before | {
                     name: row
                     for name, row in self._rows.items()
-                    if row.identity or name not in before[0]
+                    if row.identity or name not in before
                 }
                 gone = self._missing_on_disk(merged)
                 merged = {name: row for name, row in merged.items() if name not in gone}
                 merged |= _by_recording(rows)
-                header = ListRow(self._id or before[1] or uuid.uuid4().hex)
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
                     _give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
-                write_durably(self._path, LIST.text([header, *merged.values()]))
+                write_durably(self._path, LIST.text(merged.values()))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._rows, self._id = before
+            self._rows = before
             raise
         self._max_lines = 2 * len(merged) + _SPARE_LINES
-        self._rows, self._id, self._stamp = merged, header.bag_dir_id, None
+        self._rows, self._stamp = merged, None
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:
@@ -574,8 +543,8 @@ class OwnRecordings:
 
 
 _NOT_CLAIMED: Final = (
-    "its recorder was killed before it listed the directory that it made, and the files there do "
-    "not contain the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
+    "its recorder was killed before it listed the directory that it made, and the heartbeat does "
+    "not name it; it is kept until `ros2-memory adopt` takes it"
 )
 _ADVICE: Final = (
     "nothing lists them as made here: after an upgrade from a version without recordings.jsonl, a "

@@ -62,7 +62,7 @@ class TestRetention:
     @pytest.mark.parametrize("behind_h", [169, 300])
     def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
         own = OwnRecordings(tmp_path)
-        own.claim(lambda _: {})
+        own.claim()
         made = []
         for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
             own.begin(name)
