@@ -30,7 +30,6 @@ from ros2_memory.bag_dir.state_files import (
     append_deleted,
     deleted_of,
 )
-from ros2_memory.bootstrap import claim
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.history.context import Call
 from ros2_memory.insights.status import memory_status
@@ -60,7 +59,7 @@ CLOCK: Final = SettableClock(T0 + 3600 * S)
 def world(root: Path) -> Path:
     """Three recordings of ours, of which the last is held back, one of others, all state files."""
     bags = ScreenedBags(root)
-    OwnRecordings(root).claim(lambda _: {})
+    OwnRecordings(root).claim()
     own = OwnRecordings(root)
     made = []
     for nth in range(3):
@@ -106,7 +105,7 @@ def deleted(root: Path) -> set[str]:
         keeps_foreign=True,
     )
     try:
-        claim(own)
+        own.claim()
     except RecorderError:
         return set()  # it does not start
     keeper.apply()

@@ -34,7 +34,7 @@ from tests.support.bags import McapLayout, odom, write_mcap
 from tests.support.clocks import SettableClock
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Iterator
     from pathlib import Path
 
     from ros2_memory.retention.collect import Outliving
@@ -176,7 +176,6 @@ def copied(source: Path, target: Path) -> Path:
 
 
 S = 10**9
-OURS = {"recorded_by": "ros2-memory"}
 
 
 def own_all(bag_dir: Path) -> OwnRecordings:
@@ -193,22 +192,17 @@ def lines(bag_dir: Path) -> list[dict[str, Any]]:
     return [{key: value for key, value in row.items() if key != "crc32"} for row in rows]
 
 
-def embedding(
-    path: Path, custom: Mapping[str, str] | None, *, start: int = 1_790_000_000 * S, size: int = 20
-) -> Path:
+def embedding(path: Path, *, start: int = 1_790_000_000 * S, size: int = 20) -> Path:
     """A split as rosbag2 writes it since Iron: its metadata right behind the header."""
-    listed = "\n".join(f"  {key}: {value}" for key, value in (custom or {}).items())
-    said = f"custom_data:\n{listed}" if custom else "custom_data: ~"
     text = (
         "version: 9\nstorage_identifier: mcap\nrelative_file_paths:\n"
-        f"  - {path.name}\n{said}\nros_distro: jazzy\n"
+        f"  - {path.name}\ncustom_data: ~\nros_distro: jazzy\n"
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as stream:
         writer = Writer(stream, chunk_size=400)
         writer.start("ros2", "libmcap 1.3.0")
-        if custom is not None:
-            writer.add_metadata("rosbag2", {"serialized_metadata": text})
+        writer.add_metadata("rosbag2", {"serialized_metadata": text})
         schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data\n")
         channel = writer.register_channel("/chatter", "cdr", schema, {})
         for number in range(size):

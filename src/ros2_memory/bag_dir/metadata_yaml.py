@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 _MAX_BYTES: Final = 64 << 20
 _STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
-_PLAIN: Final = frozenset(_STORAGES.values())
 _ROOT: Final = "rosbag2_bagfile_information"
 # Patterns, not YAML: parsing the list of a day of splits takes 0.8 s (8640 files).
 _BAG_NAME: Final = re.compile(r"[ \t]*(?:- )?(?:- |path:)[ \t]*['\"]?([^'\"\r\n]+?)['\"]?\s*$")
@@ -117,7 +116,7 @@ class Contents(NamedTuple):
 
 
 def correct(recording: Path, reader: BagReader) -> bool:
-    """Corrects metadata.yaml by the content of the recording's files, all `.mcap` or all `.db3`.
+    """Corrects metadata.yaml by the content of the recording's files, all of one kind.
 
     If it is absent or empty, it is created if the files are named as rosbag2 names them.
 
@@ -130,7 +129,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
         ValueError: a file is incomplete, or metadata.yaml is of an unknown form; it is unchanged.
     """
     path = recording / METADATA_FILE
-    files = _plain_bags(recording)
+    files = _bags(recording)
     text = ""
     with suppress(FileNotFoundError):
         text = read_small_file(path)
@@ -164,12 +163,12 @@ def is_named_by_rosbag2(recording: Path) -> bool:
         path.suffix == ".mcap"
         and path.stem.startswith(prefix)
         and path.stem.removeprefix(prefix).isdecimal()
-        for path in _plain_bags(recording)
+        for path in _bags(recording)
     )
 
 
-def _plain_bags(recording: Path) -> list[Path]:
-    return [path for path in recording.iterdir() if bag_kind(path.name) in _PLAIN]
+def _bags(recording: Path) -> list[Path]:
+    return [path for path in recording.iterdir() if bag_kind(path.name)]
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
@@ -185,10 +184,10 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
     info = _information(content)
-    kind = _STORAGES.get(str(info.get("storage_identifier")))
-    if info.get("compression_mode") == "FILE" or any(bag_kind(name) != kind for name in files):
-        kinds = sorted({"MCAP" if bag_kind(name) == ".mcap" else "SQLite" for name in files})
-        raise ValueError(f"it is not of plain {' and '.join(kinds)} files")
+    kind = _STORAGES.get(str(info.get("storage_identifier")), "")
+    kind += COMPRESSED if info.get("compression_mode") == "FILE" else ""
+    if any(bag_kind(name) != kind for name in files):
+        raise ValueError("the files are not of the storage and compression that it states")
     version = integer(info, "version")
     if version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which lists no messages of files")
@@ -214,7 +213,7 @@ def _set_files(info: dict[object, object], files: Mapping[str, Contents]) -> Non
     last = max((end for _, end in spans.values()), default=first)
     order = sorted(files, key=lambda name: (spans.get(name, (last, last)), name))
     info.update(_span(first, last))
-    info["relative_file_paths"] = [paths.get(name, name) for name in order]
+    info["relative_file_paths"] = [paths.get(bare_name(name), name) for name in order]
     info["files"] = [
         {
             "path": name,
@@ -298,69 +297,6 @@ def _qos(channel: Channel) -> str:
     return dict(channel.metadata).get("offered_qos_profiles", "")
 
 
-def take_out(recording: Path, gone: Mapping[str, Counts]) -> bool:
-    """Removes deleted files from metadata.yaml; does nothing where there is no metadata.yaml.
-
-    `gone` has the number of messages by topic of each deleted file, by its name.
-
-    Returns:
-        Whether it was written.
-
-    Raises:
-        OSError: it cannot be read or written; the old one remains.
-        ValueError: it is of an unknown form, or contradicts `gone`; it is unchanged.
-    """
-    path = recording / METADATA_FILE
-    try:
-        text = read_small_file(path)
-    except FileNotFoundError:
-        return False
-    written = without(text, gone)
-    if written is None:
-        return False
-    write_durably(path, written)
-    return True
-
-
-def without(text: str, gone: Mapping[str, Counts]) -> str | None:
-    """Returns the text of a metadata.yaml without these files; None where it lists none of them.
-
-    Raises:
-        ValueError: it is no metadata.yaml of a known form, nothing would be left of it, or its
-            numbers are not those of the files.
-    """
-    content = _parse(text)
-    info = _information(content)
-    names = {bare_name(name): counts for name, counts in gone.items()}
-    files = _mappings(info, "files")
-    paths = _list(info, "relative_file_paths")
-    deleted = [file for file in files if bare_name(file.get("path")) in names]
-    left = [file for file in files if bare_name(file.get("path")) not in names]
-    left_paths = [path for path in paths if bare_name(path) not in names]
-    if len(left_paths) == len(paths) and not deleted:
-        return None
-    if not left or len(left) != len(left_paths):
-        raise ValueError("it does not list the files that are left")
-    lost = Counter[str]()
-    is_equal = True
-    for file in deleted:
-        counts = names[bare_name(file.get("path"))]
-        is_equal &= sum(counts.values()) == integer(file, "message_count")
-        lost.update(counts)
-    topics = _mappings(info, "topics_with_message_count")
-    for topic in topics:
-        name = _described(topic).get("name")
-        topic["message_count"] = integer(topic, "message_count") - lost.pop(str(name), 0)
-    total = sum(integer(file, "message_count") for file in left)
-    if not is_equal or lost or total != sum(integer(topic, "message_count") for topic in topics):
-        raise ValueError("its numbers are not those of the files")
-    spans = [_span_of(file) for file in left]
-    info["message_count"] = total
-    info.update(_span(min(start for start, _ in spans), max(end for _, end in spans)))
-    info["relative_file_paths"], info["files"] = left_paths, left
-    return _dumped(content)
-
-
 def recounted(text: str, left: Mapping[str, Counts]) -> str:
     """Returns the text of a metadata.yaml, as rosbag2 embeds it in a file, with other counts.
 
@@ -406,13 +342,6 @@ def _span(start: int, end: int) -> dict[str, object]:
         "starting_time": {"nanoseconds_since_epoch": start},
         "duration": {"nanoseconds": end - start},
     }
-
-
-def _span_of(file: dict[object, object]) -> tuple[int, int]:
-    start = _mapping(file.get("starting_time"), "starting_time")
-    duration = _mapping(file.get("duration"), "duration")
-    first = integer(start, "nanoseconds_since_epoch")
-    return first, first + integer(duration, "nanoseconds")
 
 
 def _parse(text: str) -> object:

@@ -2,12 +2,10 @@
 
 Only those are ever deleted. The file has one JSON object a line:
 
-    {"bag_dir_id": "5f0c..."}                                       random, of this bag directory
     {"recording": "rec_A"}                                          before its child is started
-    {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
-    {"recording": "rec_A", "inode": 7, ..., "splits": 60, "ended": true}
+    {"recording": "rec_A", "inode": 7, "generation": 9}             the directory that it has made
     {"recording": "old/run1", "inode": 8, "adopted": true, "bags": ["x.db3"]}   `ros2-memory adopt`
-    {"recording": "moments/m/rec_A", ..., "adopted": true, "splits": 0, "bags": ["rec_A_7.mcap"]}
+    {"recording": "moments/m/rec_A", ..., "adopted": true, "bags": ["rec_A_7.mcap"]}
 
 The last line of a recording counts. A directory is the recorder's own while it lies under its name
 and is the very directory that was listed (see `directories.Identity`). A bag in it is the
@@ -25,14 +23,13 @@ import os
 import stat
 import threading
 import time
-import uuid
 from bisect import bisect_left
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Final
 
-from pydantic import AfterValidator, Field, StrictBool
+from pydantic import AfterValidator, StrictBool
 
 from ros2_memory.bag_dir.durable_write import (
     append_lines,
@@ -41,14 +38,13 @@ from ros2_memory.bag_dir.durable_write import (
     write_durably,
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
+from ros2_memory.bag_dir.json_files import Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
     LIST_FILE,
     LOST_AND_FOUND,
     bag_kind,
     has_own_name,
     is_kept_apart,
-    split_name,
     split_number,
 )
 from ros2_memory.core.directories import (
@@ -66,22 +62,11 @@ if TYPE_CHECKING:
     from collections.abc import (
         Callable,
         Collection,
-        Container,
         Iterable,
         Iterator,
         Mapping,
         Sequence,
     )
-
-    CustomDataOf: TypeAlias = Callable[[Path], Mapping[str, str] | None]
-    """Returns what `ros2 bag record` embedded in a bag file; None where that is unreadable.
-
-    May raise OSError.
-    """
-
-RECORDED_BY: Final = "recorded_by"
-BAG_DIR_ID: Final = "bag_dir_id"
-PROGRAM: Final = "ros2-memory"
 
 _SPARE_LINES: Final = 1000
 _MAX_NAMED: Final = 5
@@ -100,43 +85,29 @@ def _checked_name(name: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ListRow:
-    """One line of the list: the id of the bag directory, or a recording.
+    """One line of the list: a recording.
 
-    `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
-    and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
-    directory, sorted; None: all that lie there. Directories of saved moments and of carried
-    messages are listed like adopted ones.
+    `bags`: those of an adopted directory that are not named as its splits, sorted. Directories of
+    saved moments and of carried messages are listed like adopted ones, with all bags.
     """
 
-    bag_dir_id: Annotated[str, Field(pattern=r"^[0-9a-f]{8,64}$")] = ""
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
     inode: Int64 | None = None
     generation: Int64 | None = None
     adopted: StrictBool = False
-    bags: tuple[str, ...] | None = None
-    splits: Count | None = None
-    ended: StrictBool = False
+    bags: tuple[str, ...] = ()
 
     def holds(self, file: str) -> bool:
         """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
-        if self.adopted and self.bags is None:
-            return True
-        name, bags = file.removesuffix(COMPRESSED), self.bags or ()
-        place, number = bisect_left(bags, name), split_number(self.recording, name)
-        is_split = number is not None and (self.splits is None or number < self.splits)
-        return is_split or bags[place : place + 1] == (name,)
+        name = file.removesuffix(COMPRESSED)
+        place, number = bisect_left(self.bags, name), split_number(self.recording, name)
+        is_split = number is not None and not is_kept_apart(self.recording)
+        return is_split or self.bags[place : place + 1] == (name,)
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
         others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
-        return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
-
-    def counted(self, files: Container[str]) -> int:
-        """Returns how many splits the recording has, where these files were seen."""
-        splits = self.splits or 0
-        while split_name(self.recording, splits) in files:
-            splits += 1
-        return splits
+        return replace(self, adopted=True, bags=(*sorted({*others, *self.bags}),))
 
     @property
     def identity(self) -> Identity | None:
@@ -167,7 +138,6 @@ class OwnRecordings:
         self._bag_dir = bag_dir
         self._path = bag_dir / LIST_FILE
         self._lock = threading.RLock()
-        self._id = ""
         self._rows: dict[str, ListRow] = {}
         self._lines = 0
         self._stamp: tuple[int, ...] | None = None
@@ -266,22 +236,17 @@ class OwnRecordings:
         """A value that changes when the list is read again."""
         return self._stamp
 
-    @property
-    def bag_dir_id(self) -> str | None:
-        """The random id of this bag directory, which recordings carry; None before there is one."""
-        return self._id or None
-
     # What follows is for the recorder, which holds the lock of the bag directory, and for
     # `ros2-memory adopt`.
 
-    def claim(self, custom_data: CustomDataOf) -> None:
+    def claim(self) -> None:
         """Brings the list up to date before anything is recorded.
 
         Without a list it makes one, and names what looks like recordings: nothing shows whether
         they were restored or copied. Else it drops entries of recordings that have gone, completes
-        those that a kill left without a directory (see `_find_completed`), and counts the splits
-        of those that a kill ended. What cannot be written is known all the same, so that space can
-        be freed on a full disk; the next recording writes it.
+        those that a kill left without a directory (see `_find_completed`). What cannot be written
+        is known all the same, so that space can be freed on a full disk; the next recording writes
+        it.
 
         Raises:
             RecorderError: the list cannot be read, or the bag directory cannot be listed.
@@ -295,9 +260,8 @@ class OwnRecordings:
                 )
             except OSError as error:
                 raise self._failure(error, "read") from error
-            rows = self._find_completed(custom_data)
+            rows = self._find_completed()
             self._add(rows)
-            rows += self._find_ended()
             if left:
                 names, count = left[:_MAX_NAMED], len(left)
                 _log.warning(
@@ -306,7 +270,7 @@ class OwnRecordings:
             for name, row in self._rows.items():
                 if row.identity is None and (self._bag_dir / name).is_dir():
                     _log.warning("recording_not_claimed", recording=name, reason=_NOT_CLAIMED)
-            if exists and self._id and not (rows or self._missing_on_disk(self._rows)):
+            if exists and not (rows or self._missing_on_disk(self._rows)):
                 return
             try:
                 self._rewrite(rows)
@@ -334,30 +298,8 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._append([ListRow("", name, *identity, splits=0)])
+        self._append([ListRow(name, *identity)])
         return True
-
-    def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
-        """Notes which splits the child of a recording has made, of the files that were seen.
-
-        Raises:
-            RecorderError: it cannot be written. It is known all the same, so that space can be
-                freed on a full disk, and is written with the next split.
-        """
-        with self._lock:
-            row = self._rows.get(name)
-            if row is None or row.identity is None or row.splits is None:
-                return
-            noted = replace(row, splits=row.counted(files), ended=ended)
-            try:
-                if noted == row and self._read_if_changed():
-                    return
-                self._append([noted])
-            except OSError as error:
-                raise self._failure(error) from error
-            except RecorderError:
-                self._remember_unwritten([noted])
-                raise
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
         """Lists directories with the bags in them, as the recorder's own from now on.
@@ -379,8 +321,7 @@ class OwnRecordings:
         row = self._rows.get(name)
         if row is not None and row.lists(identity):
             return row
-        row = ListRow("", name, *identity)
-        return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
+        return ListRow(name, *identity)
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
         """Lists bags that the recorder puts into a directory of a moment or of carried messages.
@@ -413,39 +354,19 @@ class OwnRecordings:
         # A new dictionary: another thread may iterate over this one.
         self._rows = self._rows | _by_recording(rows)
 
-    def _find_completed(self, custom_data: CustomDataOf) -> list[ListRow]:
+    def _find_completed(self) -> list[ListRow]:
         """Returns the entries without a directory whose directory our child made after all.
 
-        Every file there that holds a byte carries what our child embeds, with the id of this bag
-        directory; or, as with distributions that embed nothing, no file carries anything, and the
-        heartbeat names the recording.
+        Those that the last heartbeat names: it named them before the child was started.
         """
-        ours = {RECORDED_BY: PROGRAM, BAG_DIR_ID: self.bag_dir_id}
-        named = read_heartbeat(self._bag_dir).recordings
         completed: list[ListRow] = []
-        for name, row in self._rows.items():
-            if row.identity is not None:
-                continue
-            with suppress(OSError):
-                identity = identity_of(self._bag_dir / name)
-                if identity is None:
-                    continue
-                files = [path for path in bags_in(self._bag_dir / name) if path.stat().st_size]
-                embedded = [custom_data(path) or {} for path in files]
-                is_ours = all(ours.items() <= data.items() for data in embedded)
-                if embedded and (is_ours or (name in named and not any(embedded))):
-                    completed.append(ListRow("", name, *identity, splits=0))
-        return completed
-
-    def _find_ended(self) -> list[ListRow]:
-        """Returns the recordings that a kill ended, with the splits that they have."""
-        ended: list[ListRow] = []
-        for name, row in self._rows.items():
-            if row.identity is not None and row.splits is not None and not row.ended:
+        for name in read_heartbeat(self._bag_dir).recordings:
+            row = self._rows.get(name)
+            if row is not None and row.identity is None:
                 with suppress(OSError):
-                    files = {path.name for path in bags_in(self._bag_dir / name)}
-                    ended.append(replace(row, splits=row.counted(files), ended=True))
-        return ended
+                    if identity := identity_of(self._bag_dir / name):
+                        completed.append(ListRow(name, *identity))
+        return completed
 
     def _missing_on_disk(self, names: Iterable[str]) -> list[str]:
         """Returns the recordings that are no longer in the bag directory."""
@@ -479,11 +400,10 @@ class OwnRecordings:
             return False
         except ValueError as error:
             raise OSError(f"{self._path}: {error}") from error
-        rows = [line.row or ListRow() for line in lines]
-        listed = _by_recording(row for row in rows if row.recording and not row.bag_dir_id)
+        rows = [line.row for line in lines if line.row is not None]
+        listed = _by_recording(row for row in rows if row.recording)
         self._rows, self._lines, self._stamp = listed | self._unwritten, len(lines), stamp
-        self._id = next((row.bag_dir_id for row in rows[::-1] if row.bag_dir_id), "")
-        damaged = sum(not (row.bag_dir_id or row.recording) for row in rows)
+        damaged = len(lines) - len(rows)
         if damaged > self._reported_damaged:
             self._reported_damaged = damaged
             _log.warning("recordings_list_damaged", path=str(self._path), lines=damaged)
@@ -495,7 +415,7 @@ class OwnRecordings:
         try:
             with self._lock:
                 exists = self._read_if_changed()
-                if not exists or self._lines > self._max_lines or not self._id:
+                if not exists or self._lines > self._max_lines:
                     self._rewrite(rows)
                 else:
                     with self._locked() as descriptor:
@@ -509,7 +429,7 @@ class OwnRecordings:
 
     def _rewrite(self, rows: Iterable[ListRow] = ()) -> None:
         """Writes the list again with these entries, and without recordings that have gone."""
-        before = self._rows, self._id
+        before = self._rows
         try:
             with self._locked() as descriptor:
                 if descriptor is not None:
@@ -517,27 +437,26 @@ class OwnRecordings:
                     self._stamp = None
                     self._read_if_changed()
                 # What was known and what is listed now, but for what has no directory yet.
-                merged = before[0] | {
+                merged = before | {
                     name: row
                     for name, row in self._rows.items()
-                    if row.identity or name not in before[0]
+                    if row.identity or name not in before
                 }
                 gone = self._missing_on_disk(merged)
                 merged = {name: row for name, row in merged.items() if name not in gone}
                 merged |= _by_recording(rows)
-                header = ListRow(self._id or before[1] or uuid.uuid4().hex)
                 folder = self._path.parent
                 if not folder.is_dir():
                     folder.mkdir(exist_ok=True)
                     _give_to_owner(folder, self._bag_dir)
                     flush(folder.parent)
-                write_durably(self._path, LIST.text([header, *merged.values()]))
+                write_durably(self._path, LIST.text(merged.values()))
                 _give_to_owner(self._path, self._bag_dir)
         except OSError:
-            self._rows, self._id = before
+            self._rows = before
             raise
         self._max_lines = 2 * len(merged) + _SPARE_LINES
-        self._rows, self._id, self._stamp = merged, header.bag_dir_id, None
+        self._rows, self._stamp = merged, None
 
     @contextmanager
     def _locked(self) -> Iterator[int | None]:
@@ -574,8 +493,8 @@ class OwnRecordings:
 
 
 _NOT_CLAIMED: Final = (
-    "its recorder was killed before it listed the directory that it made, and the files there do "
-    "not contain the id of this bag directory; it is kept until `ros2-memory adopt` takes it"
+    "its recorder was killed before it listed the directory that it made, and the heartbeat does "
+    "not name it; it is kept until `ros2-memory adopt` takes it"
 )
 _ADVICE: Final = (
     "nothing lists them as made here: after an upgrade from a version without recordings.jsonl, a "

@@ -21,7 +21,6 @@ from ros2_memory.cli.output import (
     stdout_console,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
@@ -311,20 +310,16 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 
 def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
-    own_recordings = None  # where it cannot be known which this program made
-    with suppress(OSError, RecorderError):
-        own_recordings = OwnRecordings(root)
+    own = OwnRecordings(root)
     left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
     for path, bags in sorted(
         recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
     ):
         inside = [left.pop(file) for file in [*left] if file.startswith(f"{path}/")]
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
-        whose = None if own_recordings is None else _OTHERS
-        if Path(path).is_relative_to(root / MOMENTS_FOLDER):
-            whose = "saved moment"
-        elif own_recordings is not None and own_recordings.owns_bag(bags[0].path):
-            whose = "this recorder"
+        whose = "saved moment" if Path(path).is_relative_to(root / MOMENTS_FOLDER) else None
+        with suppress(OSError):  # where the list cannot be read, nobody knows
+            whose = whose or ("this recorder" if own.owns_bag(bags[0].path) else _OTHERS)
         is_open = any(bag.state is BagState.ACTIVE for bag in bags)
         row: JsonObject = {
             "recording": name_of(path, bags, str(root)),

@@ -1,31 +1,26 @@
 """`ros2-memory plot`: pictures of what is recorded, by the same queries as the tools.
 
-Times are Unix seconds. No window is opened, and nothing is written but the picture and matplotlib's
-list of fonts.
+Times are Unix seconds. No window is opened, and nothing is written but the picture and what
+matplotlib keeps in its own folders, its list of fonts.
 """
 
-import atexit
 import logging
 import math
-import os
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
 from importlib.util import find_spec
 from itertools import chain
 from pathlib import Path
-from shutil import rmtree
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from ros2_memory import PACKAGE
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
 from ros2_memory.cli.output import (
@@ -282,8 +277,7 @@ def _picture(out: Path, title: str, subtitle: str, size: Seconds) -> Iterator["F
     Raises:
         OSError: it cannot be written.
     """
-    os.environ.setdefault("MPLCONFIGDIR", _font_folder())
-    # It warns of fonts, and of its own limits.
+    # It warns of fonts, of its own limits, and where it finds no place for its list of fonts.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
     from matplotlib import rc_context  # noqa: PLC0415 - an extra that few install
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -296,19 +290,6 @@ def _picture(out: Path, title: str, subtitle: str, size: Seconds) -> Iterator["F
         metadata = {"Date": None} if out.suffix.lower() == ".svg" else None
         with made_whole(out) as temporary:
             figure.savefig(temporary, format=out.suffix[1:].lower(), dpi=130, metadata=metadata)
-
-
-def _font_folder() -> str:
-    """Returns where matplotlib keeps its list of fonts: the cache folder, or a temporary one."""
-    given = os.environ.get("XDG_CACHE_HOME")
-    with suppress(OSError, RuntimeError):
-        folder = (Path(given) if given else Path.home() / ".cache") / PACKAGE / "matplotlib"
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return str(folder)
-    temporary = mkdtemp(prefix="ros2-memory-")
-    atexit.register(rmtree, temporary, ignore_errors=True)
-    return temporary
 
 
 def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> None:

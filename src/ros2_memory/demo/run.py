@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import http.client
 import json
 import os
 import re
@@ -31,8 +30,7 @@ from ros2_memory.demo.messages import MessageSchedule
 from ros2_memory.demo.questions import QUESTIONS, CallContext, Exchange, Question, judge_reply
 from ros2_memory.demo.recording import DemoRecorder
 from ros2_memory.demo.robot import LAP_S, ROOMS
-from ros2_memory.recorder.process.child import LAUNCHER
-from ros2_memory.serving.health import read_health
+from ros2_memory.recorder.process.child import Child, end_all
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -113,13 +111,12 @@ def _reply(text: str) -> Iterator[str]:
 
 
 HOST: Final = "127.0.0.1"
-LOG_NAME: Final = "server.log"
 PLACES_NAME: Final = "places.yaml"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
 _UP_WITHIN_S: Final = 300.0
 """As long as it may take on a machine with much else to do; one that fails ends at once."""
 _SAID_AFTER_S: Final = 5.0
-_DOWN_WITHIN_S: Final = 5.0
+_LOOKED_AT_S: Final = 0.5
 _LOG_LINES_SHOWN: Final = 8
 _ANOTHER_PORT: Final = "choose another with --port, or --port 0 for any"
 
@@ -164,86 +161,51 @@ def server_environment(
 @contextmanager
 def running_server(
     bag_dir: Path, port: int, say: Callable[[str], object], *, verbose: bool = False
-) -> Iterator[subprocess.Popen[bytes]]:
+) -> Iterator[Child]:
     """Yields a server that answers, and ends it after the block; says what it waits for.
 
-    Its log goes to `server.log` in the bag directory, or to stderr where `verbose`; its columns
-    into a folder that is removed at the end: no one else uses it. The rooms of the flat are written
-    to `places.yaml` in the bag directory.
+    Its log goes to stderr where `verbose`; its columns into a folder that is removed at the end: no
+    one else uses it. The rooms of the flat are written to `places.yaml` in the bag directory. It
+    ends with this program, also where that is killed.
 
     Raises:
-        ConfigError: another server answers on the port.
         EpisodicError: it did not come up; the sentence ends with the last lines of its log.
     """
-    log_path = bag_dir / LOG_NAME
     places = {
         name: {"x": [from_x, to_x], "y": [from_y, to_y]}
         for name, (from_x, to_x, from_y, to_y) in ROOMS.items()
     }
     (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
-        # It ends with this program, also where that is killed.
-        launcher = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid())]
-        with log_path.open("wb") as log:
-            output = None if verbose else log
-            process = subprocess.Popen(  # noqa: S603 - an argv list, and never a shell
-                [*launcher, sys.executable, "-m", "ros2_memory.server"],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=output,
-                cwd=bag_dir,
-                env=server_environment(os.environ, bag_dir, port, cache),
-                # A Ctrl-C reaches the whole process group of a terminal; the order in which things
-                # end is ours to choose.
-                process_group=0,
-            )
+        server = Child.start(
+            [sys.executable, "-m", "ros2_memory.server", "--page", "print"],
+            server_environment(os.environ, bag_dir, port, cache),
+            stderr=None if verbose else subprocess.STDOUT,
+        )
         try:
-            _wait_until_up(process, port, log_path, say)
-            yield process
+            _wait_until_up(server, f"http://{HOST}:{port}/", say)
+            yield server
         finally:
-            process.terminate()
-            try:
-                process.wait(_DOWN_WITHIN_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+            end_all([server])
 
 
-def _wait_until_up(
-    process: subprocess.Popen[bytes], port: int, log_path: Path, say: Callable[[str], object]
-) -> None:
-    begun, said = time.monotonic(), False
-    while (answering := _answering(port)) != process.pid:
-        if answering is not None:
-            raise ConfigError(f"port {port} on {HOST} is in use by another server; {_ANOTHER_PORT}")
-        waited_s, failed = time.monotonic() - begun, ""
-        if (code := process.poll()) is not None:
-            failed = f"the server ended with exit code {code}"
+def _wait_until_up(server: Child, address: str, say: Callable[[str], object]) -> None:
+    """Waits until a server has printed its address."""
+    begun, said, lines = time.monotonic(), False, list[str]()
+    while not any(address in line for line in lines):
+        status, waited_s, failed = server.exit_status(), time.monotonic() - begun, ""
+        lines += server.take_lines()
+        if status is not None:
+            failed = f"the server ended with exit code {status}"
         elif waited_s > _UP_WITHIN_S:
-            failed = f"the server did not answer on port {port} within {_UP_WITHIN_S:g} s"
+            failed = f"the server did not answer at {address} within {_UP_WITHIN_S:g} s"
         if failed:
-            log = log_path.read_text(errors="replace").splitlines()[-_LOG_LINES_SHOWN:]
-            words = [": its last words are", *log] if log else []
+            words = [": its last words are", *lines[-_LOG_LINES_SHOWN:]] if lines else []
             raise EpisodicError("\n  ".join([failed, *words]))
         if waited_s > _SAID_AFTER_S and not said:
             said = True
-            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer on port {port}")
+            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer at {address}")
         time.sleep(0.05)
-
-
-def _answering(port: int) -> int | None:
-    """Returns the process id that the server on a port reports, 0 if it reports none.
-
-    Returns None if no server answers.
-    """
-    try:
-        _, report = read_health(HOST, port)
-    except (OSError, http.client.HTTPException):
-        return None
-    except ValueError:
-        return 0
-    pid = report.get("pid")
-    return pid if isinstance(pid, int) else 0
 
 
 SPLIT_DURATION_S: Final = 5.0
@@ -376,7 +338,7 @@ async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Ex
     return judge_reply(question, reply, call, is_error=result.is_error)
 
 
-def _wait(server: subprocess.Popen[bytes], recorder: DemoRecorder) -> None:
+def _wait(server: Child, recorder: DemoRecorder) -> None:
     """Waits until it is interrupted.
 
     Raises:
@@ -384,11 +346,9 @@ def _wait(server: subprocess.Popen[bytes], recorder: DemoRecorder) -> None:
     """
     try:
         while recorder.failure is None:
-            try:
-                code = server.wait(timeout=1.0)
-            except subprocess.TimeoutExpired:
-                continue
-            raise EpisodicError(f"the server ended by itself, with exit code {code}")
+            if (status := server.exit_status()) is not None:
+                raise EpisodicError(f"the server ended by itself, with exit code {status}")
+            time.sleep(_LOOKED_AT_S)
     except KeyboardInterrupt:
         return
     raise EpisodicError(f"the recording ended: {recorder.failure}")

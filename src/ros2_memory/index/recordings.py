@@ -12,27 +12,23 @@ each message counts once, and there is nothing to report.
 from __future__ import annotations
 
 import re
-import threading
-from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
-from weakref import WeakKeyDictionary
 
 from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, is_thinned
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.segment import Segment, folder_of
+from ros2_memory.index.segment import folder_of
 from ros2_memory.index.split_order import split_of, stem_of
-from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from ros2_memory.core.model import BagFile, SetAside
+    from ros2_memory.core.model import BagFile
     from ros2_memory.index.snapshot import Snapshot
 
 _OF_NAME: Final = rf"(?:/.*|(?:_\d+)?(?:{'|'.join(map(re.escape, BAG_KINDS))}))?"
@@ -58,57 +54,6 @@ def paths_named(root: str, name: str) -> re.Pattern[str]:
             and its like).
     """
     return re.compile(re.escape(f"{root.rstrip('/')}/{name.strip('/')}") + _OF_NAME)
-
-
-class RecordingFilter:
-    """Narrows snapshots of a bag directory to one recording, as `data.recording` does. Thread-safe.
-
-    The bags of an unchanged segment are not looked at again.
-    """
-
-    def __init__(self, bag_dir: Path, name: str) -> None:
-        self._is_named = paths_named(str(bag_dir), name).fullmatch
-        self._lock = threading.Lock()
-        self._bags_by_segment: WeakKeyDictionary[Segment, list[BagFile]] = WeakKeyDictionary()
-        self._whole: Timeline | None = None
-        self._narrowed = Timeline()
-
-    def narrowed(self, snapshot: Snapshot) -> Snapshot:
-        """Returns the part of a snapshot that is of the recording; it may be empty."""
-        timeline = self._narrowed_timeline(snapshot.timeline)
-        return replace(
-            snapshot,
-            timeline=timeline,
-            active=self._named(snapshot.active),
-            damaged=self._named(snapshot.damaged),
-            unread=self._named(snapshot.unread),
-            empty=tuple(path for path in snapshot.empty if self._is_named(str(path))),
-            silent_topics=timeline.silent - timeline.types.keys(),
-            metadata_folders=tuple(filter(self._is_named, snapshot.metadata_folders)),
-        )
-
-    def _named(self, asides: tuple[SetAside, ...]) -> tuple[SetAside, ...]:
-        return tuple(aside for aside in asides if self._is_named(str(aside.path)))
-
-    def _narrowed_timeline(self, whole: Timeline) -> Timeline:
-        with self._lock:
-            if whole is not self._whole:
-                before = {bag.file: bag for bag in self._narrowed.bags}
-                after = {
-                    bag.file: bag for segment in whole.segments for bag in self._bags_in(segment)
-                }
-                removed = [bag for file, bag in before.items() if after.get(file) is not bag]
-                added = [bag for file, bag in after.items() if before.get(file) is not bag]
-                self._narrowed = self._narrowed.changed(removed, added)
-                self._whole = whole
-            return self._narrowed
-
-    def _bags_in(self, segment: Segment) -> list[BagFile]:
-        if segment not in self._bags_by_segment:
-            self._bags_by_segment[segment] = [
-                bag for bag in segment.bags if self._is_named(bag.file)
-            ]
-        return self._bags_by_segment[segment]
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:

@@ -20,7 +20,6 @@ from ros2_memory.bootstrap import (
     build_housekeeper,
     build_reader,
     build_recorder,
-    claim,
     exclusions_of,
 )
 from ros2_memory.config import (
@@ -128,7 +127,7 @@ def _record(settings: Settings) -> None:
             },
         )
         recorder.check()
-        claim(own)
+        own.claim()
         if clear:
             _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
         try:

@@ -11,6 +11,7 @@ import gc
 import threading
 import time
 from contextlib import contextmanager, nullcontext
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -128,6 +129,17 @@ class IndexManager:
         """
         with self._lock:
             yield self._scan(patrolling=patrolling)
+
+    def alone(self, recording: str) -> IndexManager:
+        """Returns the index of one recording; it reads no bag that this one has read."""
+        alone = copy(self)
+        alone._lock, alone.published = threading.Lock(), None
+        alone._new_table = partial(self._new_table, known=self._bags, only=recording)
+        alone._table = alone._new_table()
+        return alone
+
+    def _bags(self) -> dict[str, BagFile]:
+        return {bag.file: bag for bag in self.snapshot().bags}
 
     def known_bags(self, named: Collection[str], snapshot: Snapshot) -> KnownBags:
         """Returns what retention considers, within `undisturbed`, which gave the snapshot.

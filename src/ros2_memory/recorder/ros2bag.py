@@ -194,7 +194,6 @@ class Ros2BagRecorder(Recorder):
             min_free_bytes=self._orders.min_free_bytes // 2,
             use_sim_time=self._orders.simulated,
             repeat_latched=self._repeat_latched,
-            bag_dir_id=self._orders.own.bag_dir_id,
             known_options=self._ros.options,
         )
         return Child.start(argv, self._ros.env, keep_open=self._keep_open)

@@ -2,8 +2,8 @@
 
 `recording.clear_on_startup` is for simulation and tests, so moments go too. Bags of other programs
 stay, unless retention deletes those as well (`retention.foreign`). Only files that are known by
-name are deleted, and a directory when that leaves it empty. Links are not followed, and another
-file system that is mounted below is left alone.
+name are deleted, and a directory when that leaves it empty. Links are not followed, and bags of
+another file system that is mounted below are left alone.
 """
 
 from __future__ import annotations
@@ -21,13 +21,12 @@ from ros2_memory.bag_dir.layout import (
     MOMENT_FILE,
     MOMENTS_FOLDER,
     OWN_FILES,
-    RECORDING_FILES,
     bag_kind,
 )
 from ros2_memory.core import directories
-from ros2_memory.core.directories import identity_at
+from ros2_memory.core.directories import known_identity
 from ros2_memory.core.errors import RecorderError
-from ros2_memory.retention.delete import is_journal
+from ros2_memory.retention.delete import is_journal, remove_bag, remove_emptied
 
 if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -37,7 +36,7 @@ MOST_FAULTS: Final = 100
 
 @dataclass(slots=True)
 class Cleared:
-    """What was deleted, and a sentence for each of the first things that could not be.
+    """How many bags were deleted, and a sentence for each of the first that could not be.
 
     `more` counts the others that could not be.
     """
@@ -47,25 +46,24 @@ class Cleared:
     faults: list[str] = field(default_factory=list)
     more: int = 0
 
-    def add_fault(self, path: Path, error: OSError, verb: str = "deleted") -> None:
-        """Adds a sentence, or only counts it once there are `MOST_FAULTS`."""
-        if len(self.faults) < MOST_FAULTS:
-            self.faults.append(f"{path} cannot be {verb}: {error.strerror}")
-        else:
-            self.more += 1
-
-    def delete(self, path: Path, folder: int) -> None:
-        """Deletes a file; `folder` is its open directory."""
+    def delete(self, root: Path, bag: Path, device: int) -> None:
+        """Deletes a bag below the root, if it lies on this device."""
         try:
-            size = os.stat(path.name, dir_fd=folder, follow_symlinks=False).st_size
-            os.unlink(path.name, dir_fd=folder)
+            status = bag.lstat()
+            if status.st_dev == device:
+                self.bytes += remove_bag(root, bag, (device, status.st_ino))
+                self.files += 1
         except FileNotFoundError:
             return
         except OSError as error:
-            self.add_fault(path, error)
+            self.add_fault(bag, error)
+
+    def add_fault(self, path: Path, error: OSError) -> None:
+        """Adds a sentence, or only counts it once there are `MOST_FAULTS`."""
+        if len(self.faults) < MOST_FAULTS:
+            self.faults.append(f"{path} cannot be deleted: {error.strerror or error}")
         else:
-            self.files += 1
-            self.bytes += size
+            self.more += 1
 
 
 def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
@@ -80,34 +78,39 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
         if own is not None:
             own.names()
         device = root.stat().st_dev
-        os.listdir(root)  # noqa: PTH208 - only whether it can be
-    except FileNotFoundError:
-        return cleared
     except OSError as error:
-        cleared.add_fault(root, error, "listed")
+        cleared.add_fault(root, error)
         return cleared
-    # Names, not paths: a path may be longer than the system takes (PATH_MAX), and `opened` finds
-    # each directory again from the root, so that few files are open however deep it lies.
-    waiting: list[tuple[str, ...]] = [()]
-    emptied: list[Path] = []
-    while waiting:
-        parts = waiting.pop()
-        path = root.joinpath(*parts)
-        try:
-            with directories.opened(root, path) as folder:
-                if os.fstat(folder).st_dev != device:
-                    continue
-                had_bags, below = _clear_folder(folder, parts, path, own, cleared)
-        except FileNotFoundError:
+    moments, touched = root / MOMENTS_FOLDER, list[Path]()
+    for path, entries in directories.walk(root):
+        name = path[len(str(root)) + 1 :]
+        if "/." in f"/{name}":
             continue
-        except OSError as error:
-            cleared.add_fault(path, error)
-            continue
-        if parts and (had_bags or (parts[0] == MOMENTS_FOLDER and len(parts) <= 2)):
-            emptied.append(path)
-        waiting.extend((*parts, name) for name in below)
-    _remove_emptied(root, emptied, cleared)
+        folder, holds = Path(path), own.judge(name, known_identity(path)) if own else bool
+        bags = [
+            folder / entry.name
+            for entry in entries
+            if bag_kind(entry.name) and entry.is_file(follow_symlinks=False) and holds(entry.name)
+        ]
+        for bag in bags:
+            cleared.delete(root, bag, device)
+        if bags or moments in (folder, folder.parent):
+            touched.append(folder)
+    for folder in reversed(touched):  # the deepest first
+        with suppress(OSError):
+            if folder.parent == moments:
+                _delete_moment_file(root, folder)
+            remove_emptied(root, folder)
+    for name in OWN_FILES:
+        with suppress(OSError):
+            (root / name).unlink()
     return cleared
+
+
+def _delete_moment_file(root: Path, moment: Path) -> None:
+    with directories.opened(root, moment) as folder:
+        if os.listdir(folder) == [MOMENT_FILE]:  # noqa: PTH208 - a descriptor has no path
+            os.unlink(MOMENT_FILE, dir_fd=folder)
 
 
 def refuse_homes(bag_dir: Path) -> None:
@@ -145,49 +148,6 @@ def remove_if_empty(recording: Path) -> bool:
     except OSError:
         return False
     return True
-
-
-def _clear_folder(
-    folder: int, parts: tuple[str, ...], path: Path, own: OwnRecordings | None, cleared: Cleared
-) -> tuple[bool, list[str]]:
-    """Deletes the bags in an open directory, which has this path and these names below the root.
-
-    Returns whether there were any, and the directories in it that are not hidden.
-    """
-    bags, files, below = _names_in(folder)
-    going = bags
-    if own is not None:
-        holds = own.judge("/".join(parts), identity_at(folder))
-        # A journal goes with its bag.
-        going = {
-            name for name in bags if holds(name.rpartition("-")[0] if is_journal(name) else name)
-        }
-    beside = RECORDING_FILES if bags and going == bags else frozenset()
-    for name in going | files & (beside if parts else beside | OWN_FILES):
-        cleared.delete(path / name, folder)
-    return bool(bags), [name for name in below if not name.startswith(".")]
-
-
-def _remove_emptied(root: Path, emptied: list[Path], cleared: Cleared) -> None:
-    """Deletes directories that are empty, but for the file of a moment of which no bag is left."""
-    # The deepest first.
-    for path in reversed(emptied):
-        with suppress(OSError), directories.opened(root, path.parent) as above:
-            if path.parent == root / MOMENTS_FOLDER:
-                with directories.opened(root, path) as folder:
-                    bags, files, below = _names_in(folder)
-                    if MOMENT_FILE in files and not bags and not below:
-                        cleared.delete(path / MOMENT_FILE, folder)
-            os.rmdir(path.name, dir_fd=above)
-
-
-def _names_in(folder: int) -> tuple[set[str], set[str], list[str]]:
-    """Returns the names of bags and their journals, of files, and of directories in a directory."""
-    with os.scandir(folder) as listing:
-        entries = [*listing]
-    files = {entry.name for entry in entries if entry.is_file(follow_symlinks=False)}
-    below = [entry.name for entry in entries if entry.is_dir(follow_symlinks=False)]
-    return {name for name in files if bag_kind(name) or is_journal(name)}, files, below
 
 
 def _is_worthless(entry: os.DirEntry[str]) -> bool:

@@ -29,14 +29,12 @@ from ros2_memory.bag_dir.handover_file import (
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
-    METADATA_FILE,
     THINNED_FILE,
     bag_kind,
     is_carried,
     is_kept_apart,
     is_thinned,
 )
-from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.bag_dir.state_files import (
     ERASING,
     THINNED,
@@ -57,6 +55,7 @@ from ros2_memory.retention.delete import beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
     left_in,
+    metadata_corrected,
     open_files,
     opened_folder,
     reason_of,
@@ -66,7 +65,7 @@ from ros2_memory.retention.repair import (
 from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Mapping, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
@@ -234,7 +233,8 @@ class Eraser:
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
         files = [self._bag_dir / name for name in erasure.files]
-        notes = [*self._correct_metadata({path.parent for path in files})]
+        folders = {path.parent for path in files}
+        notes = [*metadata_corrected(self._bag_dir, folders, self._reader)]
         try:
             self._delete_left_over(files)
             self._forget_silences(erasure)
@@ -435,24 +435,6 @@ class Eraser:
 
             write_handover(folder, replace(handover, also_counts=also, counts_elsewhere=elsewhere))
             os.utime(target, ns=(before.st_atime_ns, before.st_mtime_ns))
-
-    def _correct_metadata(self, recordings: Collection[Path]) -> Iterator[str]:
-        """Corrects each recording's metadata.yaml by what is left; yields a line for each."""
-        for recording in sorted(recordings):
-            name = f"{self._relative(recording)}/{METADATA_FILE}"
-            if not (recording / METADATA_FILE).exists():
-                if recording.name in read_heartbeat(self._bag_dir).recordings:
-                    yield f"{name} will count deleted messages: the recorder writes it at the end"
-                continue
-            try:
-                with directories.opened(self._bag_dir, recording):
-                    if correct(recording, self._reader):
-                        yield f"{name} counts the remaining messages"
-            except (BagError, OSError, ValueError) as error:
-                yield (
-                    f"{name} still counts deleted messages ({error}); `ros2 bag reindex "
-                    f"{recording}` rewrites it"
-                )
 
     def _relative(self, path: Path) -> str:
         return os.path.relpath(path, self._bag_dir)

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import bag_kind
+from ros2_memory.bag_dir.heartbeat import read_heartbeat
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
 from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
@@ -24,7 +25,7 @@ from ros2_memory.retention.delete import beside
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterator, Mapping
 
     from ros2_memory.core.timebase import Ns
 
@@ -212,6 +213,33 @@ def left_in(
                 counts[topic.topic] += topic.count
             files[bare_name(path.name)] = counts - gone.get(path, Counter())
     return files
+
+
+def metadata_corrected(
+    bag_dir: Path, recordings: Collection[Path], reader: BagReader
+) -> Iterator[str]:
+    """Has each recording's metadata.yaml describe the bags that are left; yields a line for each.
+
+    Where a recorder is still to write it, that counts what has gone, too.
+    """
+    for recording in sorted(recordings):
+        listing = recording / METADATA_FILE
+        name = os.path.relpath(listing, bag_dir)
+        if not listing.exists():
+            if os.path.dirname(name) in read_heartbeat(bag_dir).recordings:  # noqa: PTH120
+                yield f"{name} will count what was deleted, too: the recorder writes it at the end"
+            continue
+        try:
+            with directories.opened(bag_dir, recording):
+                is_changed = correct(recording, reader)
+        except (BagError, OSError, ValueError) as error:
+            yield (
+                f"{name} still describes what was deleted ({error}); rosbag2 opens the folder "
+                f"after `ros2 bag reindex {recording}`"
+            )
+        else:
+            if is_changed:
+                yield f"{name} describes what is left"
 
 
 def open_files() -> frozenset[tuple[int, int]]:

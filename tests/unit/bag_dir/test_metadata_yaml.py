@@ -9,8 +9,10 @@ import pytest
 import yaml
 from rosbags.rosbag2 import Reader
 
-from ros2_memory.bag_dir.metadata_yaml import Listing, parse_listing, take_out, without
+from ros2_memory.bag_dir.metadata_yaml import Listing, correct, parse_listing
+from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.bags import text, write_mcap
 from tests.support.shared_bags import RECORDED, needs_recorded
 
 if TYPE_CHECKING:
@@ -47,13 +49,6 @@ def file(path: str, start: int, count: int) -> dict[str, object]:
     }
 
 
-def left(given: object, gone: dict[str, dict[str, int]]) -> dict[str, Any]:
-    text = without(yaml.safe_dump(given), gone)
-    assert text is not None
-    info: dict[str, Any] = yaml.safe_load(text)[ROOT]
-    return info
-
-
 @pytest.mark.parametrize("sort_keys", [True, False])
 def test_a_listing_is_read_in_any_order_of_keys(sort_keys: bool) -> None:
     text = yaml.safe_dump(content(), sort_keys=sort_keys)
@@ -63,48 +58,42 @@ def test_a_listing_is_read_in_any_order_of_keys(sort_keys: bool) -> None:
     assert listing == Listing(listing.names, dict(zip(names, (5, 3), strict=True)), 8)
 
 
-def test_it_lists_what_is_left_and_counts_it() -> None:
-    info = left(content(), {"r_0.mcap": {"/a": 5}})
-    assert info["relative_file_paths"] == ["r_1.mcap"]
-    assert [each["path"] for each in info["files"]] == ["r_1.mcap"]
-    assert info["starting_time"] == {"nanoseconds_since_epoch": 111}
-    assert info["duration"] == {"nanoseconds": 9}
-    assert info["message_count"] == 3
-    assert [each["message_count"] for each in info["topics_with_message_count"]] == [2, 1]
+def test_what_is_left_is_described_and_other_keys_stay(tmp_path: Path) -> None:
+    for number in range(2):
+        messages = [text(10 * number + at, "x", topic) for topic in ("/a", "/b") for at in (1, 4)]
+        write_mcap(tmp_path / f"r_{number}.mcap", messages)
+    listing = tmp_path / "metadata.yaml"
+    listing.write_text(yaml.safe_dump(content(storage_identifier="mcap")))
+    (tmp_path / "r_0.mcap").unlink()
+    assert correct(tmp_path, McapReader())
+    info = yaml.safe_load(listing.read_text())[ROOT]
+    assert info["relative_file_paths"] == [each["path"] for each in info["files"]] == ["r_1.mcap"]
+    assert info["starting_time"] == {"nanoseconds_since_epoch": 11}
+    assert info["duration"] == {"nanoseconds": 3}
+    assert info["message_count"] == info["files"][0]["message_count"] == 4
     assert (info["version"], info["ros_distro"], info["custom_data"]) == (9, "jazzy", None)
-
-
-def test_a_topic_of_which_nothing_is_left_is_listed_with_none() -> None:
-    info = left(content(), {"r_1.mcap": {"/a": 2, "/b": 1}})
-    assert [each["message_count"] for each in info["topics_with_message_count"]] == [5, 0]
-
-
-@pytest.mark.parametrize("deleted", ["r_0.mcap.zstd", "r_0.mcap"])
-@pytest.mark.parametrize("listed", ["r_0.mcap.zstd", "r_0.mcap"])
-def test_compressed_files_may_be_listed_under_either_name(deleted: str, listed: str) -> None:
-    given = content(relative_file_paths=[listed, "r_1.mcap.zstd"])
-    assert left(given, {deleted: {"/a": 5}})["relative_file_paths"] == ["r_1.mcap.zstd"]
+    assert not correct(tmp_path, McapReader())
 
 
 @pytest.mark.parametrize(
-    ("given", "gone", "reason"),
+    ("given", "reason"),
     [
-        (content(), {"r_0.mcap": {"/a": 4}}, "numbers"),
-        (content(), {"r_0.mcap": {"/c": 5}}, "numbers"),
-        (content(message_count=8), {"r_0.mcap": {}}, "numbers"),
-        (content(files=None), {"r_0.mcap": {"/a": 5}}, "no list files"),
-        (content(relative_file_paths=["r_0.mcap"]), {"r_0.mcap": {"/a": 5}}, "files that are left"),
-        (content(files=[file("r_0.mcap", 100, 5)]), {"r_0.mcap": {"/a": 5}}, "that are left"),
-        (content(files=["r_0.mcap"]), {"r_0.mcap": {"/a": 5}}, "files holds no keys"),
-        ({}, {"r_0.mcap": {}}, "holds no keys"),
-        ([], {"r_0.mcap": {}}, "holds no keys"),
+        (content(), "storage"),
+        (content(storage_identifier="sqlite3"), "storage"),
+        (content(storage_identifier="mcap", compression_mode="FILE"), "compression"),
+        (content(storage_identifier="mcap", version=4), "version 4"),
+        ({}, "holds no keys"),
+        ([], "holds no keys"),
     ],
 )
-def test_what_cannot_be_corrected_is_refused(
-    given: object, gone: dict[str, dict[str, int]], reason: str
-) -> None:
+def test_what_cannot_be_corrected_is_refused(tmp_path: Path, given: object, reason: str) -> None:
+    write_mcap(tmp_path / "r_0.mcap", [text(1, "x")])
+    listing = tmp_path / "metadata.yaml"
+    listing.write_text(yaml.safe_dump(given))
+    before = listing.read_text()
     with pytest.raises(ValueError, match=reason):
-        without(yaml.safe_dump(given), gone)
+        correct(tmp_path, McapReader())
+    assert listing.read_text() == before
 
 
 @needs_recorded
@@ -117,9 +106,8 @@ def test_what_ros_recorded_is_opened_by_rosbags_without_its_first_file(
     recording = tmp_path / name
     shutil.copytree(RECORDED / name, recording)
     first = min(recording.glob("*_0.*"))
-    held = {each.topic: each.count for each in Rosbag2Reader().summarize(first).topics}
     first.unlink()
-    assert take_out(recording, {first.name: held})
+    assert correct(recording, Rosbag2Reader())
     with Reader(recording) as reader:
         messages = [*reader.messages()]
         assert len(messages) == reader.message_count

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import threading
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -17,21 +16,20 @@ from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bag_dir.own_recordings import LIST, ListRow, OwnRecordings
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
-from ros2_memory.storage.mcap.salvage import custom_data
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.examples import examples
 from tests.support.fakes import failing
-from tests.support.housekeepers import OURS, embedding, lines, made_moment, own_all
+from tests.support.housekeepers import embedding, lines, made_moment, own_all
 from tests.support.log_lines import with_checks
 from tests.support.simulated_recorders import World
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, MutableMapping
+    from collections.abc import MutableMapping
     from pathlib import Path
 
 A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
@@ -40,17 +38,22 @@ A, B, C = "rec_20260921T101320Z", "rec_20260921T102320Z", "rec_20260921T103320Z"
 def claimed(bag_dir: Path) -> OwnRecordings:
     """The list after a start of the recorder."""
     own = OwnRecordings(bag_dir)
-    own.claim(custom_data)
+    own.claim()
     return own
 
 
 def begun(bag_dir: Path) -> OwnRecordings:
-    """The list where a recording was begun that embeds its id, and has its first split."""
+    """The list where a recording was begun, is named by the heartbeat and has its first split."""
     own = claimed(bag_dir)
     own.begin(A)
-    assert own.bag_dir_id is not None
-    embedding(bag_dir / A / f"{A}_0.mcap", {**OURS, "bag_dir_id": own.bag_dir_id})
+    named_in_heartbeat(bag_dir, A)
+    embedding(bag_dir / A / f"{A}_0.mcap")
     return own
+
+
+def named_in_heartbeat(bag_dir: Path, *names: str) -> None:
+    beat = Heartbeat(7, 1, RecorderState.STOPPED, names, 1, 0, (), (), None, 2.0)
+    write_heartbeat(bag_dir, beat)
 
 
 def restored(folder: Path) -> None:
@@ -90,9 +93,7 @@ class TestWhatARecorderLists:
         world.supervisor.start()
         [recorder] = world.recorders
         name = recorder.directory.name
-        [header, entry] = listed_at_start[0]
-        assert list(header) == ["bag_dir_id"]
-        assert entry == {"recording": name}
+        assert listed_at_start[0] == [{"recording": name}]
         world.run(2)
         assert lines(tmp_path)[-1]["inode"] == recorder.directory.stat().st_ino
         assert OwnRecordings(tmp_path).owns(recorder.directory)
@@ -160,16 +161,9 @@ class TestWhatAKillLeaves:
         assert claimed(tmp_path).owns(tmp_path / A)
         assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
-    @pytest.mark.parametrize(
-        "embedded",
-        [None, {}, {"robot": "r1"}, OURS, {**OURS, "bag_dir_id": "0" * 32}],
-        ids=["nothing", "no custom data", "another program's", "no id", "another directory's id"],
-    )
-    def test_what_lies_there_is_not_what_the_child_made(
-        self, tmp_path: Path, embedded: dict[str, str] | None
-    ) -> None:
+    def test_what_no_heartbeat_names_may_be_anybodys(self, tmp_path: Path) -> None:
         begun(tmp_path)
-        embedding(tmp_path / A / f"{A}_1.mcap", embedded)
+        named_in_heartbeat(tmp_path)
         with structlog.testing.capture_logs() as logs:
             assert not claimed(tmp_path).owns(tmp_path / A)
         [event] = events_named(logs, "recording_not_claimed")
@@ -202,7 +196,6 @@ class TestWhatAKillLeaves:
         assert again.owns(bag_dir / C)
         assert not again.owns(bag_dir / B)
         assert again.exists()
-        assert again.bag_dir_id == own.bag_dir_id
 
     @pytest.mark.parametrize(
         "line",
@@ -214,7 +207,6 @@ class TestWhatAKillLeaves:
             {"recording": "a", "inode": True},
             {"recording": "a", "inode": "1"},
             {"recording": 5},
-            {"bag_dir_id": "../.."},
             [],
             None,
         ],
@@ -235,14 +227,14 @@ class TestWhatAKillLeaves:
 
         with monkeypatch.context() as patch, structlog.testing.capture_logs() as logs:
             patch.setattr(own_recordings, "write_durably", failing())
-            own.claim(custom_data)
+            own.claim()
             assert events_named(logs, "recordings_not_listed")
             assert own.owns(tmp_path / A)
             patch.setattr(own_recordings, "append_lines", failing())
             with pytest.raises(RecorderError, match="No space left"):
                 own.begin(B)
         own.begin(B)
-        assert [each.get("recording") for each in lines(tmp_path)] == [None, A, A, B]
+        assert [each.get("recording") for each in lines(tmp_path)] == [A, A, B]
         assert OwnRecordings(tmp_path).owns(tmp_path / A)
 
     @settings(max_examples=examples(100), deadline=None)
@@ -260,7 +252,7 @@ class TestWhatAKillLeaves:
 class TestCopies:
     def test_a_restored_directory_is_foreign_until_it_is_adopted(self, tmp_path: Path) -> None:
         bags = tmp_path / "bags"
-        embedding(bags / A / f"{A}_0.mcap", OURS)
+        embedding(bags / A / f"{A}_0.mcap")
         own = own_all(bags)
         assert own.owns(bags / A)
         # ext4 gives it the same inode number: the generation tells, where there is one.
@@ -273,7 +265,7 @@ class TestCopies:
 
     def test_a_whole_bag_directory_that_was_copied_is_foreign(self, tmp_path: Path) -> None:
         for name in (A, B):
-            embedding(tmp_path / "bags" / name / f"{name}_0.mcap", OURS)
+            embedding(tmp_path / "bags" / name / f"{name}_0.mcap")
         own_all(tmp_path / "bags")
         shutil.copytree(tmp_path / "bags", tmp_path / "disk")
         own = claimed(tmp_path / "disk")
@@ -283,24 +275,17 @@ class TestCopies:
 class TestWithoutAList:
     """Whether bags are from before the list, restored or copied: nothing shows it."""
 
-    def beat(self, bag_dir: Path, *names: str) -> None:
-        beat = Heartbeat(7, 1, RecorderState.STOPPED, names, 1, 0, (), (), None, 2.0)
-        write_heartbeat(bag_dir, beat)
-
     def hand_over(self, bag_dir: Path, name: str, following: str) -> None:
         write_handover(bag_dir / name, Handover(next=following, counts_until=1))
         write_handover(bag_dir / following, Handover(previous=name, counts_from=1))
 
     # Adopted at the start until 0.1: a folder that was restored without its list holds the same
     # handover.json, recorder.json and custom data, and the budget deleted all of it.
-    @pytest.mark.parametrize("embedded", [None, {}, OURS, {**OURS, "bag_dir_id": "1" * 32}])
-    def test_recordings_are_foreign_and_the_start_says_so(
-        self, tmp_path: Path, embedded: Mapping[str, str] | None
-    ) -> None:
+    def test_recordings_are_foreign_and_the_start_says_so(self, tmp_path: Path) -> None:
         for name in (A, B):
-            embedding(tmp_path / name / f"{name}_0.mcap", embedded)
-        embedding(tmp_path / "session_mcap" / "s_0.mcap", embedded)
-        self.beat(tmp_path, A)
+            embedding(tmp_path / name / f"{name}_0.mcap")
+        embedding(tmp_path / "session_mcap" / "s_0.mcap")
+        named_in_heartbeat(tmp_path, A)
         self.hand_over(tmp_path, A, B)
         with structlog.testing.capture_logs() as logs:
             own = claimed(tmp_path)
@@ -317,80 +302,50 @@ class TestBags:
         """The list after a recording that was ended as it should."""
         own = claimed(bag_dir)
         own.begin(name)
-        files = [embedding(bag_dir / name / f"{name}_{n}.mcap", None) for n in range(splits)]
+        for number in range(splits):
+            embedding(bag_dir / name / f"{name}_{number}.mcap")
         own.complete(name)
-        own.note(name, {path.name for path in files}, ended=True)
         return claimed(bag_dir)
 
     @pytest.mark.parametrize(
         "name",
-        [f"{A}_3.mcap", f"{A}_77.mcap", f"{A}_00.mcap", f"{A}_0.db3", "x.mcap", f"{B}_0.mcap"],
+        [f"{A}_00.mcap", f"{A}_0.db3", f"{A}.mcap", "x.mcap", f"{B}_0.mcap"],
     )
     def test_no_others(self, tmp_path: Path, name: str) -> None:
         own = self.made(tmp_path, A, 3)
-        embedding(tmp_path / A / name, None)
+        embedding(tmp_path / A / name)
         assert not own.owns_bag(tmp_path / A / name)
         assert not claimed(tmp_path).owns_bag(tmp_path / A / name)
 
-    def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
+    def test_a_recorder_owns_its_splits_and_no_other_bag_beside_them(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=40).started(25)
-        foreign = embedding(world.recorders[0].directory / "x_0.mcap", None)
-        last = embedding(foreign.with_name(f"{foreign.parent.name}_99.mcap"), None)
+        foreign = embedding(world.recorders[0].directory / "x_0.mcap")
         world.run(40)
         world.supervisor.stop()
         own = OwnRecordings(tmp_path)
         for each in world.recorders:
             bags = [*each.directory.glob("*.mcap")]
-            assert {path for path in bags if not own.owns_bag(path)} == {foreign, last} & {*bags}
-            assert lines(tmp_path)[-1]["ended"] is True
+            assert {path for path in bags if not own.owns_bag(path)} == {foreign} & {*bags}
 
-    def test_after_a_kill_the_next_start_counts_what_was_not_noted(self, tmp_path: Path) -> None:
-        own = claimed(tmp_path)
-        own.begin(A)
-        files = [embedding(tmp_path / A / f"{A}_{n}.mcap", None) for n in range(4)]
-        files[3].write_bytes(files[3].read_bytes()[:-300])
-        own.complete(A)
-        own.note(A, {files[0].name})
-        foreign = embedding(tmp_path / A / f"{A}_9.mcap", None)
-        own = claimed(tmp_path)
-        assert all(map(own.owns_bag, files))
-        assert Repairer(McapReader(), McapWriter()).repair(files[3])
-        assert own.owns_bag(files[3])
-        assert not own.owns_bag(foreign)
-        later = embedding(tmp_path / A / f"{A}_4.mcap", None)
-        assert not claimed(tmp_path).owns_bag(later)
-
-    def test_recordings_of_before_such_notes_hold_all_that_are_named_after_them(
+    def test_what_a_kill_cut_short_is_owned_before_and_after_its_repair(
         self, tmp_path: Path
     ) -> None:
-        path = embedding(tmp_path / A / f"{A}_12.mcap", None)
-        other = embedding(tmp_path / A / "x_0.mcap", None)
-        own = claimed(tmp_path)
-        identity = identity_of(tmp_path / A)
-        assert identity is not None
-        LIST.append(tmp_path, [ListRow("", A, identity.inode, identity.generation)])
-        for _ in range(2):
-            assert own.owns_bag(path)
-            assert not own.owns_bag(other)
-            own = claimed(tmp_path)
+        own = self.made(tmp_path, A, 4)
+        cut = tmp_path / A / f"{A}_3.mcap"
+        cut.write_bytes(cut.read_bytes()[:-300])
+        assert own.owns_bag(cut)
+        assert Repairer(McapReader(), McapWriter()).repair(cut)
+        assert own.owns_bag(cut)
 
     def test_an_adopted_folder_holds_what_lay_there(self, tmp_path: Path) -> None:
-        path = embedding(tmp_path / "runs" / "x_0.mcap", None)
+        path = embedding(tmp_path / "runs" / "x_0.mcap")
         own = own_all(tmp_path)
-        later = embedding(tmp_path / "runs" / "y_0.mcap", None)
+        later = embedding(tmp_path / "runs" / "y_0.mcap")
         assert own.owns_bag(path)
         assert not own.owns_bag(later)
         own_all(tmp_path)
         assert own.owns_bag(path)
         assert own.owns_bag(later)
-
-    def test_a_folder_that_an_earlier_version_adopted_holds_everything(
-        self, tmp_path: Path
-    ) -> None:
-        path = embedding(tmp_path / "runs" / "x_0.mcap", None)
-        own_all(tmp_path)
-        LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
-        assert OwnRecordings(tmp_path).owns_bag(path)
 
     def test_carried_messages_and_moments_are_those_that_were_listed(self, tmp_path: Path) -> None:
         own = claimed(tmp_path)
@@ -414,40 +369,3 @@ class TestBags:
         saved.rename(tmp_path / "moved")  # so that its inode number is not used again
         saved.mkdir()
         assert not own.owns_bag(saved / f"{A}_0.mcap")
-
-    @pytest.mark.parametrize("named", [True, False])
-    def test_where_children_embed_nothing_the_heartbeat_names_one_that_a_kill_left_unlisted(
-        self, tmp_path: Path, named: bool
-    ) -> None:
-        claimed(tmp_path).begin(A)
-        path = embedding(tmp_path / A / f"{A}_0.mcap", None)
-        beat = Heartbeat(7, 1, RecorderState.RECORDING, (A,) * named, 1, 0, (), (), None, 2.0)
-        write_heartbeat(tmp_path, beat)
-        assert claimed(tmp_path).owns_bag(path) is named
-
-
-class TestEmbedded:
-    """None where it cannot be known, which is not the same as nothing."""
-
-    def test_wherever_a_file_was_cut_it_is_what_was_embedded_or_unknown(
-        self, tmp_path: Path
-    ) -> None:
-        path = embedding(tmp_path / "a_0.mcap", OURS, size=2)
-        data, found = path.read_bytes(), []
-        for length in range(len(data)):
-            path.write_bytes(data[:length])
-            found.append(custom_data(path))
-        known = found.index(OURS)
-        assert found == [None] * known + [OURS] * (len(data) - known)
-        assert data[known - 20 : known].endswith(b"ros_distro: jazzy\n"[-8:])
-
-    @settings(max_examples=examples(100), deadline=None)
-    @given(at=st.integers(0, 400), value=st.integers(0, 255))
-    def test_a_damaged_file_never_raises_more_than_an_oserror(
-        self, tmp_path_factory: pytest.TempPathFactory, at: int, value: int
-    ) -> None:
-        path = embedding(tmp_path_factory.mktemp("bag") / "a_0.mcap", OURS, size=2)
-        data = bytearray(path.read_bytes())
-        data[at % len(data)] = value
-        path.write_bytes(data)
-        assert custom_data(path) in (None, OURS) or isinstance(custom_data(path), dict)

@@ -72,8 +72,7 @@ ROWS: list[tuple[Log, str]] = [
     (FORGOTTEN, "".join(f"{row}\n" for row in FORGOTTEN_ROWS)),
     (
         LIST,
-        r"""{"bag_dir_id": "5f0c5f0c"}
-{"recording": "rec_A"}
+        r"""{"recording": "rec_A"}
 {"recording": "rec_A", "inode": 7, "generation": 9}
 {"recording": "old/run\udcff", "inode": 8, "adopted": true}
 """,

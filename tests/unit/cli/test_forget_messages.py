@@ -33,7 +33,7 @@ from ros2_memory.bag_dir.state_files import ERASING, read_losses
 from ros2_memory.cli.maintenance import forget as cli_forget
 from ros2_memory.columns.store import FILE
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
-from ros2_memory.retention import eraser
+from ros2_memory.retention import eraser, repair
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import (
@@ -517,7 +517,7 @@ def cut_off_after(patch: pytest.MonkeyPatch, steps: int) -> None:
         (Path, "replace"),
         (os, "link"),
         (eraser, "flush"),
-        (eraser, "correct"),
+        (repair, "correct"),
         (eraser, "append_losses"),
         (ERASING, "remove"),
         (cli_forget, "forget_columns"),

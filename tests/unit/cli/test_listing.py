@@ -20,6 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory import cli
+from ros2_memory.bag_dir.layout import LIST_FILE
 from ros2_memory.cli.ask import with_times
 from ros2_memory.cli.options import LOOKING, parse_end, parse_time, settings_to_look
 from ros2_memory.cli.output import format_time
@@ -223,6 +224,9 @@ class TestRecordings:
         assert (rows["a"]["whose"], rows["c"]["whose"]) == ("this recorder", "another recorder")
         assert rows["c"]["not_read"] == 1
         assert "1 damaged bag file; see below" in " ".join(exits(0, "info .").out.split())
+        (folder / LIST_FILE).unlink()
+        (folder / LIST_FILE).mkdir()  # a list that cannot be read
+        assert {row["whose"] for row in self.rows(exits).values()} == {None}
 
     def test_one_without_a_message_is_named_too(self, folder: Path, exits: Program) -> None:
         write_mcap(folder / "caught_nothing" / "caught_nothing_0.mcap", [])

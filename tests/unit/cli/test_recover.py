@@ -85,8 +85,8 @@ class TestMetadata:
         ("text", "reason"),
         [
             ("{", "not YAML"),
-            ("rosbag2_bagfile_information: {}", "not of plain MCAP files"),
-            ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "plain MCAP"),
+            ("rosbag2_bagfile_information: {}", "not of the storage"),
+            ("rosbag2_bagfile_information: {storage_identifier: sqlite3}", "not of the storage"),
             ("rosbag2_bagfile_information: {storage_identifier: mcap, version: 4}", "version 4"),
         ],
     )

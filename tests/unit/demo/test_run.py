@@ -6,20 +6,14 @@ That fits a terminal, and leaves nothing of an answer unsaid.
 from __future__ import annotations
 
 import json
-import threading
-from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, HTTPServer
+import socket
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory.core.errors import ConfigError
+from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.demo.questions import QUESTIONS, Exchange, Question
 from ros2_memory.demo.run import format_exchange, run_demo, running_server
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 REPLY = json.dumps(
     {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},
@@ -51,31 +45,11 @@ def test_a_long_reply_is_cut_and_says_so() -> None:
     assert f"{len(REPLY):,} characters in all" in last
 
 
-@contextmanager
-def serving(server: HTTPServer) -> Iterator[None]:
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield
-    finally:
-        server.shutdown()
-        thread.join()
-
-
-def test_another_server_that_answers_on_the_port_is_not_taken_for_the_own(tmp_path: Path) -> None:
-    class Theirs(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            self.send_response(200)
-            self.end_headers()
-            self.wfile.write(b'{"status": "ok", "pid": 1}')
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    with HTTPServer(("127.0.0.1", 0), Theirs) as theirs, serving(theirs):
-        port = theirs.server_port
+def test_a_server_that_cannot_listen_is_told_by_its_last_words(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
         with (
-            pytest.raises(ConfigError, match=rf"port {port} .* in use .* --port"),
+            pytest.raises(EpisodicError, match=rf"(?s)exit code 1.*port {port} .* in use"),
             running_server(tmp_path, port, print),
         ):
             pass

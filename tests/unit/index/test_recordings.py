@@ -1,4 +1,4 @@
-"""One recording of a bag directory: a filter leaves what a scan of it alone finds."""
+"""One recording of a bag directory: the index of it alone finds what a scan of it does."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
-from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.recorder.index_manager import IndexManager
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import odom, write_mcap
@@ -43,7 +43,9 @@ def test_a_recording_that_is_not_there_is_named_as_it_was_asked_for(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["a", "a_1", "run", "run_1", "deep", "deep/b", "loose", "nothing"])
-def test_a_filter_leaves_what_a_scan_of_one_recording_finds(tmp_path: Path, name: str) -> None:
+def test_the_index_of_one_recording_finds_what_a_scan_of_it_finds(
+    tmp_path: Path, name: str
+) -> None:
     bags = ["a/a_0", "a/a_1", "a_1/0", "run_0", "run_1", "run_10", "loose", "loose_x"]
     for n, bag in enumerate([*bags, "deep/b/0", "deep/c/0", "latched/carried"]):
         write(tmp_path, bag, at_s=n)
@@ -52,22 +54,19 @@ def test_a_filter_leaves_what_a_scan_of_one_recording_finds(tmp_path: Path, name
         (tmp_path / folder / "damaged.mcap").write_bytes(b"this is not a bag" * 100)
         (tmp_path / folder / "other.db3").symlink_to(tmp_path / "run_0.mcap")
     index = index_of(tmp_path)
-    part = RecordingFilter(tmp_path, name)
-    assert comparable(part.narrowed(index.refresh())) == comparable(
-        index_of(tmp_path, name).refresh()
-    )
+    index.refresh()
+    part = index.alone(name)
+    assert comparable(part.refresh()) == comparable(index_of(tmp_path, name).refresh())
     write(tmp_path, "a/a_2", at_s=50)
     write(tmp_path, "run_2", at_s=51)
     (tmp_path / "a" / "a_0.mcap").unlink()
-    assert comparable(part.narrowed(index.refresh())) == comparable(
-        index_of(tmp_path, name).refresh()
-    )
+    assert comparable(part.refresh()) == comparable(index_of(tmp_path, name).refresh())
 
 
 def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
     for n, bag in enumerate(["a/0", "a/1", "run_0", "run_1", "loose", "deep/b/x", "deep/b/y"]):
         write(tmp_path, bag, at_s=n)
-    snapshot = index_of(tmp_path).refresh()
-    for path, bags in recordings_of(snapshot).items():
-        part = RecordingFilter(tmp_path, name_of(path, bags, str(tmp_path))).narrowed(snapshot)
+    index = index_of(tmp_path)
+    for path, bags in recordings_of(index.refresh()).items():
+        part = index.alone(name_of(path, bags, str(tmp_path))).refresh()
         assert list(part.bags) == bags

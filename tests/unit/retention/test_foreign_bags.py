@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 from ros2_memory import cli
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
-from ros2_memory.bootstrap import claim
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.insights.status import memory_status
 from ros2_memory.retention.clear import clear_bags
@@ -144,15 +143,14 @@ class TestRetention:
         house.apply()
         assert not (bags / A).exists()
 
-    def test_of_a_recording_that_was_noted_only_its_splits_go(self, tmp_path: Path) -> None:
+    def test_of_a_recording_that_was_listed_only_its_splits_go(self, tmp_path: Path) -> None:
         own = OwnRecordings(tmp_path)
         own.begin(A)
         mine = recording(tmp_path, A, 0)
         own.complete(A)
-        own.note(A, {path.name for path in mine}, ended=True)
         for later in ("rec_later", "rec_latest"):  # without a heartbeat these may be being written
             own.begin(later)
-        others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
+        others = foreign(tmp_path, f"{A}/{A}.mcap", f"{A}/theirs_0.mcap")
         newest = recording(tmp_path, B, 3 * 3600)
         with structlog.testing.capture_logs() as logs:
             house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE).apply()
@@ -200,10 +198,9 @@ class TestUpgrade:
     def test_a_damaged_copy_of_another_directorys_recordings_outlives_every_limit(
         self, tmp_path: Path
     ) -> None:
-        carried = {"recorded_by": "ros2-memory", "bag_dir_id": "1" * 32}
         for number in range(4):
             path = tmp_path / A / f"{A}_{number}.mcap"
-            embedding(path, carried, start=T0 + number * 10 * S)
+            embedding(path, start=T0 + number * 10 * S)
         first = tmp_path / A / f"{A}_0.mcap"
         first.write_bytes(first.read_bytes()[:100])
         write_heartbeat(
@@ -212,7 +209,7 @@ class TestUpgrade:
         )
         for path in (tmp_path / A).iterdir():
             os.utime(path, (1, 1))
-        claim(OwnRecordings(tmp_path))
+        OwnRecordings(tmp_path).claim()
         before = files_in(tmp_path)
         keeper_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE, clock=late()).apply()
         assert files_in(tmp_path) == before
@@ -286,7 +283,7 @@ class TestClearing:
         # What retention deleted long ago is in no list.
         (tmp_path / A).rename(tmp_path.parent / "gone")
         own = OwnRecordings(tmp_path)
-        claim(own)
+        own.claim()
         clear_bags(tmp_path, own)
         assert all(path.exists() for path in others)
         assert len(in_moments(tmp_path)) == len(others)
@@ -300,7 +297,7 @@ class TestClearing:
         restored = foreign(tmp_path, *names, "latched/carried.mcap")
         for _ in range(2):
             own = OwnRecordings(tmp_path)
-            claim(own)
+            own.claim()
             clear_bags(tmp_path, own)
             assert all(path.exists() for path in restored)
         monkeypatch.setenv("MEMORY_BAG_DIR", str(tmp_path))

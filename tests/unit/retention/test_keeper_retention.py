@@ -62,14 +62,13 @@ class TestRetention:
     @pytest.mark.parametrize("behind_h", [169, 300])
     def test_a_clock_that_was_behind_deletes_nothing(self, tmp_path: Path, behind_h: int) -> None:
         own = OwnRecordings(tmp_path)
-        own.claim(lambda _: {})
+        own.claim()
         made = []
         for name, hours in ((A, -150), (B, 0), ("rec_wrong", -behind_h), ("rec_right", 1)):
             own.begin(name)
             odometry = [odom(T0 + hours * 3600 * S + n * S, n, 0) for n in range(9)]
             made.append(write_mcap(tmp_path / name / f"{name}_0.mcap", odometry))
             own.complete(name)
-            own.note(name, {f"{name}_0.mcap"}, ended=True)
         clock = SettableClock(T0 + 2 * 3600 * S)
         house_of(tmp_path, max_age_h=168, clock=clock, keeps_foreign=True).apply()
         assert all(path.exists() for path in made)

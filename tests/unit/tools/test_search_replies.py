@@ -342,7 +342,7 @@ def test_the_oldest_splits_that_our_retention_deleted_are_no_reason_to_doubt_nev
     own.parent.mkdir()
     inode = (bag_dir / "rec").stat().st_ino
     mine = json.dumps({"recording": "rec", "inode": inode})
-    own.write_text(with_checks('{"bag_dir_id": "5f0c"}\n' + mine))
+    own.write_text(with_checks(mine))
     assert last(bag_dir, recalls, "/rosout", "contains", "never") is None
     (bag_dir / "rec" / "rec_1.mcap").rename(bag_dir / "rec" / "rec_0.mcap")
     assert last(bag_dir, recalls, "/rosout", "contains", "never")["notes"]

@@ -11,7 +11,6 @@ import typer
 from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, bags_in, folders_with_bags, is_regular
-from ros2_memory.bootstrap import claim
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
 from ros2_memory.cli.output import print_json, print_line
 from ros2_memory.core.directories import identity_of
@@ -51,7 +50,7 @@ def adopt(
     if not own.exists():  # as the recorder does when it starts
         lock = BagDirLock.acquire(root, patience_s=0.0)
         try:
-            claim(own)
+            own.claim()
         finally:
             lock.release()
     new = {name: bags for name, bags in bags_by_name.items() if not all(map(own.owns_bag, bags))}

@@ -8,8 +8,7 @@ Messages of topics, or of the time in which the robot was in a place, are taken 
 hold them (`retention.eraser`).
 """
 
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -23,13 +22,12 @@ from ros2_memory.bag_dir.layout import (
     ERASING_FILE,
     FORGOTTEN_FILE,
     LOCK_FILE,
-    METADATA_FILE,
     MOMENTS_FOLDER,
     SHIPPED_FILE,
     other_form,
 )
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.metadata_yaml import bare_name, take_out
+from ros2_memory.bag_dir.metadata_yaml import bare_name
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
     ERASING,
@@ -40,7 +38,7 @@ from ros2_memory.bag_dir.state_files import (
     append_deleted,
     deleted_of,
 )
-from ros2_memory.bootstrap import build_reader, column_paths, delete_catalogues
+from ros2_memory.bootstrap import build_reader, column_paths
 from ros2_memory.cli.options import (
     BOUNDED,
     STAYS,
@@ -57,7 +55,6 @@ from ros2_memory.cli.options import (
 from ros2_memory.cli.output import format_size, format_time, print_line, spinner
 from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.config import Settings
-from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, InvalidArgumentsError, RecorderError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed, match_topics
@@ -69,6 +66,7 @@ from ros2_memory.places.where import known_track_for, parse_where
 from ros2_memory.retention.delete import remove_bag, remove_emptied
 from ros2_memory.retention.eraser import Eraser, Survey
 from ros2_memory.retention.latched_carry import Carrier
+from ros2_memory.retention.repair import metadata_corrected
 from ros2_memory.storage.mcap.writer import McapWriter
 
 PLACE_MARGIN_NS: Final[Ns] = NS_PER_S
@@ -413,7 +411,8 @@ class _Forget:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
                 kept.append(error.reason)
-            notes = [*self._correct_metadata(deleted, open_recordings)]
+            recordings = {bag.recording for bag in deleted}
+            notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
         also = ""
         if carried is not None:
             messages = counted(carried, "latched message is", "latched messages are")
@@ -465,38 +464,6 @@ class _Forget:
                 kept.append(f"{bag.path}: {error}")
         return deleted, freed
 
-    def _correct_metadata(
-        self, deleted: Sequence[BagFile], open_recordings: Collection[Path]
-    ) -> Iterator[str]:
-        """Takes deleted bags out of each recording's metadata.yaml; yields a line for each.
-
-        That of an open recording is left to its recorder, which writes it at the end.
-        """
-        for recording in sorted({bag.recording for bag in deleted}):
-            listing = recording / METADATA_FILE
-            name = self._name(listing)
-            if recording in open_recordings and not listing.exists():
-                yield f"{name} will list deleted bags: the recorder writes it at the end"
-                continue
-            counts = {
-                bag.path.name: Counter[str]() for bag in deleted if bag.recording == recording
-            }
-            for bag in deleted:
-                for topic in bag.summary.topics if bag.recording == recording else ():
-                    counts[bag.path.name][topic.topic] += topic.count
-            try:
-                with directories.opened(self._bag_dir, recording):
-                    is_listed = take_out(recording, counts)
-                if is_listed:
-                    yield f"{name} lists the remaining bags"
-            except FileNotFoundError:
-                continue  # the recording was deleted, and its metadata.yaml with it
-            except (OSError, ValueError) as error:
-                yield (
-                    f"{name} still lists deleted bags ({error}); rosbag2 opens the folder "
-                    f"after `ros2 bag reindex {recording}`"
-                )
-
     def _request_of_lake(self, forgettings: Sequence[Forgetting]) -> list[str]:
         """Stores what a lake has to forget; returns a line on what the lake keeps if it cannot."""
         if not forgettings:
@@ -529,7 +496,6 @@ class _Forget:
             BagError: some of it may still be there.
         """
         if not self._dry_run:
-            delete_catalogues(self._settings)
             names = [*files]
             for path in column_paths(self._settings):
                 forget_columns(path, self._bag_dir, names)

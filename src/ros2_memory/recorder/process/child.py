@@ -86,6 +86,7 @@ class Child:
         *,
         keep_open: Collection[int] = (),
         patience: Patience | None = None,
+        stderr: int | None = subprocess.STDOUT,
     ) -> Child:
         """Starts `argv`, whose first element is the path of a program.
 
@@ -94,6 +95,7 @@ class Child:
             env: its whole environment.
             keep_open: file descriptors that it inherits besides its output.
             patience: how long to wait for it when it is to end.
+            stderr: where its errors go; None for where this program's go.
 
         Raises:
             RecorderError: it cannot be started.
@@ -101,7 +103,7 @@ class Child:
         if threading.current_thread() is not threading.main_thread():
             raise RecorderError("a recorder must be started from the main thread: it dies with it")
         launched = [sys.executable, "-I", "-S", str(LAUNCHER), str(os.getpid()), *argv]
-        process = _spawn(launched, env, subprocess.PIPE, subprocess.STDOUT, keep_open)
+        process = _spawn(launched, env, subprocess.PIPE, stderr, keep_open)
         return cls(process, patience or Patience())
 
     def take_lines(self) -> list[str]:
@@ -188,7 +190,7 @@ def _spawn(
     argv: Sequence[str],
     env: Mapping[str, str],
     stdout: int,
-    stderr: int,
+    stderr: int | None,
     keep_open: Collection[int],
 ) -> subprocess.Popen[bytes]:
     try:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 import yaml
 
-from ros2_memory.bag_dir.own_recordings import BAG_DIR_ID, PROGRAM, RECORDED_BY
 from ros2_memory.core.errors import RecorderError
 
 if TYPE_CHECKING:
@@ -26,7 +25,6 @@ HELP_ARGV: Final = ("bag", "record", "--help")
 KEYBOARD: Final = "--disable-keyboard-controls"
 NODE_NAME: Final = "--node-name"
 REPEAT: Final = "--repeat-transient-local"
-CUSTOM_DATA: Final = "--custom-data"
 SERVICES: Final = "--services"
 CACHE: Final = "--max-cache-size"
 STATISTICS: Final = "--stats_max_publishing_rate"
@@ -51,7 +49,6 @@ def record_argv(
     min_free_bytes: int = 0,
     use_sim_time: bool = False,
     repeat_latched: Sequence[str] = (),
-    bag_dir_id: str | None = None,
     known_options: Collection[str] = (),
 ) -> list[str]:
     """Returns the argv of one recording.
@@ -71,7 +68,6 @@ def record_argv(
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that.
-        bag_dir_id: the custom data that identifies the bag directory, if it can be written.
         known_options: the options that this distribution has, see `options_in_help`.
     """
     argv = [ros2, "bag", "record", "-s", "mcap", "-d", str(split_duration_s), "-o", str(directory)]
@@ -81,8 +77,6 @@ def record_argv(
     argv += ["--qos-profile-overrides-path", str(qos_file)]
     argv += ["--storage-config-file", str(storage_file)]
     argv += ["--include-hidden-topics"] * topics.hidden + ["--use-sim-time"] * use_sim_time
-    custom = [f"{RECORDED_BY}={PROGRAM}"]
-    custom += [] if bag_dir_id is None else [f"{BAG_DIR_ID}={bag_dir_id}"]
     optional: dict[str, Sequence[str | int] | None] = {
         CACHE: [cache_bytes],
         MIN_FREE: [min_free_bytes] if min_free_bytes else None,
@@ -90,7 +84,6 @@ def record_argv(
         STATISTICS: [1],
         KEYBOARD: [],
         NODE_NAME: [node_name],
-        CUSTOM_DATA: custom,
         REPEAT: repeat_latched or None,
     }
     for name, values in optional.items():

@@ -6,7 +6,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from functools import lru_cache, partial
 from itertools import chain
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 from ros2_memory.bag_dir.layout import is_kept_apart
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError, QueryTimeoutError
@@ -19,18 +19,17 @@ from ros2_memory.history.robots import (
     describe_mixed,
     mixed_recordings,
 )
-from ros2_memory.index.recordings import RecordingFilter, name_of, recordings_of
+from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.serving.page.span import path_in
 
 if TYPE_CHECKING:
     from collections.abc import Collection
-    from pathlib import Path
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.reply import JsonObject
-    from ros2_memory.history.context import Call, Memory, SnapshotSource
+    from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.recorder.index_manager import IndexManager
 
 MOST_RECORDINGS: Final = 300
 """The newest are listed: a week of recordings of an hour is 168."""
@@ -38,37 +37,6 @@ MOST_PATHS: Final = 6
 """Colours that can be told apart on one map."""
 _MOST_MEMORIES: Final = 16
 """Recordings that pages look at and that stay at hand."""
-
-
-class OneRecording:
-    """The part of an index that is of one recording; a `SnapshotSource`. Thread-safe."""
-
-    def __init__(self, index: SnapshotSource, name: str) -> None:
-        self.bag_dir: Path = index.bag_dir
-        self._index = index
-        self._filter = RecordingFilter(index.bag_dir, name)
-
-    @property
-    def published(self) -> Snapshot | None:
-        """The part of the last scan's result; None before the first."""
-        published = self._index.published
-        return None if published is None else self._filter.narrowed(published)
-
-    def snapshot(self, reach: Ns | None = None) -> Snapshot:
-        """Returns the part of a current snapshot."""
-        return self._filter.narrowed(self._index.snapshot(reach))
-
-    def refresh(self) -> Snapshot:
-        """Scans now, and returns the part of the result."""
-        return self._filter.narrowed(self._index.refresh())
-
-    def heartbeat(self) -> Heartbeat | None:
-        """Returns the last heartbeat of the directory's recorder."""
-        return self._index.heartbeat()
-
-    def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns the recordings that handovers join with one."""
-        return self._index.joined_with(recording)
 
 
 class Recordings:
@@ -132,8 +100,9 @@ def _narrowed(memory: Memory, name: str) -> Memory:
 
     It has neither a recorder nor a budget.
     """
+    index = cast("IndexManager", memory.index)  # a page is of one bag directory
     limits = replace(memory.limits, now="latest", kept=None, recording=name)
-    return replace(memory, index=OneRecording(memory.index, name), limits=limits, memo=Memo())
+    return replace(memory, index=index.alone(name), limits=limits, memo=Memo())
 
 
 def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:

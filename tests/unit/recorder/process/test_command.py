@@ -16,7 +16,7 @@ from ros2_memory.recorder.process.command import (
 from ros2_memory.recorder.process.topics import TopicSelection
 
 TOPICS = TopicSelection(("/odom", "/tf", "/tf_static"))
-OPTIONAL = ("--disable-keyboard-controls", "--node-name", "--custom-data")
+OPTIONAL = ("--disable-keyboard-controls", "--node-name")
 
 
 def argv_for(
@@ -77,8 +77,6 @@ def test_what_a_distribution_knows_is_added_to_the_letter() -> None:
         "--disable-keyboard-controls",
         "--node-name",
         "ros2_memory_rec_1",
-        "--custom-data",
-        "recorded_by=ros2-memory",
         "--repeat-transient-local",
         "/tf_static=32",
         "/map",
