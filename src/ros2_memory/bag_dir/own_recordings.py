@@ -87,27 +87,30 @@ def _checked_name(name: str) -> str:
 class ListRow:
     """One line of the list: a recording.
 
-    `bags`: those of an adopted directory that are not named as its splits, sorted. Directories of
-    saved moments and of carried messages are listed like adopted ones, with all bags.
+    `bags`: those of an adopted directory that are not named as its splits, sorted; None: all that
+    lie there. Directories of saved moments and of carried messages are listed like adopted ones,
+    with all bags.
     """
 
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
     inode: Int64 | None = None
     generation: Int64 | None = None
     adopted: StrictBool = False
-    bags: tuple[str, ...] = ()
+    bags: tuple[str, ...] | None = None
 
     def holds(self, file: str) -> bool:
         """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
-        name = file.removesuffix(COMPRESSED)
-        place, number = bisect_left(self.bags, name), split_number(self.recording, name)
+        if self.adopted and self.bags is None:
+            return True
+        name, bags = file.removesuffix(COMPRESSED), self.bags or ()
+        place, number = bisect_left(bags, name), split_number(self.recording, name)
         is_split = number is not None and not is_kept_apart(self.recording)
-        return is_split or self.bags[place : place + 1] == (name,)
+        return is_split or bags[place : place + 1] == (name,)
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
         others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
-        return replace(self, adopted=True, bags=(*sorted({*others, *self.bags}),))
+        return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
 
     @property
     def identity(self) -> Identity | None:

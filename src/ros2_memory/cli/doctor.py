@@ -524,11 +524,17 @@ def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Findi
     """Returns the finding on a running recorder whose list is not this one; else None."""
     here, there = {*selection.listed}, {*live.listed}
     differences = ("adds", here - there), ("lacks", there - here)
-    if not there or here == there:
+    if there and here != there:
+        what = [f"{file} {how} {listed(sorted(names))}" for how, names in differences if names]
+        do = f"{_LIST_TAKEN}; if the recorder has another file, give this command its settings"
+        return warning(f"the running recorder has another list: {'; '.join(what)}", do)
+    waited = [name for name in live.missing if name not in selection.entries]
+    others = [name for name in (*live.subscribed, *waited) if not selection.matches(name)]
+    if not others:
         return None
-    what = [f"{file} {how} {listed(sorted(names))}" for how, names in differences if names]
-    do = f"{_LIST_TAKEN}; if the recorder has another file, give this command its settings"
-    return warning(f"the running recorder has another list: {'; '.join(what)}", do)
+    seen = f"the running recorder records or waits for {listed(others)}, not listed in {file}"
+    do = "give this command the recorder's settings (its environment and key=value arguments); "
+    return warning(seen, f"{do}{_LIST_TAKEN}")
 
 
 def _unheard_entries(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import threading
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -16,7 +17,7 @@ from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
+from ros2_memory.bag_dir.own_recordings import LIST, OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
@@ -346,6 +347,14 @@ class TestBags:
         own_all(tmp_path)
         assert own.owns_bag(path)
         assert own.owns_bag(later)
+
+    def test_a_folder_that_an_earlier_version_adopted_holds_everything(
+        self, tmp_path: Path
+    ) -> None:
+        path = embedding(tmp_path / "runs" / "x_0.mcap")
+        own_all(tmp_path)
+        LIST.replace(tmp_path, [replace(row, bags=None) for row in LIST.rows(tmp_path)])
+        assert OwnRecordings(tmp_path).owns_bag(path)
 
     def test_carried_messages_and_moments_are_those_that_were_listed(self, tmp_path: Path) -> None:
         own = claimed(tmp_path)

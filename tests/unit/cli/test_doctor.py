@@ -217,6 +217,12 @@ class Fault(NamedTuple):
         ),
         Fault(
             1,
+            ["topics: .*records or waits for /bumper, /diagnostics, not listed in .*settings"],
+            {"subscribed": ("/odom", "/bumper"), "missing": ("/diagnostics",)},
+            "/odom, /vision/scene",
+        ),
+        Fault(
+            1,
             ["topics: .*adds /said.*lacks /gone -> a changed list is taken within seconds"],
             {"listed": ("/odom", "/gone")},
             "/odom, /said",
