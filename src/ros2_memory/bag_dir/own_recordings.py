@@ -3,9 +3,10 @@
 Only those are ever deleted. The file has one JSON object a line:
 
     {"recording": "rec_A"}                                          before its child is started
-    {"recording": "rec_A", "inode": 7, "generation": 9}             the directory that it has made
+    {"recording": "rec_A", "inode": 7, "generation": 9, "splits": 3}    what the child has made
+    {"recording": "rec_A", "inode": 7, ..., "splits": 60, "ended": true}
     {"recording": "old/run1", "inode": 8, "adopted": true, "bags": ["x.db3"]}   `ros2-memory adopt`
-    {"recording": "moments/m/rec_A", ..., "adopted": true, "bags": ["rec_A_7.mcap"]}
+    {"recording": "moments/m/rec_A", ..., "adopted": true, "splits": 0, "bags": ["rec_A_7.mcap"]}
 
 The last line of a recording counts. A directory is the recorder's own while it lies under its name
 and is the very directory that was listed (see `directories.Identity`). A bag in it is the
@@ -38,13 +39,14 @@ from ros2_memory.bag_dir.durable_write import (
     write_durably,
 )
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.json_files import Int64, JsonLog, state_path
+from ros2_memory.bag_dir.json_files import Count, Int64, JsonLog, state_path
 from ros2_memory.bag_dir.layout import (
     LIST_FILE,
     LOST_AND_FOUND,
     bag_kind,
     has_own_name,
     is_kept_apart,
+    split_name,
     split_number,
 )
 from ros2_memory.core.directories import (
@@ -62,6 +64,7 @@ if TYPE_CHECKING:
     from collections.abc import (
         Callable,
         Collection,
+        Container,
         Iterable,
         Iterator,
         Mapping,
@@ -87,9 +90,10 @@ def _checked_name(name: str) -> str:
 class ListRow:
     """One line of the list: a recording.
 
-    `bags`: those of an adopted directory that are not named as its splits, sorted; None: all that
-    lie there. Directories of saved moments and of carried messages are listed like adopted ones,
-    with all bags.
+    `splits`: its child made the files with lower numbers; None in lines of versions before 0.1,
+    and of adopted recordings. `ended`: it makes no more. `bags`: the other bags of an adopted
+    directory, sorted; None: all that lie there. Directories of saved moments and of carried
+    messages are listed like adopted ones.
     """
 
     recording: Annotated[str, AfterValidator(_checked_name)] = ""
@@ -97,6 +101,8 @@ class ListRow:
     generation: Int64 | None = None
     adopted: StrictBool = False
     bags: tuple[str, ...] | None = None
+    splits: Count | None = None
+    ended: StrictBool = False
 
     def holds(self, file: str) -> bool:
         """Returns whether a bag file is of the recording, by its name; it lies in its directory."""
@@ -104,13 +110,20 @@ class ListRow:
             return True
         name, bags = file.removesuffix(COMPRESSED), self.bags or ()
         place, number = bisect_left(bags, name), split_number(self.recording, name)
-        is_split = number is not None and not is_kept_apart(self.recording)
+        is_split = number is not None and (self.splits is None or number < self.splits)
         return is_split or bags[place : place + 1] == (name,)
 
     def with_bags(self, files: Iterable[str]) -> ListRow:
         """Returns the line of the directory with these bags adopted."""
         others = {file.removesuffix(COMPRESSED) for file in files if not self.holds(file)}
         return replace(self, adopted=True, bags=(*sorted({*others, *(self.bags or ())}),))
+
+    def counted(self, files: Container[str]) -> int:
+        """Returns how many splits the recording has, where these files were seen."""
+        splits = self.splits or 0
+        while split_name(self.recording, splits) in files:
+            splits += 1
+        return splits
 
     @property
     def identity(self) -> Identity | None:
@@ -247,9 +260,9 @@ class OwnRecordings:
 
         Without a list it makes one, and names what looks like recordings: nothing shows whether
         they were restored or copied. Else it drops entries of recordings that have gone, completes
-        those that a kill left without a directory (see `_find_completed`). What cannot be written
-        is known all the same, so that space can be freed on a full disk; the next recording writes
-        it.
+        those that a kill left without a directory (see `_find_completed`), and counts the splits
+        of those that a kill ended. What cannot be written is known all the same, so that space can
+        be freed on a full disk; the next recording writes it.
 
         Raises:
             RecorderError: the list cannot be read, or the bag directory cannot be listed.
@@ -265,6 +278,7 @@ class OwnRecordings:
                 raise self._failure(error, "read") from error
             rows = self._find_completed()
             self._add(rows)
+            rows += self._find_ended()
             if left:
                 names, count = left[:_MAX_NAMED], len(left)
                 _log.warning(
@@ -301,8 +315,30 @@ class OwnRecordings:
             raise RecorderError(f"{self._bag_dir / name}: {error.strerror or error}") from error
         if identity is None:
             return False
-        self._append([ListRow(name, *identity)])
+        self._append([ListRow(name, *identity, splits=0)])
         return True
+
+    def note(self, name: str, files: Container[str], *, ended: bool = False) -> None:
+        """Notes which splits the child of a recording has made, of the files that were seen.
+
+        Raises:
+            RecorderError: it cannot be written. It is known all the same, so that space can be
+                freed on a full disk, and is written with the next split.
+        """
+        with self._lock:
+            row = self._rows.get(name)
+            if row is None or row.identity is None or row.splits is None:
+                return
+            noted = replace(row, splits=row.counted(files), ended=ended)
+            try:
+                if noted == row and self._read_if_changed():
+                    return
+                self._append([noted])
+            except OSError as error:
+                raise self._failure(error) from error
+            except RecorderError:
+                self._remember_unwritten([noted])
+                raise
 
     def adopt(self, identities: Mapping[str, Identity]) -> None:
         """Lists directories with the bags in them, as the recorder's own from now on.
@@ -324,7 +360,8 @@ class OwnRecordings:
         row = self._rows.get(name)
         if row is not None and row.lists(identity):
             return row
-        return ListRow(name, *identity)
+        row = ListRow(name, *identity)
+        return replace(row, splits=0, ended=True) if is_kept_apart(name) else row
 
     def hold(self, directory: Path, bags: Iterable[str]) -> None:
         """Lists bags that the recorder puts into a directory of a moment or of carried messages.
@@ -368,8 +405,18 @@ class OwnRecordings:
             if row is not None and row.identity is None:
                 with suppress(OSError):
                     if identity := identity_of(self._bag_dir / name):
-                        completed.append(ListRow(name, *identity))
+                        completed.append(ListRow(name, *identity, splits=0))
         return completed
+
+    def _find_ended(self) -> list[ListRow]:
+        """Returns the recordings that a kill ended, with the splits that they have."""
+        ended: list[ListRow] = []
+        for name, row in self._rows.items():
+            if row.identity is not None and row.splits is not None and not row.ended:
+                with suppress(OSError):
+                    files = {path.name for path in bags_in(self._bag_dir / name)}
+                    ended.append(replace(row, splits=row.counted(files), ended=True))
+        return ended
 
     def _missing_on_disk(self, names: Iterable[str]) -> list[str]:
         """Returns the recordings that are no longer in the bag directory."""

@@ -21,7 +21,7 @@ from ros2_memory.recorder.process.output import Line, LineKind, parse_line
 from ros2_memory.storage.base import BagReader, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
     from pathlib import Path
 
     from ros2_memory.recorder.policies import ClockReading
@@ -109,6 +109,11 @@ class Splits:
     def closed_names(self) -> frozenset[str]:
         """The splits that were closed at the last observation."""
         return frozenset(name for name, split in self._files.items() if split.closed)
+
+    @property
+    def seen(self) -> Collection[str]:
+        """The names of all splits that were ever observed."""
+        return self._files.keys()
 
     def names(self) -> frozenset[str]:
         """Returns the names of all splits, seen before or present now."""

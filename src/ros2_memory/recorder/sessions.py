@@ -285,9 +285,13 @@ class RecordingSessions:
         return session
 
     def _update_list(self, session: RecordingSession) -> None:
-        """Lists the directory that the child made; a fault is retried."""
+        """Lists the directory that the child made, and its splits; a fault is retried."""
         with self._events.lasting_if_refused("recording_not_listed", session.name):
             session.is_listed = session.is_listed or self._orders.own.complete(session.name)
+            # Else another disk may lie there.
+            if session.is_listed and session.splits.exists:
+                has_ended = session.state is SessionState.ENDED
+                self._orders.own.note(session.name, session.splits.seen, ended=has_ended)
 
     def _observe_session(self, session: RecordingSession, now: ClockReading) -> SplitChanges:
         self._report_output(session)

@@ -17,7 +17,7 @@ from ros2_memory.bag_dir import own_recordings
 from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.layout import LIST_FILE
-from ros2_memory.bag_dir.own_recordings import LIST, OwnRecordings
+from ros2_memory.bag_dir.own_recordings import LIST, ListRow, OwnRecordings
 from ros2_memory.core.directories import Identity, identity_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.repair import Repairer
@@ -303,14 +303,14 @@ class TestBags:
         """The list after a recording that was ended as it should."""
         own = claimed(bag_dir)
         own.begin(name)
-        for number in range(splits):
-            embedding(bag_dir / name / f"{name}_{number}.mcap")
+        files = [embedding(bag_dir / name / f"{name}_{n}.mcap") for n in range(splits)]
         own.complete(name)
+        own.note(name, {path.name for path in files}, ended=True)
         return claimed(bag_dir)
 
     @pytest.mark.parametrize(
         "name",
-        [f"{A}_00.mcap", f"{A}_0.db3", f"{A}.mcap", "x.mcap", f"{B}_0.mcap"],
+        [f"{A}_3.mcap", f"{A}_77.mcap", f"{A}_00.mcap", f"{A}_0.db3", "x.mcap", f"{B}_0.mcap"],
     )
     def test_no_others(self, tmp_path: Path, name: str) -> None:
         own = self.made(tmp_path, A, 3)
@@ -318,25 +318,47 @@ class TestBags:
         assert not own.owns_bag(tmp_path / A / name)
         assert not claimed(tmp_path).owns_bag(tmp_path / A / name)
 
-    def test_a_recorder_owns_its_splits_and_no_other_bag_beside_them(self, tmp_path: Path) -> None:
+    def test_a_recorder_notes_each_split(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=40).started(25)
         foreign = embedding(world.recorders[0].directory / "x_0.mcap")
+        last = embedding(foreign.with_name(f"{foreign.parent.name}_99.mcap"))
         world.run(40)
         world.supervisor.stop()
         own = OwnRecordings(tmp_path)
         for each in world.recorders:
             bags = [*each.directory.glob("*.mcap")]
-            assert {path for path in bags if not own.owns_bag(path)} == {foreign} & {*bags}
+            assert {path for path in bags if not own.owns_bag(path)} == {foreign, last} & {*bags}
+            assert lines(tmp_path)[-1]["ended"] is True
 
-    def test_what_a_kill_cut_short_is_owned_before_and_after_its_repair(
+    def test_after_a_kill_the_next_start_counts_what_was_not_noted(self, tmp_path: Path) -> None:
+        own = claimed(tmp_path)
+        own.begin(A)
+        files = [embedding(tmp_path / A / f"{A}_{n}.mcap") for n in range(4)]
+        files[3].write_bytes(files[3].read_bytes()[:-300])
+        own.complete(A)
+        own.note(A, {files[0].name})
+        foreign = embedding(tmp_path / A / f"{A}_9.mcap")
+        own = claimed(tmp_path)
+        assert all(map(own.owns_bag, files))
+        assert Repairer(McapReader(), McapWriter()).repair(files[3])
+        assert own.owns_bag(files[3])
+        assert not own.owns_bag(foreign)
+        later = embedding(tmp_path / A / f"{A}_4.mcap")
+        assert not claimed(tmp_path).owns_bag(later)
+
+    def test_recordings_of_before_such_notes_hold_all_that_are_named_after_them(
         self, tmp_path: Path
     ) -> None:
-        own = self.made(tmp_path, A, 4)
-        cut = tmp_path / A / f"{A}_3.mcap"
-        cut.write_bytes(cut.read_bytes()[:-300])
-        assert own.owns_bag(cut)
-        assert Repairer(McapReader(), McapWriter()).repair(cut)
-        assert own.owns_bag(cut)
+        path = embedding(tmp_path / A / f"{A}_12.mcap")
+        other = embedding(tmp_path / A / "x_0.mcap")
+        own = claimed(tmp_path)
+        identity = identity_of(tmp_path / A)
+        assert identity is not None
+        LIST.append(tmp_path, [ListRow(A, identity.inode, identity.generation)])
+        for _ in range(2):
+            assert own.owns_bag(path)
+            assert not own.owns_bag(other)
+            own = claimed(tmp_path)
 
     def test_an_adopted_folder_holds_what_lay_there(self, tmp_path: Path) -> None:
         path = embedding(tmp_path / "runs" / "x_0.mcap")

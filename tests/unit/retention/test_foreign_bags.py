@@ -143,14 +143,15 @@ class TestRetention:
         house.apply()
         assert not (bags / A).exists()
 
-    def test_of_a_recording_that_was_listed_only_its_splits_go(self, tmp_path: Path) -> None:
+    def test_of_a_recording_that_was_noted_only_its_splits_go(self, tmp_path: Path) -> None:
         own = OwnRecordings(tmp_path)
         own.begin(A)
         mine = recording(tmp_path, A, 0)
         own.complete(A)
+        own.note(A, {path.name for path in mine}, ended=True)
         for later in ("rec_later", "rec_latest"):  # without a heartbeat these may be being written
             own.begin(later)
-        others = foreign(tmp_path, f"{A}/{A}.mcap", f"{A}/theirs_0.mcap")
+        others = foreign(tmp_path, f"{A}/{A}_77.mcap", f"{A}/theirs_0.mcap")
         newest = recording(tmp_path, B, 3 * 3600)
         with structlog.testing.capture_logs() as logs:
             house_of(tmp_path, keeps_foreign=True, max_bytes=LITTLE).apply()

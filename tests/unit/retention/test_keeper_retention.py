@@ -69,6 +69,7 @@ class TestRetention:
             odometry = [odom(T0 + hours * 3600 * S + n * S, n, 0) for n in range(9)]
             made.append(write_mcap(tmp_path / name / f"{name}_0.mcap", odometry))
             own.complete(name)
+            own.note(name, {f"{name}_0.mcap"}, ended=True)
         clock = SettableClock(T0 + 2 * 3600 * S)
         house_of(tmp_path, max_age_h=168, clock=clock, keeps_foreign=True).apply()
         assert all(path.exists() for path in made)
