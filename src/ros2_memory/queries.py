@@ -74,6 +74,7 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     may_be_elsewhere,
+    named_numbers,
     out_of_time,
     unasked_limit,
 )
@@ -101,7 +102,13 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.driven_inside import farthest_from
-from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
+from ros2_memory.places.pose_frames import (
+    note_axes,
+    note_runs,
+    placed,
+    placed_waypoints,
+    with_place,
+)
 from ros2_memory.things.unseen import found_in_singular
 
 if TYPE_CHECKING:
@@ -234,6 +241,7 @@ def _position_in(
             _note_reach(view, stored, pose)
         if frame_id is not None:
             pose = placed(view, pose, stored.time, recording, frame_id)
+        note_axes(view, pose.frame_id)
         if memory.limits.places:
             pose = with_place(view, pose, stored.time, recording)
     notes = view.notes.sentences()
@@ -585,6 +593,7 @@ def trajectory_summary(
     note_unread(view, window)
     note_edges(view, window)
     note_runs(view, name, path.frames[0], window)
+    note_axes(view, frame_id or path.frames[0])
     elapsed = elapsed_in(view, window)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
     driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
@@ -669,6 +678,7 @@ def _notes_on_never(
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
         *unasked_limit(condition, min_score),
+        *named_numbers(view, search.topics, condition),
         *found_in_singular(view, topic, condition, window),
     )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)

@@ -15,9 +15,11 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import (
     Condition,
+    Contains,
     Equals,
     NearPosition,
     is_unknown_below,
+    lacks_name,
     parse_condition,
     refusal_for,
     summarising,
@@ -65,6 +67,8 @@ MOST_UNSURE: Final = 32
 """Messages of a part that are read one by one, where its columns leave open what they meet."""
 _MOST_LEFT: Final = 0.5
 """Where a bag's columns leave open more of them, those of its type are left to the messages."""
+_MOST_TYPES: Final = 3
+"""Types of which the constants are looked at: each costs the channels of a file."""
 _MOST_FRAMES: Final = 3
 """Topics whose frame is named: each costs one message."""
 _TOGETHER_NS: Final[Ns] = NS_PER_S
@@ -117,21 +121,28 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     Else the value. A field is a number where the definition has one of its name.
     """
     word = value.strip() if isinstance(value, str) else ""
-    timeline = view.timeline
-    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
-    if not _CONSTANT_NAME.fullmatch(word) or topic is None:
-        return value
-    try:
-        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
-    except BagError:
+    if not _CONSTANT_NAME.fullmatch(word):
         return value
     is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
-    for channel in channels:
-        if channel.type == type_name and is_number.search(_text_of(channel.schema)):
-            constants = _CONSTANT.findall(_text_of(channel.schema))
+    for schema in _schemas_of(view, type_name):
+        if is_number.search(_text_of(schema)):
+            constants = _CONSTANT.findall(_text_of(schema))
             numbers = {number for name, number in constants if name == word}
             return int(numbers.pop()) if len(numbers) == 1 else value
     return value
+
+
+def _schemas_of(view: View, type_name: str) -> list[Schema]:
+    """Returns the definitions of a type in the first file that has it; none where it is damaged."""
+    timeline = view.timeline
+    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
+    if topic is None:
+        return []
+    try:
+        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
+    except BagError:
+        return []
+    return [channel.schema for channel in channels if channel.type == type_name]
 
 
 def _text_of(schema: Schema) -> str:
@@ -144,6 +155,28 @@ def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, .
         return ()
     least = f"{condition.min_score:g}"
     return (f"detections with a score below {least} do not count here, unless min_score is given",)
+
+
+def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns the note on constants that have the word of a text condition, for "never".
+
+    No text has it, but a number of the message may mean it.
+    """
+    test = condition.test
+    word = test.folded if isinstance(test, Contains | Equals) else None
+    if condition.field or not word:
+        return ()
+    types = sorted({*chain.from_iterable(map(view.timeline.types_of, topics))})
+    named = {
+        constant: type_name
+        for type_name in types[:_MOST_TYPES]
+        for schema in _schemas_of(view, type_name)
+        for constant in _constants_named(schema, "", word)
+    }
+    if not named:
+        return ()
+    of_types = listed([f"{constant} ({type_name})" for constant, type_name in named.items()])
+    return (f"{abbreviate(word)} is in no text, but names {of_types}: ask equals on the field",)
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
@@ -214,7 +247,7 @@ def _frames_of_newest(view: View, topic: str) -> list[str]:
 
 
 def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
-    """Returns the constants of a message definition whose names have a word, with their values.
+    """Returns the constants of a definition whose names have a word as a whole, with their values.
 
     Only the one whose name is the field's and the word, where there is one.
     """
@@ -222,7 +255,7 @@ def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
     constants = _CONSTANT.findall(_text_of(schema)) if wanted else []
     whole = {wanted, f"{field.upper()}_{wanted}"}
     same = [(name, value) for name, value in constants if name in whole]
-    shown = same or [(name, value) for name, value in constants if wanted in name]
+    shown = same or [pair for pair in constants if f"_{wanted}_" in f"_{pair[0]}_"]
     return [f"{name} = {value}" for name, value in dict.fromkeys(shown)]
 
 
@@ -510,18 +543,23 @@ class ReverseSearch:
         if newest is None or value is None:
             return None
         field, test = self.condition.field or "", self.condition.test
-        if field and is_unknown_below(value, field):
-            # An empty list does not show what its elements have.
+
+        def is_open(value: JsonValue) -> bool:
+            return is_unknown_below(value, field) or lacks_name(value, field)
+
+        if field and is_open(value):
+            # An empty list does not show what its elements have, nor a part of the joints the rest.
             window = TimeWindow(MIN_NS, newest.time)
             older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            shows_field = (older for older in values if not is_unknown_below(older, field))
+            shows_field = (older for older in values if not is_open(older))
             value = next(shows_field, value)
         refusal = refusal_for(self.condition, value)
-        if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
+        word = test.folded if isinstance(test, Contains | Equals) else None
+        if refusal is None or word is None:
             return refusal
         _, _, name = field.rpartition(".")
-        constants = _constants_named(newest.record.channel.schema, name, str(test.value))
+        constants = _constants_named(newest.record.channel.schema, name, word)
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
     def matches(self, stored: StoredMessage) -> bool | None:

@@ -36,6 +36,7 @@ from ros2_memory.history.reverse_search import (
     ReverseSearch,
     compared_frames,
     condition_of,
+    named_numbers,
     unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
@@ -142,7 +143,11 @@ def find_matches(
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if total == 0:
-        notes = (*notes, *found_in_singular(view, topic, condition, window))
+        notes = (
+            *notes,
+            *named_numbers(view, topics, condition),
+            *found_in_singular(view, topic, condition, window),
+        )
     total = total if scope.since is None else None
     return Sightings(
         sightings,

@@ -6,6 +6,7 @@ Those are too few, score too low, or could not be placed.
 from __future__ import annotations
 
 import difflib
+import re
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -47,6 +48,7 @@ if TYPE_CHECKING:
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
+_ARTICLE: Final = re.compile(r"^(?:an?|the) ")
 _UNDECODED: Final = Reason(
     "could not be decoded, so detections in them are not known", "topic", of="messages of "
 )
@@ -119,15 +121,15 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
 def found_in_singular(
     view: View, topic: str, condition: Condition, window: TimeWindow
 ) -> tuple[str, ...]:
-    """Returns the note on a text that no message has, but its singular; none where there is none.
+    """Returns the note on a text that no message has, but its singular without an article.
 
     A search takes a text as it stands, and `find_things` a label in either form.
     """
     test = condition.test
     text = test.folded if isinstance(test, Contains | Equals) else None
-    if text is None or singular(text) == plain(text):
+    one = singular(_ARTICLE.sub("", plain(text or "")))
+    if text is None or one == plain(text):
         return ()
-    one = singular(text)
     other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
     stored = None
     with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so

@@ -22,7 +22,16 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    detections,
+    make,
+    odom,
+    text,
+    write_mcap,
+)
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.noting_reader import NotingReader
 
@@ -88,6 +97,30 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
         newest("POWER_SUPPLY_STATUS_EMPTY")
 
 
+@pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
+@pytest.mark.parametrize("word", ["STATE_HAULING", "hauling"])
+def test_never_of_a_word_names_the_constant_that_has_it(
+    tmp_path: Path, kind: str, word: str
+) -> None:
+    body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
+    messages = [Msg("/winch", "winch_msgs/msg/Winch", T0, body), text(T0, "up", "/winch_log")]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    note = (
+        f'"{word.lower()}" is in no text, but names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
+        "ask equals on the field"
+    )
+    for topic in ("/winch", "/winch*"):
+        question = (memory_of(tmp_path), Call(), topic, kind)
+        assert queries.find_last_match(*question, word).notes == (note,)
+        assert find_matches(*question, word).notes == (note,)
+        assert queries.find_last_match(*question, "paying").notes == ()
+    if word == "hauling":
+        with pytest.raises(InvalidArgumentsError, match=r"such as STATE_HAULING = 2$"):
+            queries.find_last_match(
+                memory_of(tmp_path), Call(), "/winch", kind, word, field="state"
+            )
+
+
 def last(
     memory: Memory,
     condition_type: str,
@@ -148,12 +181,12 @@ def test_a_bag_beyond_its_share_is_searched_by_its_columns(
         ("/bumper", "equals", True),
     ],
 )
-def test_what_never_was_is_answered_without_reading_a_bag(
+def test_what_never_was_is_answered_without_reading_a_message(
     bag_dir: Path, topic: str, condition_type: str, value: JsonValue
 ) -> None:
     memory, reader = filled(bag_dir)
     assert last(memory, condition_type, value, topic=topic).found is None
-    assert reader.names == []
+    assert not any(topics for _, topics in reader.asked)  # but the definitions of types
 
 
 def test_a_place_never_visited_is_looked_up_in_no_bag_but_the_newest(bag_dir: Path) -> None:

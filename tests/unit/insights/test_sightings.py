@@ -4,6 +4,7 @@ import json
 import math
 import random
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -134,9 +135,9 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["coffee mug"])])
     memory = memory_of(tmp_path)
-    note = f'"coffee mugs" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
-    for kind in ("contains", "equals"):
-        asked = (memory, Call(), OBJECTS, kind, "coffee mugs")
+    for kind, words in product(("contains", "equals"), ("coffee mugs", "a coffee mug")):
+        asked = (memory, Call(), OBJECTS, kind, words)
+        note = f'"{words}" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
         assert find_matches(*asked).notes == (note,)
         assert queries.find_last_match(*asked).notes == (note,)
     never = (memory, Call(), OBJECTS, "contains", "scissors")
