@@ -76,7 +76,7 @@ from ros2_memory.history.reverse_search import (
     may_be_elsewhere,
     named_numbers,
     out_of_time,
-    unasked_limit,
+    score_limit,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
 from ros2_memory.history.scan import pick
@@ -677,7 +677,7 @@ def _notes_on_never(
     notes = (
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
-        *unasked_limit(condition, min_score),
+        *score_limit(condition, min_score),
         *named_numbers(view, search.topics, condition),
         *found_in_singular(view, topic, condition, window),
     )

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import heapq
 import re
+from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import (
+    Beyond,
     Condition,
     Contains,
     Equals,
@@ -24,6 +26,7 @@ from ros2_memory.analysis.conditions import (
     refusal_for,
     summarising,
 )
+from ros2_memory.analysis.facts import FULL_CHARGE
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -109,10 +112,33 @@ def condition_of(
         value = level_number(value, field, type_name)
         value = _constant_number(view, value, field, type_name)
     try:
-        return parse_condition(condition_type, value, limits.position_tolerance_m, field, least)
+        condition = parse_condition(
+            condition_type, value, limits.position_tolerance_m, field, least
+        )
     except InvalidArgumentsError as error:
         hint = unknown_name_hint(value, field, types)
         raise InvalidArgumentsError(f"{error}{hint}") from error
+    _require_fraction(view, pattern, condition)
+    return condition
+
+
+def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
+    """Checks that a charge is not compared with percent where all messages state fractions.
+
+    As sensor_msgs/BatteryState asks for; some drivers publish percent.
+
+    Raises:
+        InvalidArgumentsError: it is.
+    """
+    test = condition.test
+    if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
+        return
+    percent = replace(condition, test=Beyond(FULL_CHARGE, above=True))
+    if ReverseSearch(view, pattern, percent).newest(MAX_NS) is None:
+        as_fraction = f"{test.limit:g} % is {test.limit / 100:g}"
+        raise InvalidArgumentsError(
+            f"value: percentage is a fraction here, from 0 to 1: {as_fraction}"
+        )
 
 
 def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
@@ -149,12 +175,14 @@ def _text_of(schema: Schema) -> str:
     return schema.text.decode("utf-8", "replace")
 
 
-def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
-    """Returns the note on a limit of scores that the question does not have, for "never"."""
-    if min_score is not None or not condition.min_score:
+def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
+    """Returns the note for "never" on a limit of scores that was not asked for, or is above 1."""
+    if not condition.min_score or (min_score is not None and min_score <= 1):
         return ()
-    least = f"{condition.min_score:g}"
-    return (f"detections with a score below {least} do not count here, unless min_score is given",)
+    least = f"detections with a score below {condition.min_score:g} do not count here"
+    if min_score is not None:
+        return (f"{least}, and most scores are from 0 to 1",)
+    return (f"{least}, unless min_score is given",)
 
 
 def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:

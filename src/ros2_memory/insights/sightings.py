@@ -37,7 +37,7 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     named_numbers,
-    unasked_limit,
+    score_limit,
 )
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
@@ -138,7 +138,7 @@ def find_matches(
     note_unread(view, searched, nothing=total == 0, search=True)
     if total == 0:
         silences = describe_silences(view, topics, searched)
-        view.notes.add(*silences, *unasked_limit(condition, min_score))
+        view.notes.add(*silences, *score_limit(condition, min_score))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()

@@ -10,7 +10,7 @@ import json
 import math
 import random
 from functools import partial
-from itertools import chain, repeat
+from itertools import chain, product, repeat
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -95,6 +95,33 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
     assert newest("POWER_SUPPLY_STATUS_FULL", "/chatter", "value") == T0  # a text stays one
     with pytest.raises(InvalidArgumentsError, match=r"must be a number"):
         newest("POWER_SUPPLY_STATUS_EMPTY")
+
+
+def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
+    question = (memory_of(tmp_path), Call(), "/battery_state")
+    for kind, search in product(("below", "above"), (queries.find_last_match, find_matches)):
+        with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
+            search(*question, kind, 20, field="percentage")
+    found = queries.find_last_match(*question, "above", 0.2, field="percentage").found
+    assert found is not None
+    assert found.sample.time == T0
+
+
+def test_percent_of_a_battery_that_states_percent_is_compared(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 90.0), battery(T0 + NS_PER_S, 1.0)])
+    question = (memory_of(tmp_path), Call(), "/battery_state")
+    found = queries.find_last_match(*question, "above", 20, field="percentage").found
+    assert found is not None
+    assert found.sample.time == T0
+
+
+def test_never_within_a_least_score_above_one_says_what_scores_are(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [detections(T0, ["cup"])])
+    question = (memory_of(tmp_path), Call(), SCENE, "contains", "cup")
+    for search in (queries.find_last_match, find_matches):
+        (note,) = search(*question, min_score=80).notes
+        assert note.endswith("a score below 80 do not count here, and most scores are from 0 to 1")
 
 
 @pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
