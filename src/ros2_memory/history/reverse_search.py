@@ -186,10 +186,7 @@ def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...
 
 
 def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
-    """Returns the note on constants that have the word of a text condition, for "never".
-
-    No text has it, but a number of the message may mean it.
-    """
+    """Returns the note on constants that have the word of a text condition, for "never"."""
     test = condition.test
     word = test.folded if isinstance(test, Contains | Equals) else None
     if condition.field or not word:
@@ -204,7 +201,7 @@ def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tu
     if not named:
         return ()
     of_types = listed([f"{constant} ({type_name})" for constant, type_name in named.items()])
-    return (f"{abbreviate(word)} is in no text, but names {of_types}: ask equals on the field",)
+    return (f"{abbreviate(word)} names {of_types}: ask equals on the field of that number",)
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:

@@ -143,11 +143,9 @@ def find_matches(
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if total == 0:
-        notes = (
-            *notes,
-            *named_numbers(view, topics, condition),
-            *found_in_singular(view, topic, condition, window),
-        )
+        notes += named_numbers(view, topics, condition)
+    if total == 0 and where is None and not during:
+        notes += found_in_singular(view, topic, condition, window)
     total = total if scope.since is None else None
     return Sightings(
         sightings,

@@ -10,7 +10,7 @@ import json
 import math
 import random
 from functools import partial
-from itertools import chain, product, repeat
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any
 
 import pytest
@@ -100,9 +100,11 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
 def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
     question = (memory_of(tmp_path), Call(), "/battery_state")
-    for kind, search in product(("below", "above"), (queries.find_last_match, find_matches)):
+    for kind in ("below", "above"):
         with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
-            search(*question, kind, 20, field="percentage")
+            queries.find_last_match(*question, kind, 20, field="percentage")
+        with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
+            find_matches(*question, kind, 20, field="percentage")
     found = queries.find_last_match(*question, "above", 0.2, field="percentage").found
     assert found is not None
     assert found.sample.time == T0
@@ -133,8 +135,8 @@ def test_never_of_a_word_names_the_constant_that_has_it(
     messages = [Msg("/winch", "winch_msgs/msg/Winch", T0, body), text(T0, "up", "/winch_log")]
     write_mcap(tmp_path / "bag.mcap", messages)
     note = (
-        f'"{word.lower()}" is in no text, but names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
-        "ask equals on the field"
+        f'"{word.lower()}" names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
+        "ask equals on the field of that number"
     )
     for topic in ("/winch", "/winch*"):
         question = (memory_of(tmp_path), Call(), topic, kind)

@@ -145,6 +145,18 @@ def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> N
     assert queries.find_last_match(*never).notes == ()
 
 
+def test_never_of_a_plural_while_something_holds_claims_nothing_of_other_times(
+    tmp_path: Path,
+) -> None:
+    states = [boolean(BEGIN, data=True), boolean(BEGIN + 9 * S, data=False)]
+    write_mcap(tmp_path / "bag.mcap", [*states, detections(BEGIN + S, ["mugs"])])
+    question = (memory_of(tmp_path), Call(), OBJECTS, "contains", "mugs")
+    assert find_matches(*question).total == 1
+    never = find_matches(*question, during=[WhileCondition("/bumper", "equals", False)])
+    assert never.total == 0
+    assert never.notes == ()
+
+
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [odom(BEGIN, 1.0, 2.0), text(BEGIN, "[]", topic="/seen")])
     memory = memory_of(tmp_path)
