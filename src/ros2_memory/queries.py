@@ -74,9 +74,7 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     may_be_elsewhere,
-    named_numbers,
     out_of_time,
-    score_limit,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
 from ros2_memory.history.scan import pick
@@ -109,7 +107,7 @@ from ros2_memory.places.pose_frames import (
     placed_waypoints,
     with_place,
 )
-from ros2_memory.things.unseen import found_in_singular
+from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -677,9 +675,7 @@ def _notes_on_never(
     notes = (
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
-        *score_limit(condition, min_score),
-        *named_numbers(view, search.topics, condition),
-        *found_in_singular(view, topic, condition, window),
+        *notes_on_never(view, topic, condition, window, min_score),
     )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()

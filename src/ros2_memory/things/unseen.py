@@ -35,7 +35,8 @@ from ros2_memory.core.text import (
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.reverse_search import ReverseSearch, named_numbers, score_limit
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import may_have_detections
@@ -118,7 +119,25 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     return frozenset(reasons)
 
 
-def found_in_singular(
+def notes_on_never(
+    view: View,
+    topic: str,
+    condition: Condition,
+    window: TimeWindow,
+    min_score: float | None,
+    *,
+    is_bounded: bool = False,
+) -> tuple[str, ...]:
+    """Returns the notes on what a search that found nothing in a window may have been meant for.
+
+    `is_bounded`: whether matches of some times in the window did not count.
+    """
+    meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
+    numbers = named_numbers(view, matching_topics(view, topic), condition)
+    return (*score_limit(condition, min_score), *numbers, *meant)
+
+
+def _found_in_singular(
     view: View, topic: str, condition: Condition, window: TimeWindow
 ) -> tuple[str, ...]:
     """Returns the note on a text that no message has, but its singular without an article.

@@ -25,6 +25,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline, unix_from_ns
+from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -140,6 +141,7 @@ def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> N
         note = f'"{words}" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
         assert find_matches(*asked).notes == (note,)
         assert queries.find_last_match(*asked).notes == (note,)
+        assert note in count_matches(*asked, by="day").notes
     never = (memory, Call(), OBJECTS, "contains", "scissors")
     assert find_matches(*never).notes == ()
     assert queries.find_last_match(*never).notes == ()
@@ -155,6 +157,10 @@ def test_never_of_a_plural_while_something_holds_claims_nothing_of_other_times(
     never = find_matches(*question, during=[WhileCondition("/bumper", "equals", False)])
     assert never.total == 0
     assert never.notes == ()
+    counted = count_matches(
+        *question, by="day", during=[WhileCondition("/bumper", "equals", False)]
+    )
+    assert not any("was not found" in note for note in counted.notes)
 
 
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
