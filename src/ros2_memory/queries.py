@@ -74,6 +74,7 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     may_be_elsewhere,
+    note_no_fix,
     out_of_time,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
@@ -101,7 +102,7 @@ from ros2_memory.insights.status import (
 )
 from ros2_memory.places.driven_inside import farthest_from
 from ros2_memory.places.pose_frames import (
-    note_axes,
+    axes_of,
     note_runs,
     placed,
     placed_waypoints,
@@ -175,6 +176,7 @@ def topic_range(
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
+    note_no_fix(view, name, window, fields)
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
@@ -239,7 +241,7 @@ def _position_in(
             _note_reach(view, stored, pose)
         if frame_id is not None:
             pose = placed(view, pose, stored.time, recording, frame_id)
-        note_axes(view, pose.frame_id)
+        view.notes.add(*axes_of(pose.frame_id))
         if memory.limits.places:
             pose = with_place(view, pose, stored.time, recording)
     notes = view.notes.sentences()
@@ -591,7 +593,7 @@ def trajectory_summary(
     note_unread(view, window)
     note_edges(view, window)
     note_runs(view, name, path.frames[0], window)
-    note_axes(view, frame_id or path.frames[0])
+    view.notes.add(*axes_of(frame_id or path.frames[0]))
     elapsed = elapsed_in(view, window)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
     driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path)

@@ -271,12 +271,27 @@ def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
     assert "carries no position" in refused["detail"]
 
 
+def test_numbers_without_a_fix_are_told_where_they_count(tmp_path: Path) -> None:
+    states = [fix(T0 + n * S, 0.0, 0.0, -1 if n == 4 else 0) for n in range(9)]
+    write_mcap(tmp_path / "bag.mcap", states)
+    height = {"topic": "/fix", "fields": ["altitude"], "start": T0_S}
+    for given in ({}, {"by": "hour"}):
+        reply = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 8, **height, **given)
+        told = [note for note in reply["notes"] if note.startswith(f"until {T0_S + 4}")]
+        assert "have no fix (fix_status -1)" in told[0]
+    before = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 3, **height)
+    assert not any("no fix" in note for note in before.get("notes", ()))
+
+
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
+    topic, above = "/fmu/out/vehicle_odometry", {"condition_type": "above", "value": 1.0}
     note = "in NED x is north, y east and z down: yaw_deg is clockwise from north, seen from above"
     for tool, given in (
         ("get_position_at", {"timestamp": T0_S + 1}),
         ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
+        ("find_matches", {"topic": topic, **above, "field": "position.z"}),
+        ("find_last_match", {"topic": topic, **above, "field": "position.z"}),
     ):
         assert note in ask(tmp_path, False, tool, **given)["notes"]
 

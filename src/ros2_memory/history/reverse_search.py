@@ -70,6 +70,7 @@ MOST_UNSURE: Final = 32
 """Messages of a part that are read one by one, where its columns leave open what they meet."""
 _MOST_LEFT: Final = 0.5
 """Where a bag's columns leave open more of them, those of its type are left to the messages."""
+_IN_DEGREES: Final = frozenset({"latitude", "longitude", "altitude"})
 _MOST_TYPES: Final = 3
 """Types of which the constants are looked at: each costs the channels of a file."""
 _MOST_FRAMES: Final = 3
@@ -208,13 +209,29 @@ def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> 
     """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    named = [f"{', '.join(frames)} ({topic})" for topic, frames in _frames(view, topics)]
+    named = [f"{', '.join(frames)} ({topic})" for topic, frames in position_frames(view, topics)]
     if not named:
         return ()
+    axes = "x and y" if condition.test.z is None else "x, y and z"
     within = f"within {condition.test.tolerance_m:g} m"
-    compared = f"near_position compared x and y ({within}) in the frame of each message: "
+    compared = f"near_position compared {axes} ({within}) in the frame of each message: "
     compared += listed(named)
     return (f"{compared}; {_ELSEWHERE}",)
+
+
+def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str]) -> None:
+    """Notes that numbers of a satellite receiver in a window include those without a fix."""
+    types = view.timeline.types_of(topic)
+    mapped = set(chain.from_iterable(map(view.extractor.fields_of, types)))
+    if "fix_status" not in mapped or not _IN_DEGREES.intersection(fields):
+        return
+    no_fix = Condition(Beyond(0, above=False), "fix_status")
+    newest = ReverseSearch(view, topic, no_fix).newest(window.stop)
+    if newest is not None and newest.time >= window.start:
+        view.notes.add(
+            f"until {unix_text(newest.time)} some messages have no fix (fix_status -1): their "
+            "latitude, longitude and altitude are not its position, but count here"
+        )
 
 
 def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
@@ -225,7 +242,7 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
-    others = {frame for _, frames in _frames(view, topics) for frame in frames} - {target}
+    others = {frame for _, frames in position_frames(view, topics) for frame in frames} - {target}
     try:
         return any(connects(view, (target, frame)) for frame in sorted(others))
     except QueryTimeoutError:
@@ -240,7 +257,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     """
     test = condition.test
     asked = test.frame_id if isinstance(test, NearPosition) else None
-    for topic, frames in _frames(view, topics) if asked else ():
+    for topic, frames in position_frames(view, topics) if asked else ():
         if (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
@@ -248,7 +265,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
             )
 
 
-def _frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
+def position_frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Returns the first topics that have positions, and the frames of these."""
     frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
     return [(topic, of_topic) for topic, of_topic in frames if of_topic]

@@ -128,7 +128,7 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     there = placed(view, pose, stored.time, stored.bag.recording, frame_id)
-    note_axes(view, there.frame_id)
+    view.notes.add(*axes_of(there.frame_id))
     return with_place(view, there, stored.time, stored.bag.recording)
 
 
@@ -331,13 +331,12 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
         )
 
 
-def note_axes(view: View, frame_id: str) -> None:
-    """Notes how the axes of a frame lie that is north-east-down, not REP 103's, by its name."""
-    if frame_id.casefold().endswith("ned"):
-        view.notes.add(
-            f"in {frame_id} x is north, y east and z down: yaw_deg is clockwise from north, seen "
-            "from above"
-        )
+def axes_of(frame_id: str) -> tuple[str, ...]:
+    """Returns the note on a frame that is north-east-down, not REP 103's, by its name."""
+    if not frame_id.casefold().endswith("ned"):
+        return ()
+    axes = f"in {frame_id} x is north, y east and z down"
+    return (f"{axes}: yaw_deg is clockwise from north, seen from above",)
 
 
 def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:

@@ -36,8 +36,14 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics
-from ros2_memory.history.reverse_search import ReverseSearch, named_numbers, score_limit
+from ros2_memory.history.reverse_search import (
+    ReverseSearch,
+    named_numbers,
+    position_frames,
+    score_limit,
+)
 from ros2_memory.insights.silences import describe_silences
+from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import may_have_detections
 
@@ -133,8 +139,14 @@ def notes_on_never(
     `is_bounded`: whether matches of some times in the window did not count.
     """
     meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
-    numbers = named_numbers(view, matching_topics(view, topic), condition)
-    return (*score_limit(condition, min_score), *numbers, *meant)
+    topics = matching_topics(view, topic)
+    heights = position_frames(view, topics) if condition.field == "position.z" else ()
+    return (
+        *score_limit(condition, min_score),
+        *named_numbers(view, topics, condition),
+        *(note for _, frames in heights for frame in frames for note in axes_of(frame)),
+        *meant,
+    )
 
 
 def _found_in_singular(

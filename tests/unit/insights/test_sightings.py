@@ -173,6 +173,8 @@ def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> Non
         "for a place in another frame, such as the map, ask visits, or give where"
     )
     assert note in find_matches(*asked).notes
+    high = find_matches(*asked[:3], "near_position", {"x": 1.0, "y": 2.0, "z": 9.0})
+    assert high.notes[0].startswith("near_position compared x, y and z (within 0.5 m)")
     found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})
     assert (len(found.sightings), note in found.notes) == (1, True)
     during = WhileCondition("/odom", "near_position", place)
