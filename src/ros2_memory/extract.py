@@ -126,12 +126,12 @@ class PlanarPose:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """The compiled schema map of one type. Poses and twists are tried in order."""
+    """The compiled schema map of one type. Poses, twists and latitudes are tried in order."""
 
     fields: Mapping[str, Segments]
     poses: tuple[PointPose | PlanarPose, ...]
     twists: tuple[tuple[Route, Route], ...]
-    geodetic: tuple[Route, Route, Route, Route] | None = None
+    geodetic: tuple[tuple[Route, ...], ...] = ()
     pose_frame: Route | None = None
     velocity_frame: Route | None = None
 
@@ -150,6 +150,11 @@ UNMAPPED: Final = Plan(
     twists=tuple(
         (Route(*prefix, "linear"), Route(*prefix, "angular"))
         for prefix in (("twist", "twist"), ("twist",))
+    ),
+    geodetic=tuple(
+        (*(Route(*prefix, name) for name in names), Route("status", "status"))
+        for prefix in ((), ("position",), ("pose", "position"))
+        for names in (("latitude", "longitude", "altitude"), ("lat", "lon", "alt"))
     ),
 )
 """For a type that is not in the schema map."""
@@ -258,16 +263,23 @@ class SchemaExtractor:
         return None
 
     def geodetic(self, message: object, type_name: str) -> Geodetic | None:
-        """Returns the position on the Earth of a message; None where it has none."""
-        routes = self.plan(type_name).geodetic
-        if routes is None:
-            return None
-        latitude, longitude, altitude, status = (number(route.of(message)) for route in routes)
-        if latitude is None or longitude is None:
-            return None
-        above = math.nan if altitude is None else altitude
-        has_fix = status is None or status >= 0
-        return Geodetic(latitude, longitude, above, _text(FRAME.of(message)), has_fix)
+        """Returns the position on the Earth of a message; None where it has none.
+
+        By the schema map's names; for a type that is not in the map, by `latitude` and `longitude`,
+        or `lat` and `lon`, in the message, its `position` or `pose.position`, unless these numbers
+        cannot be degrees.
+        """
+        plan = self.plan(type_name)
+        for routes in plan.geodetic:
+            latitude, longitude, altitude, status = (number(route.of(message)) for route in routes)
+            if latitude is None or longitude is None:
+                continue
+            if plan is UNMAPPED and (abs(latitude) > 90 or abs(longitude) > 360):
+                continue
+            above = math.nan if altitude is None else altitude
+            has_fix = status is None or status >= 0
+            return Geodetic(latitude, longitude, above, _text(FRAME.of(message)), has_fix)
+        return None
 
     def own_path(self, path: str, type_name: str) -> str:
         """Returns a full path in a message as one in its extracted value.
@@ -308,7 +320,7 @@ class SchemaExtractor:
                 for route in plan.poses
             ),
             "velocity": bool(plan.twists),
-            "geodetic": plan.geodetic is not None,
+            "geodetic": bool(plan.geodetic),
         }
         return frozenset(kind for kind, is_there in has.items() if is_there)
 
@@ -402,9 +414,9 @@ def _compile(type_name: str, fields: Mapping[str, str]) -> Plan:
         fields=paths,
         poses=_poses(paths.keys(), route),
         twists=((route("linear_velocity"), route("angular_velocity")),) if has_twist else (),
-        geodetic=(route("latitude"), route("longitude"), route("altitude"), route("fix_status"))
+        geodetic=(tuple(map(route, ("latitude", "longitude", "altitude", "fix_status"))),)
         if has_geodetic
-        else None,
+        else (),
         pose_frame=route("pose_frame") if "pose_frame" in paths else None,
         velocity_frame=route("velocity_frame") if "velocity_frame" in paths else None,
     )

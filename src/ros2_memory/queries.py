@@ -74,8 +74,8 @@ from ros2_memory.history.reverse_search import (
     compared_frames,
     condition_of,
     may_be_elsewhere,
+    note_no_fix,
     out_of_time,
-    unasked_limit,
 )
 from ros2_memory.history.robots import note_robots, note_robots_near, require_one_robot
 from ros2_memory.history.scan import pick
@@ -101,8 +101,14 @@ from ros2_memory.insights.status import (
     undecodable_types,
 )
 from ros2_memory.places.driven_inside import farthest_from
-from ros2_memory.places.pose_frames import note_runs, placed, placed_waypoints, with_place
-from ros2_memory.things.unseen import found_in_singular
+from ros2_memory.places.pose_frames import (
+    axes_of,
+    note_runs,
+    placed,
+    placed_waypoints,
+    with_place,
+)
+from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -170,6 +176,7 @@ def topic_range(
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
+    note_no_fix(view, name, window, fields)
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
@@ -234,6 +241,7 @@ def _position_in(
             _note_reach(view, stored, pose)
         if frame_id is not None:
             pose = placed(view, pose, stored.time, recording, frame_id)
+        view.notes.add(*axes_of(pose.frame_id))
         if memory.limits.places:
             pose = with_place(view, pose, stored.time, recording)
     notes = view.notes.sentences()
@@ -585,6 +593,7 @@ def trajectory_summary(
     note_unread(view, window)
     note_edges(view, window)
     note_runs(view, name, path.frames[0], window)
+    view.notes.add(*axes_of(frame_id or path.frames[0]))
     elapsed = elapsed_in(view, window)
     whole = path.trajectory(max(max_waypoints, _FEWEST_OF_A_LINE))
     driven = while_recorded(across_steps(whole, path, elapsed), elapsed, path)
@@ -668,8 +677,7 @@ def _notes_on_never(
     notes = (
         *not_covered(view, search.topics, window),
         *describe_silences(view, search.topics, window),
-        *unasked_limit(condition, min_score),
-        *found_in_singular(view, topic, condition, window),
+        *notes_on_never(view, topic, condition, window, min_score),
     )
     is_doubtful = notes or may_be_elsewhere(view, search.topics, condition)
     return (*notes, *compared_frames(view, search.topics, condition)) if is_doubtful else ()

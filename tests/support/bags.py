@@ -53,6 +53,14 @@ OTHER_ROBOTS: Final = {
     "px4_msgs/msg/VehicleLocalPosition": (
         "uint64 timestamp\nbool xy_valid\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32 heading\n"
     ),
+    "px4_msgs/msg/VehicleGlobalPosition": (
+        "uint64 timestamp\nfloat64 lat\nfloat64 lon\nfloat32 alt\n"
+    ),
+    "geographic_msgs/msg/GeoPoint": "float64 latitude\nfloat64 longitude\nfloat64 altitude\n",
+    "geographic_msgs/msg/GeoPointStamped": "std_msgs/Header header\nGeoPoint position\n",
+    "winch_msgs/msg/Winch": (
+        "int8 STATE_IDLE=0\nint8 STATE_HAULING=2\nint8 state\nfloat32 cable\nstring note\n"
+    ),
     "px4_msgs/msg/VehicleStatus": (
         "uint64 timestamp\nuint8 arming_state\n"
         + "".join(f"bool {name}\n" for name in STATUS_FLAGS)

@@ -243,6 +243,59 @@ def test_a_satellite_fix_is_reported_in_degrees(tmp_path: Path, recalls: bool) -
     assert only["notes"][0].startswith("by /fix, the only topic for it: data.pose_topic is /odom")
 
 
+GLOBAL = "px4_msgs/msg/VehicleGlobalPosition"
+
+
+@pytest.mark.parametrize("kind", [GLOBAL, "geographic_msgs/msg/GeoPointStamped"])
+def test_degrees_of_an_unlisted_type_are_named_and_reported(tmp_path: Path, kind: str) -> None:
+    if kind == GLOBAL:
+        body = make(kind, timestamp=0, lat=54.5, lon=10.25, alt=40.0)
+    else:
+        there = make("geographic_msgs/msg/GeoPoint", latitude=54.5, longitude=10.25, altitude=40.0)
+        body = make(kind, header=header(T0, "earth"), position=there)
+    write_mcap(tmp_path / "bag.mcap", [text(T0, "up"), Msg("/where", kind, T0, body)])
+    at = {"timestamp": T0_S}
+    detail = ask(tmp_path, False, "get_position_at", **at)["detail"]
+    assert f"latitude and longitude are on /where ({kind}): give topic" in detail
+    found = ask(tmp_path, False, "get_position_at", topic="/where", **at)
+    assert (found["latitude"], found["longitude"], found["altitude"]) == (54.5, 10.25, 40.0)
+    assert found["x"] is None
+    way = {"topic": "/where", "start": T0_S, "end": T0_S + 1}
+    assert "in degrees" in ask(tmp_path, False, "trajectory_summary", **way)["detail"]
+
+
+def test_numbers_that_are_no_degrees_are_no_position(tmp_path: Path) -> None:
+    scaled = make(GLOBAL, timestamp=0, lat=545000000.0, lon=102500000.0, alt=40.0)
+    write_mcap(tmp_path / "bag.mcap", [Msg("/where", GLOBAL, T0, scaled)])
+    refused = ask(tmp_path, False, "get_position_at", topic="/where", timestamp=T0_S)
+    assert "carries no position" in refused["detail"]
+
+
+def test_numbers_without_a_fix_are_told_where_they_count(tmp_path: Path) -> None:
+    states = [fix(T0 + n * S, 0.0, 0.0, -1 if n == 4 else 0) for n in range(9)]
+    write_mcap(tmp_path / "bag.mcap", states)
+    height = {"topic": "/fix", "fields": ["altitude"], "start": T0_S}
+    for given in ({}, {"by": "hour"}):
+        reply = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 8, **height, **given)
+        told = [note for note in reply["notes"] if note.startswith(f"until {T0_S + 4}")]
+        assert "have no fix (fix_status -1)" in told[0]
+    before = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 3, **height)
+    assert not any("no fix" in note for note in before.get("notes", ()))
+
+
+def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [vehicle(T0 + n * S, n, 0.0) for n in range(9)])
+    topic, above = "/fmu/out/vehicle_odometry", {"condition_type": "above", "value": 1.0}
+    note = "in NED x is north, y east and z down: yaw_deg is clockwise from north, seen from above"
+    for tool, given in (
+        ("get_position_at", {"timestamp": T0_S + 1}),
+        ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),
+        ("find_matches", {"topic": topic, **above, "field": "position.z"}),
+        ("find_last_match", {"topic": topic, **above, "field": "position.z"}),
+    ):
+        assert note in ask(tmp_path, False, tool, **given)["notes"]
+
+
 ABOUT_POSES: list[tuple[str, dict[str, Any]]] = [
     ("get_position_at", {"timestamp": T0_S + 1}),
     ("trajectory_summary", {"start": T0_S, "end": T0_S + 5}),

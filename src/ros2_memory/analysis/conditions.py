@@ -38,6 +38,8 @@ _WHOLE: Final = re.compile(r"[-+]?\d{1,300}", re.ASCII)
 _DECIMAL: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _LISTED_PATHS: Final = 16
 _INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
+ELEMENT_NAMES: Final = ("names", "name", "joint_names")
+"""Keys of a list that names the elements of the arrays beside it, as in joint states."""
 _PICKED: Final = re.compile(r"(\.-?\d+)+$")
 _EXAMPLES: Final = {
     "contains": 'condition_type "contains", value "scissors"',
@@ -159,11 +161,6 @@ class Equals:
     def numbers(self) -> tuple[int | float, ...]:
         """The numbers that a float is equal to."""
         return tuple(number for meant in self.integers for number in (meant, stored_as(meant)))
-
-    @property
-    def is_on_texts(self) -> bool:
-        """Whether no boolean and no number matches."""
-        return self.boolean is None and not self.numbers
 
     def passes(self, leaf: JsonValue) -> bool:
         """Returns whether a leaf is equal."""
@@ -376,7 +373,7 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
 
     Over a list the path goes on in every element, unless the segment is a whole number, which
     selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
-    the first.
+    the first. Of joint states `positions.elbow` is what `names` has beside it in each value.
     """
     return _along(value, dot_path)[-1]
 
@@ -384,9 +381,23 @@ def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
 def _along(value: JsonValue, dot_path: str) -> list[list[JsonValue]]:
     """Returns what is at each beginning of a dot-path: first the value, last its targets."""
     nodes: list[list[JsonValue]] = [[value]]
-    for segment in dot_path.split("."):
+    head, _, name = dot_path.partition(".")
+    names = names_beside(value, dot_path)
+    for segment in (head, str(names.index(name))) if name in names else dot_path.split("."):
         nodes.append([target for node in nodes[-1] for target in _descend(node, segment)])
     return nodes
+
+
+def names_beside(value: JsonValue, dot_path: str) -> list[JsonValue]:
+    """Returns the names of an array's elements where a path has one instead of a number."""
+    head, _, name = dot_path.partition(".")
+    if not isinstance(value, dict) or not name or _INDEX.fullmatch(name):
+        return []
+    array = value.get(head)
+    if not isinstance(array, list) or isinstance(next(iter(array), 0), dict):
+        return []
+    lists = (value.get(key) for key in ELEMENT_NAMES if key != head)
+    return next((names for names in lists if isinstance(names, list)), [])
 
 
 def positions(value: JsonValue) -> Iterator[Vector3]:
@@ -595,7 +606,9 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
         targets = at_field(value, condition.field)
         if not targets:
             paths = ", ".join(_paths(value)) or "none"
-            return f"the values have no field {condition.field!r}; their fields are: {paths}"
+            refusal = f"the values have no field {condition.field!r}; their fields are: {paths}"
+            named = ", ".join(map(str, names_beside(value, condition.field)[:_LISTED_PATHS]))
+            return f"{refusal}; or an element of a list by its name: {named}" if named else refusal
     elif isinstance(condition.test, NearPosition):
         if any(True for _ in positions(value)) or _has_unknown_part(value):
             return None
@@ -672,6 +685,11 @@ def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
     beginnings = chain.from_iterable(_along(value, dot_path)[:-1])
     return any(target is None or target == [] for target in beginnings)
+
+
+def lacks_name(value: JsonValue, dot_path: str) -> bool:
+    """Returns whether another value may have a named element that this one does not have."""
+    return bool(names_beside(value, dot_path)) and not at_field(value, dot_path)
 
 
 def _has_unknown_part(value: JsonValue) -> bool:

@@ -53,7 +53,7 @@ _UNSURE_CHARGE: Final = 0.02
 """So little above such a fraction says nothing: the charge that a battery reports trembles."""
 
 _PERCENT: Final = 100
-_FULL: Final = 1.05
+FULL_CHARGE: Final = 1.05
 """Up to here a charge is a fraction, of a full battery that reports a little more."""
 _WARN: Final = 30
 _ERROR: Final = 40
@@ -127,13 +127,13 @@ def charge_of(value: JsonValue) -> float | None:
     charge = value.get("percentage") if isinstance(value, dict) else None
     if not isinstance(charge, float) or not 0 <= charge <= _PERCENT:
         return None
-    return charge / _PERCENT if charge > _FULL else min(charge, 1.0)
+    return charge / _PERCENT if charge > FULL_CHARGE else min(charge, 1.0)
 
 
 def charge_levels(charges: Floats) -> Ints:
     """Returns below how many of `LOW_CHARGES` each charge is; -1 where that is not known."""
     with np.errstate(invalid="ignore"):
-        part = np.where(charges > _FULL, charges / _PERCENT, charges)
+        part = np.where(charges > FULL_CHARGE, charges / _PERCENT, charges)
         levels = np.sum([part < least for least in LOW_CHARGES], axis=0, dtype=np.int64)
         surely = np.sum([part < least + _UNSURE_CHARGE for least in LOW_CHARGES], axis=0)
         is_known = (charges >= 0) & (charges <= _PERCENT) & (levels == surely)

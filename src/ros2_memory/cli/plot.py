@@ -45,7 +45,7 @@ from ros2_memory.history.no_data import (
     GIVE_TOPIC,
     require_bags,
     resolve_topic,
-    topics_that_show_poses,
+    topics_that_show,
     topics_with,
 )
 from ros2_memory.history.scan import pick
@@ -423,7 +423,7 @@ def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
     view = asked.view
     receivers = [named.partition(" ")[0] for named in topics_with(view, "geodetic")]
     if topic is None and not (
-        topics_with(view, "position") or topics_that_show_poses(view) or robot_body(view)
+        topics_with(view, "position") or topics_that_show(view) or robot_body(view)
     ):
         topic = next(iter(receivers), None)
     if topic in receivers:

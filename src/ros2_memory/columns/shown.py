@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeGua
 
 import numpy as np
 
+from ros2_memory.analysis.conditions import ELEMENT_NAMES
 from ros2_memory.columns.stored import Lazily
 from ros2_memory.columns.table import MAX_NUMBERS, Table
 from ros2_memory.columns.values import (
@@ -117,6 +118,21 @@ def _at_place(level: Level, place: int) -> Limit:
 
     def find(values: Values, positions: Ints) -> TruthValues:
         return TruthValues.known(values.places(level, positions, from_end=place < 0) == place)
+
+    return Limit(level, find)
+
+
+def _at_name(level: Level, names: Leaf, name: str) -> Limit:
+    """Returns the limit to the element that has this name in the list of names beside it."""
+
+    def find(values: Values, positions: Ints) -> TruthValues:
+        texts, owners = values.texts(names), values.elements(names.level).owners
+        has_name = np.array([word == name for word in texts.words], np.bool_)[texts.codes]
+        found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
+        places = np.full(values.rows, -1)
+        places[owners[found]] = values.places(names.level, found, from_end=False)
+        at = values.places(level, positions, from_end=False)
+        return TruthValues.known(at == places[values.elements(level).owners[positions]])
 
     return Limit(level, find)
 
@@ -495,6 +511,18 @@ def at_field(root: Node, dot_path: str) -> list[Spot]:
     Raises:
         UnknownShapeError: it depends on the message.
     """
+    head, _, name = dot_path.partition(".")
+    fields = root.fields if isinstance(root, Object) else {}
+    lists = (fields[key] for key in ELEMENT_NAMES if key in fields and key != head)
+    names = next((node.element for node in lists if isinstance(node, Listing)), None)
+    if name and head in fields and isinstance(names, Leaf) and not _INDEX.fullmatch(name):
+        named = [
+            Spot(Narrowed(_at_name(array.level, names, name), array.element), limits)
+            for array, limits in opened(Spot(fields[head]))
+            if isinstance(array, Listing) and isinstance(array.element, Leaf)
+        ]
+        if named:
+            return named
     spots = [Spot(root)]
     for segment in dot_path.split("."):
         spots = [target for spot in spots for target in _step(spot, segment)]

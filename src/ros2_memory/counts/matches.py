@@ -65,6 +65,7 @@ from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 from ros2_memory.results import BinColumn, Bins
+from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -150,6 +151,11 @@ def count_matches(
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
     binned.add_held(held)
+    if not held:
+        is_bounded = where is not None or bool(during)
+        view.notes.add(
+            *notes_on_never(view, topic, condition, asked, min_score, is_bounded=is_bounded)
+        )
     return binned.answer()
 
 

@@ -27,7 +27,7 @@ from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.no_data import no_data_between, resolve_topic
-from ros2_memory.history.reverse_search import note_summarised
+from ros2_memory.history.reverse_search import note_no_fix, note_summarised
 from ros2_memory.history.robots import note_robots
 from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
@@ -492,6 +492,7 @@ def count_range(
         return count_values(view, name, asked, fields=fields)
     binned = BinnedWindow(view, asked, by, (name,))
     names = tuple(dict.fromkeys(fields))
+    note_no_fix(view, name, asked, names)
     size = len(binned.bins.names)
     if len(names) * size > MOST_CELLS:
         raise InvalidArgumentsError(

@@ -99,7 +99,7 @@ def has_poses(view: View) -> bool:
     for type_name in view.timeline.types_of(view.limits.pose_topic):
         if not extractor.is_mapped(type_name) or "position" in extractor.kinds_of(type_name):
             return True
-    return bool(topics_of_robot(view, "position") or topics_that_show_poses(view))
+    return bool(topics_of_robot(view, "position") or topics_that_show(view))
 
 
 def resolve_pose_topic(
@@ -150,22 +150,22 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
     those = {"position": "poses", "velocity": "velocities"}[what]
     topics = topics_with(view, what)
     if not topics and what == "position":
-        topics = topics_that_show_poses(view)
+        topics = topics_that_show(view)
     if topics:
         which = topics[0].partition(" ")[0] if len(topics) == 1 else "to one of them"
         return (
             f"; {those} are on {listed(topics)}: set data.pose_topic"
             f"{'=' if len(topics) == 1 else ' '}{which}, or {GIVE_TOPIC}"
         )
-    if what == "position" and (fixes := topics_with(view, "geodetic")):
+    if what == "position" and (
+        fixes := topics_with(view, "geodetic") or topics_that_show(view, "geodetic")
+    ):
         advice = "give topic" if degrees else "get_position_at answers them by topic"
         return (
             ", nor another with poses in metres; latitude and longitude are on "
             f"{listed(fixes)}: {advice}"
         )
-    if what == "velocity" and (
-        posed := topics_with(view, "position") or topics_that_show_poses(view)
-    ):
+    if what == "velocity" and (posed := topics_with(view, "position") or topics_that_show(view)):
         return (
             f", nor another with velocities; poses are on {listed(posed)}: trajectory_summary "
             "returns speeds from them, by topic"
@@ -181,10 +181,11 @@ def _where_it_is(view: View, what: str, *, degrees: bool) -> str | None:
     return None
 
 
-def topics_that_show_poses(view: View) -> list[str]:
+def topics_that_show(view: View, what: str = "position") -> list[str]:
     """Returns topics of types outside the schema map whose newest message has a pose.
 
-    Each with its type behind it, of at most `MOST_TRIED` topics: for an error alone.
+    Or latitude and longitude, if `what` is "geodetic". Each with its type behind it, of at most
+    `MOST_TRIED` topics: for an error alone.
     """
     extractor, timeline = view.extractor, view.timeline
     unmapped = [
@@ -199,8 +200,13 @@ def topics_that_show_poses(view: View) -> list[str]:
             newest = view.stream.first((topic,), TimeWindow.everything(), newest_first=True)
             if newest is None:
                 continue
-            pose = extractor.pose(decode(view, newest), newest.type)
-            if pose is not None and pose.orientation is not None:
+            message, type_name = decode(view, newest), newest.type
+            if what == "geodetic":
+                is_shown = extractor.geodetic(message, type_name) is not None
+            else:
+                pose = extractor.pose(message, type_name)
+                is_shown = pose is not None and pose.orientation is not None
+            if is_shown:
                 shown.append(f"{topic} ({newest.type})")
     return shown
 
@@ -544,7 +550,7 @@ def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
     channel = stored.record.channel
     has = f"carries no {what}"
-    if "geodetic" in view.extractor.kinds_of(channel.type):
+    if view.extractor.geodetic(view.bags.decode(stored), channel.type) is not None:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"

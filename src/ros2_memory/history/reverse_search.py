@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -16,13 +17,16 @@ import numpy as np
 from ros2_memory.analysis.conditions import (
     Beyond,
     Condition,
+    Contains,
     Equals,
     NearPosition,
     is_unknown_below,
+    lacks_name,
     parse_condition,
     refusal_for,
     summarising,
 )
+from ros2_memory.analysis.facts import FULL_CHARGE
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -35,11 +39,12 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.text import Reason, abbreviate, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.context import Note
+from ros2_memory.history.context import READING_S, Note
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import matching_topics, undecodable, with_notes
 from ros2_memory.history.scan import decoded_rows, scan
 from ros2_memory.history.transforms import connects
+from ros2_memory.history.view import View
 from ros2_memory.messages.detections import detections_of
 from ros2_memory.messages.levels import level_number, level_path, unknown_name_hint
 
@@ -50,7 +55,6 @@ if TYPE_CHECKING:
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.history.duplicates import StoredMessage
-    from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray, Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"
@@ -66,9 +70,11 @@ MOST_UNSURE: Final = 32
 """Messages of a part that are read one by one, where its columns leave open what they meet."""
 _MOST_LEFT: Final = 0.5
 """Where a bag's columns leave open more of them, those of its type are left to the messages."""
-_MOST_LOOKED_AT: Final = 3
-"""Topics whose newest message is looked at, for its frame or its scale."""
-_PERCENT: Final = 100
+_IN_DEGREES: Final = frozenset({"latitude", "longitude", "altitude"})
+_MOST_TYPES: Final = 3
+"""Types of which the constants are looked at: each costs the channels of a file."""
+_MOST_FRAMES: Final = 3
+"""Topics whose frame is named: each costs one message."""
 _TOGETHER_NS: Final[Ns] = NS_PER_S
 """Messages that may match and are no farther apart are read at once."""
 _MOST_TOGETHER: Final = 256
@@ -97,8 +103,8 @@ def condition_of(
     memory = view.memory
     limits = memory.limits
     least = limits.min_score if min_score is None else min_score
-    topics = matching_topics(view, pattern)
-    types = frozenset(chain.from_iterable(map(view.timeline.types_of, topics)))
+    timeline = view.timeline
+    types = frozenset(chain.from_iterable(map(timeline.types_of, matching_topics(view, pattern))))
     type_name = next(iter(types)) if len(types) == 1 else ""
     if not field and condition_type == "equals":
         field = level_path(value, type_name)
@@ -107,34 +113,39 @@ def condition_of(
         value = level_number(value, field, type_name)
         value = _constant_number(view, value, field, type_name)
     try:
-        tolerance_m = limits.position_tolerance_m
-        condition = parse_condition(condition_type, value, tolerance_m, field, least)
+        condition = parse_condition(
+            condition_type, value, limits.position_tolerance_m, field, least
+        )
     except InvalidArgumentsError as error:
         hint = unknown_name_hint(value, field, types)
         raise InvalidArgumentsError(f"{error}{hint}") from error
-    _note_fraction(view, topics, condition)
+    _require_fraction(view, pattern, condition)
     return condition
 
 
-def _note_fraction(view: View, topics: Sequence[str], condition: Condition) -> None:
-    """Notes that a field named as a percentage holds a fraction, if a condition asks for percent.
+def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
+    """Checks that a charge is not compared with percent where all messages state fractions.
 
-    Such is `percentage` of `sensor_msgs/msg/BatteryState`: of 0.9 to say that it is below 20 is
-    true, and never what was meant.
+    As sensor_msgs/BatteryState asks for; some drivers publish percent. Nothing is refused where
+    there is no time to look at all messages.
+
+    Raises:
+        InvalidArgumentsError: it is.
     """
-    test, field = condition.test, condition.field or ""
-    if not isinstance(test, Beyond) or not 1 < test.limit <= _PERCENT or "percent" not in field:
+    test = condition.test
+    if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
         return
-    for topic in topics[:_MOST_LOOKED_AT]:
-        stored = view.stream.last(topic)
-        message = None if stored is None else view.bags.decode(stored)
-        if stored is not None and message is not None:
-            newest = view.extractor.exact_at(message, stored.type, field)
-            if isinstance(newest, float | int) and 0 <= newest <= 1:
-                view.notes.add(
-                    f"{field} of {topic} is {newest:.2g} in its newest message: if that is a "
-                    f"fraction, ask with {test.limit / _PERCENT:g} for {test.limit:g} %"
-                )
+    percent = replace(condition, test=Beyond(FULL_CHARGE, above=True))
+    brief = View(view.memory, view.call.within(READING_S))
+    try:
+        are_fractions = ReverseSearch(brief, pattern, percent).newest(MAX_NS) is None
+    except QueryTimeoutError:
+        return
+    if are_fractions:
+        as_fraction = f"{test.limit:g} % is {test.limit / 100:g}"
+        raise InvalidArgumentsError(
+            f"value: percentage is a fraction here, from 0 to 1: {as_fraction}"
+        )
 
 
 def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -> JsonValue:
@@ -143,46 +154,90 @@ def _constant_number(view: View, value: JsonValue, field: str, type_name: str) -
     Else the value. A field is a number where the definition has one of its name.
     """
     word = value.strip() if isinstance(value, str) else ""
-    timeline = view.timeline
-    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
-    if not _CONSTANT_NAME.fullmatch(word) or topic is None:
-        return value
-    try:
-        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
-    except BagError:
+    if not _CONSTANT_NAME.fullmatch(word):
         return value
     is_number = re.compile(_NUMBER_FIELD.format(re.escape(field.rpartition(".")[2])), re.MULTILINE)
-    for channel in channels:
-        if channel.type == type_name and is_number.search(_text_of(channel.schema)):
-            constants = _CONSTANT.findall(_text_of(channel.schema))
+    for schema in _schemas_of(view, type_name):
+        if is_number.search(_text_of(schema)):
+            constants = _CONSTANT.findall(_text_of(schema))
             numbers = {number for name, number in constants if name == word}
             return int(numbers.pop()) if len(numbers) == 1 else value
     return value
+
+
+def _schemas_of(view: View, type_name: str) -> list[Schema]:
+    """Returns the definitions of a type in the first file that has it; none where it is damaged."""
+    timeline = view.timeline
+    topic = next((name for name in timeline.topics() if type_name in timeline.types_of(name)), None)
+    if topic is None:
+        return []
+    try:
+        channels = [*view.memory.reader.channels(timeline.first_with(topic, type_name).path)]
+    except BagError:
+        return []
+    return [channel.schema for channel in channels if channel.type == type_name]
 
 
 def _text_of(schema: Schema) -> str:
     return schema.text.decode("utf-8", "replace")
 
 
-def unasked_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
-    """Returns the note on a limit of scores that the question does not have, for "never"."""
-    if min_score is not None or not condition.min_score:
+def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...]:
+    """Returns the note for "never" on a limit of scores that was not asked for, or is above 1."""
+    if not condition.min_score or (min_score is not None and min_score <= 1):
         return ()
-    least = f"{condition.min_score:g}"
-    return (f"detections with a score below {least} do not count here, unless min_score is given",)
+    least = f"detections with a score below {condition.min_score:g} do not count here"
+    if min_score is not None:
+        return (f"{least}, and most scores are from 0 to 1",)
+    return (f"{least}, unless min_score is given",)
+
+
+def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
+    """Returns the note on constants that have the word of a text condition, for "never"."""
+    test = condition.test
+    word = test.folded if isinstance(test, Contains | Equals) else None
+    if condition.field or not word:
+        return ()
+    types = sorted({*chain.from_iterable(map(view.timeline.types_of, topics))})
+    named = {
+        constant: type_name
+        for type_name in types[:_MOST_TYPES]
+        for schema in _schemas_of(view, type_name)
+        for constant in _constants_named(schema, "", word)
+    }
+    if not named:
+        return ()
+    of_types = listed([f"{constant} ({type_name})" for constant, type_name in named.items()])
+    return (f"{abbreviate(word)} names {of_types}: ask equals on the field of that number",)
 
 
 def compared_frames(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
     """Returns the note on the frames in which `near_position` compared; none for another test."""
     if not isinstance(condition.test, NearPosition):
         return ()
-    named = [f"{', '.join(frames)} ({topic})" for topic, frames in _frames(view, topics)]
+    named = [f"{', '.join(frames)} ({topic})" for topic, frames in position_frames(view, topics)]
     if not named:
         return ()
+    axes = "x and y" if condition.test.z is None else "x, y and z"
     within = f"within {condition.test.tolerance_m:g} m"
-    compared = f"near_position compared x and y ({within}) in the frame of each message: "
+    compared = f"near_position compared {axes} ({within}) in the frame of each message: "
     compared += listed(named)
     return (f"{compared}; {_ELSEWHERE}",)
+
+
+def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str]) -> None:
+    """Notes that numbers of a satellite receiver in a window include those without a fix."""
+    types = view.timeline.types_of(topic)
+    mapped = set(chain.from_iterable(map(view.extractor.fields_of, types)))
+    if "fix_status" not in mapped or not _IN_DEGREES.intersection(fields):
+        return
+    no_fix = Condition(Beyond(0, above=False), "fix_status")
+    newest = ReverseSearch(view, topic, no_fix).newest(window.stop)
+    if newest is not None and newest.time >= window.start:
+        view.notes.add(
+            f"until {unix_text(newest.time)} some messages have no fix (fix_status -1): their "
+            "latitude, longitude and altitude are not its position, but count here"
+        )
 
 
 def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) -> bool:
@@ -193,7 +248,7 @@ def may_be_elsewhere(view: View, topics: Sequence[str], condition: Condition) ->
     target = view.limits.map_frame
     if not isinstance(condition.test, NearPosition) or not target or condition.test.frame_id:
         return False
-    others = {frame for _, frames in _frames(view, topics) for frame in frames} - {target}
+    others = {frame for _, frames in position_frames(view, topics) for frame in frames} - {target}
     try:
         return any(connects(view, (target, frame)) for frame in sorted(others))
     except QueryTimeoutError:
@@ -208,7 +263,7 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
     """
     test = condition.test
     asked = test.frame_id if isinstance(test, NearPosition) else None
-    for topic, frames in _frames(view, topics) if asked else ():
+    for topic, frames in position_frames(view, topics) if asked else ():
         if (asked or "").lstrip("/") not in {frame.lstrip("/") for frame in frames}:
             raise InvalidArgumentsError(
                 f"value: frame_id is {abbreviate(asked)}, and near_position compares x and y in "
@@ -216,9 +271,9 @@ def _require_frame(view: View, topics: Sequence[str], condition: Condition) -> N
             )
 
 
-def _frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
+def position_frames(view: View, topics: Sequence[str]) -> list[tuple[str, list[str]]]:
     """Returns the first topics that have positions, and the frames of these."""
-    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_LOOKED_AT]]
+    frames = [(topic, _frames_of_newest(view, topic)) for topic in topics[:_MOST_FRAMES]]
     return [(topic, of_topic) for topic, of_topic in frames if of_topic]
 
 
@@ -240,7 +295,7 @@ def _frames_of_newest(view: View, topic: str) -> list[str]:
 
 
 def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
-    """Returns the constants of a message definition whose names have a word, with their values.
+    """Returns the constants of a definition whose names have a word as a whole, with their values.
 
     Only the one whose name is the field's and the word, where there is one.
     """
@@ -248,7 +303,7 @@ def _constants_named(schema: Schema, field: str, word: str) -> list[str]:
     constants = _CONSTANT.findall(_text_of(schema)) if wanted else []
     whole = {wanted, f"{field.upper()}_{wanted}"}
     same = [(name, value) for name, value in constants if name in whole]
-    shown = same or [(name, value) for name, value in constants if wanted in name]
+    shown = same or [pair for pair in constants if f"_{wanted}_" in f"_{pair[0]}_"]
     return [f"{name} = {value}" for name, value in dict.fromkeys(shown)]
 
 
@@ -536,18 +591,23 @@ class ReverseSearch:
         if newest is None or value is None:
             return None
         field, test = self.condition.field or "", self.condition.test
-        if field and is_unknown_below(value, field):
-            # An empty list does not show what its elements have.
+
+        def is_open(value: JsonValue) -> bool:
+            return is_unknown_below(value, field) or lacks_name(value, field)
+
+        if field and is_open(value):
+            # An empty list does not show what its elements have, nor a part of the joints the rest.
             window = TimeWindow(MIN_NS, newest.time)
             older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            shows_field = (older for older in values if not is_unknown_below(older, field))
+            shows_field = (older for older in values if not is_open(older))
             value = next(shows_field, value)
         refusal = refusal_for(self.condition, value)
-        if refusal is None or not isinstance(test, Equals) or not test.is_on_texts:
+        word = test.folded if isinstance(test, Contains | Equals) else None
+        if refusal is None or word is None:
             return refusal
         _, _, name = field.rpartition(".")
-        constants = _constants_named(newest.record.channel.schema, name, str(test.value))
+        constants = _constants_named(newest.record.channel.schema, name, word)
         return f"{refusal}, such as {listed(constants)}" if constants else refusal
 
     def matches(self, stored: StoredMessage) -> bool | None:

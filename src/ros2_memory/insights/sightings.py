@@ -36,7 +36,6 @@ from ros2_memory.history.reverse_search import (
     ReverseSearch,
     compared_frames,
     condition_of,
-    unasked_limit,
 )
 from ros2_memory.history.robots import note_robots_on
 from ros2_memory.history.transforms import connects
@@ -55,7 +54,7 @@ from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import pose_in, recording_at, robot_at
 from ros2_memory.places.where import Scope, WhileCondition
 from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
-from ros2_memory.things.unseen import found_in_singular
+from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -137,12 +136,13 @@ def find_matches(
     note_unread(view, searched, nothing=total == 0, search=True)
     if total == 0:
         silences = describe_silences(view, topics, searched)
-        view.notes.add(*silences, *unasked_limit(condition, min_score))
+        view.notes.add(*silences)
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if total == 0:
-        notes = (*notes, *found_in_singular(view, topic, condition, window))
+        is_bounded = where is not None or bool(during)
+        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=is_bounded)
     total = total if scope.since is None else None
     return Sightings(
         sightings,

@@ -128,6 +128,7 @@ def robot_at(view: View, at: Ns, recording: Path, frame_id: str | None) -> Pose 
     if stored is None or pose is None or not all(map(math.isfinite, pose.position)):
         return None
     there = placed(view, pose, stored.time, stored.bag.recording, frame_id)
+    view.notes.add(*axes_of(there.frame_id))
     return with_place(view, there, stored.time, stored.bag.recording)
 
 
@@ -328,6 +329,14 @@ def note_runs(view: View, topic: str, frame_id: str, window: TimeWindow) -> None
             f"{changing_origin(frame_id)}, and these are several runs of odometry: the same "
             "coordinates may be another place in each"
         )
+
+
+def axes_of(frame_id: str) -> tuple[str, ...]:
+    """Returns the note on a frame that is north-east-down, not REP 103's, by its name."""
+    if not frame_id.casefold().endswith("ned"):
+        return ()
+    axes = f"in {frame_id} x is north, y east and z down"
+    return (f"{axes}: yaw_deg is clockwise from north, seen from above",)
 
 
 def known_track(view: View, frame_id: str, window: TimeWindow) -> KnownTrack:

@@ -6,6 +6,7 @@ Those are too few, score too low, or could not be placed.
 from __future__ import annotations
 
 import difflib
+import re
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -34,8 +35,15 @@ from ros2_memory.core.text import (
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.reverse_search import ReverseSearch
+from ros2_memory.history.no_data import matching_topics
+from ros2_memory.history.reverse_search import (
+    ReverseSearch,
+    named_numbers,
+    position_frames,
+    score_limit,
+)
 from ros2_memory.insights.silences import describe_silences
+from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import plain, singular
 from ros2_memory.things.seen import may_have_detections
 
@@ -47,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.things.known import KnownThings
 
 _MOST_NAMED: Final = 5
+_ARTICLE: Final = re.compile(r"^(?:an?|the) ")
 _UNDECODED: Final = Reason(
     "could not be decoded, so detections in them are not known", "topic", of="messages of "
 )
@@ -116,18 +125,42 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     return frozenset(reasons)
 
 
-def found_in_singular(
+def notes_on_never(
+    view: View,
+    topic: str,
+    condition: Condition,
+    window: TimeWindow,
+    min_score: float | None,
+    *,
+    is_bounded: bool = False,
+) -> tuple[str, ...]:
+    """Returns the notes on what a search that found nothing in a window may have been meant for.
+
+    `is_bounded`: whether matches of some times in the window did not count.
+    """
+    meant = () if is_bounded else _found_in_singular(view, topic, condition, window)
+    topics = matching_topics(view, topic)
+    heights = position_frames(view, topics) if condition.field == "position.z" else ()
+    return (
+        *score_limit(condition, min_score),
+        *named_numbers(view, topics, condition),
+        *(note for _, frames in heights for frame in frames for note in axes_of(frame)),
+        *meant,
+    )
+
+
+def _found_in_singular(
     view: View, topic: str, condition: Condition, window: TimeWindow
 ) -> tuple[str, ...]:
-    """Returns the note on a text that no message has, but its singular; none where there is none.
+    """Returns the note on a text that no message has, but its singular without an article.
 
     A search takes a text as it stands, and `find_things` a label in either form.
     """
     test = condition.test
     text = test.folded if isinstance(test, Contains | Equals) else None
-    if text is None or singular(text) == plain(text):
+    one = singular(_ARTICLE.sub("", plain(text or "")))
+    if text is None or one == plain(text):
         return ()
-    one = singular(text)
     other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
     stored = None
     with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so

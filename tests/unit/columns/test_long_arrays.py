@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from random import Random
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -31,24 +32,17 @@ LENGTHS: Final = {
 }
 
 
+def joint_state(nth: int, names: Sequence[str], positions: Sequence[float]) -> Msg:
+    at, kind = T0 + nth * NS_PER_S, "sensor_msgs/msg/JointState"
+    none = np.zeros(0)
+    arrays = {"position": np.array(positions), "velocity": none, "effort": none}
+    return Msg("/joints", kind, at, make(kind, header=header(at, ""), name=[*names], **arrays))
+
+
 def joints(lengths: Sequence[int]) -> list[Msg]:
     """States of joints whose positions rise by 1 from message to message."""
-    return [
-        Msg(
-            "/joints",
-            "sensor_msgs/msg/JointState",
-            T0 + nth * NS_PER_S,
-            make(
-                "sensor_msgs/msg/JointState",
-                header=header(T0 + nth * NS_PER_S, ""),
-                name=[],
-                position=np.linspace(nth, nth + 0.75, length),
-                velocity=np.zeros(0),
-                effort=np.zeros(0),
-            ),
-        )
-        for nth, length in enumerate(lengths)
-    ]
+    spans = enumerate(lengths)
+    return [joint_state(nth, [], [*np.linspace(nth, nth + 0.75, length)]) for nth, length in spans]
 
 
 @pytest.mark.parametrize("lengths", LENGTHS.values(), ids=LENGTHS)
@@ -136,3 +130,30 @@ def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
             assert "data is long it is only summarised" in found()["notes"][0]
     if number == 100:
         assert found(field="data.bytes")["value"] is not None
+
+
+@pytest.mark.parametrize("more", [0, 12], ids=["few joints", "many joints"])
+def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
+    tmp_path: Path, more: int
+) -> None:
+    random, messages, bent = Random(5), [], []
+    for nth in range(40):
+        angles = {name: random.random() for name in ("pan", "elbow", "gripper.left")}
+        angles |= {f"more_{number}": 9.0 for number in range(more)}
+        if nth % 4 == 3 or nth == 39:  # another node publishes the rest of the joints
+            del angles["elbow"]
+        names = random.sample([*angles], len(angles))
+        messages.append(joint_state(nth, names, [angles[name] for name in names]))
+        if angles.get("elbow", 0.0) > 0.5:
+            bent.append(T0 / NS_PER_S + nth)
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    elbow = {"topic": "/joints", "condition_type": "above", "value": 0.5, "field": "position.elbow"}
+    left = {**elbow, "field": "positions.gripper.left", "value": 2.0}
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        assert asked(memory, tmp_path, "find_last_match", **elbow)["timestamp"] == bent[-1]
+        runs = asked(memory, tmp_path, "find_matches", **elbow, limit=100)["sightings"]
+        assert sum(run["count"] for run in runs) == len(bent)
+        assert asked(memory, tmp_path, "find_last_match", **left) is None
+        refused = asked(memory, tmp_path, "find_last_match", **{**elbow, "field": "position.knee"})
+        assert refused["detail"].startswith("/joints: the values have no field 'positions.knee'")
+        assert "or an element of a list by its name: " in refused["detail"]

@@ -22,7 +22,16 @@ from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies
-from tests.support.bags import Msg, battery, boolean, detections, odom, text, write_mcap
+from tests.support.bags import (
+    Msg,
+    battery,
+    boolean,
+    detections,
+    make,
+    odom,
+    text,
+    write_mcap,
+)
 from tests.support.memories import asked, memory_of, with_store
 from tests.support.noting_reader import NotingReader
 
@@ -88,27 +97,57 @@ def test_a_constant_of_the_message_may_be_named_for_its_number(tmp_path: Path) -
         newest("POWER_SUPPLY_STATUS_EMPTY")
 
 
-@pytest.mark.parametrize(
-    ("charge", "limit", "note"),
-    [
-        pytest.param(0.87, 20, "percentage of /battery_state is 0.87 in its newest", id="fraction"),
-        pytest.param(87.0, 20, None, id="percent"),
-        pytest.param(0.87, 0.2, None, id="asked_as_fraction"),
-    ],
-)
-def test_percent_of_a_battery_that_states_fractions_is_noted(
-    tmp_path: Path, charge: float, limit: float, note: str | None
+def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 0.9), battery(T0 + NS_PER_S, 0.1)])
+    question = (memory_of(tmp_path), Call(), "/battery_state")
+    for kind in ("below", "above"):
+        with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
+            queries.find_last_match(*question, kind, 20, field="percentage")
+        with pytest.raises(InvalidArgumentsError, match=r"is a fraction here.*: 20 % is 0\.2$"):
+            find_matches(*question, kind, 20, field="percentage")
+    found = queries.find_last_match(*question, "above", 0.2, field="percentage").found
+    assert found is not None
+    assert found.sample.time == T0
+
+
+def test_percent_of_a_battery_that_states_percent_is_compared(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, 90.0), battery(T0 + NS_PER_S, 1.0)])
+    question = (memory_of(tmp_path), Call(), "/battery_state")
+    found = queries.find_last_match(*question, "above", 20, field="percentage").found
+    assert found is not None
+    assert found.sample.time == T0
+
+
+def test_never_within_a_least_score_above_one_says_what_scores_are(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [detections(T0, ["cup"])])
+    question = (memory_of(tmp_path), Call(), SCENE, "contains", "cup")
+    for search in (queries.find_last_match, find_matches):
+        (note,) = search(*question, min_score=80).notes
+        assert note.endswith("a score below 80 do not count here, and most scores are from 0 to 1")
+
+
+@pytest.mark.parametrize("kind", ["contains", "contains_word", "equals"])
+@pytest.mark.parametrize("word", ["STATE_HAULING", "hauling"])
+def test_never_of_a_word_names_the_constant_that_has_it(
+    tmp_path: Path, kind: str, word: str
 ) -> None:
-    write_mcap(tmp_path / "bag.mcap", [battery(T0 + n * NS_PER_S, charge) for n in range(9)])
-    memory = memory_of(tmp_path)
-    below = ("/battery_state", "below", limit)
-    newest = queries.find_last_match(memory, Call(), *below, field="percentage")
-    ranges = find_matches(memory, Call(), *below, field="percentage")
-    for notes in (newest.notes, ranges.notes):
-        assert [text for text in notes if "fraction" in text] == [
-            text for text in notes if note and text.startswith(note)
-        ]
-        assert (note is not None) == any(text.endswith("ask with 0.2 for 20 %") for text in notes)
+    body = make("winch_msgs/msg/Winch", state=2, cable=1.0, note="")
+    messages = [Msg("/winch", "winch_msgs/msg/Winch", T0, body), text(T0, "up", "/winch_log")]
+    write_mcap(tmp_path / "bag.mcap", messages)
+    note = (
+        f'"{word.lower()}" names STATE_HAULING = 2 (winch_msgs/msg/Winch): '
+        "ask equals on the field of that number"
+    )
+    for topic in ("/winch", "/winch*"):
+        question = (memory_of(tmp_path), Call(), topic, kind)
+        assert queries.find_last_match(*question, word).notes == (note,)
+        assert find_matches(*question, word).notes == (note,)
+        assert queries.find_last_match(*question, "paying").notes == ()
+    if word == "hauling":
+        with pytest.raises(InvalidArgumentsError, match=r"such as STATE_HAULING = 2$"):
+            queries.find_last_match(
+                memory_of(tmp_path), Call(), "/winch", kind, word, field="state"
+            )
 
 
 def last(
@@ -171,12 +210,12 @@ def test_a_bag_beyond_its_share_is_searched_by_its_columns(
         ("/bumper", "equals", True),
     ],
 )
-def test_what_never_was_is_answered_without_reading_a_bag(
+def test_what_never_was_is_answered_without_reading_a_message(
     bag_dir: Path, topic: str, condition_type: str, value: JsonValue
 ) -> None:
     memory, reader = filled(bag_dir)
     assert last(memory, condition_type, value, topic=topic).found is None
-    assert reader.names == []
+    assert not any(topics for _, topics in reader.asked)  # but the definitions of types
 
 
 def test_a_place_never_visited_is_looked_up_in_no_bag_but_the_newest(bag_dir: Path) -> None:

@@ -4,6 +4,7 @@ import json
 import math
 import random
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
@@ -24,6 +25,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Place
 from ros2_memory.core.timebase import Deadline, unix_from_ns
+from ros2_memory.counts.matches import count_matches
 from ros2_memory.history.context import Call, Memory, QuerySettings
 from ros2_memory.history.reverse_search import ReverseSearch
 from ros2_memory.history.view import View
@@ -134,14 +136,31 @@ def test_never_says_which_scores_do_not_count(tmp_path: Path) -> None:
 def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["coffee mug"])])
     memory = memory_of(tmp_path)
-    note = f'"coffee mugs" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
-    for kind in ("contains", "equals"):
-        asked = (memory, Call(), OBJECTS, kind, "coffee mugs")
+    for kind, words in product(("contains", "equals"), ("coffee mugs", "a coffee mug")):
+        asked = (memory, Call(), OBJECTS, kind, words)
+        note = f'"{words}" was not found, but "coffee mug" was, last at {BEGIN / S:.6f}'
         assert find_matches(*asked).notes == (note,)
         assert queries.find_last_match(*asked).notes == (note,)
+        assert note in count_matches(*asked, by="day").notes
     never = (memory, Call(), OBJECTS, "contains", "scissors")
     assert find_matches(*never).notes == ()
     assert queries.find_last_match(*never).notes == ()
+
+
+def test_never_of_a_plural_while_something_holds_claims_nothing_of_other_times(
+    tmp_path: Path,
+) -> None:
+    states = [boolean(BEGIN, data=True), boolean(BEGIN + 9 * S, data=False)]
+    write_mcap(tmp_path / "bag.mcap", [*states, detections(BEGIN + S, ["mugs"])])
+    question = (memory_of(tmp_path), Call(), OBJECTS, "contains", "mugs")
+    assert find_matches(*question).total == 1
+    never = find_matches(*question, during=[WhileCondition("/bumper", "equals", False)])
+    assert never.total == 0
+    assert never.notes == ()
+    counted = count_matches(
+        *question, by="day", during=[WhileCondition("/bumper", "equals", False)]
+    )
+    assert not any("was not found" in note for note in counted.notes)
 
 
 def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> None:
@@ -154,6 +173,8 @@ def test_never_near_a_position_says_in_which_frame_it_was(tmp_path: Path) -> Non
         "for a place in another frame, such as the map, ask visits, or give where"
     )
     assert note in find_matches(*asked).notes
+    high = find_matches(*asked[:3], "near_position", {"x": 1.0, "y": 2.0, "z": 9.0})
+    assert high.notes[0].startswith("near_position compared x, y and z (within 0.5 m)")
     found = find_matches(*asked[:2], "/odom", "near_position", {"x": 1.0, "y": 2.0})
     assert (len(found.sightings), note in found.notes) == (1, True)
     during = WhileCondition("/odom", "near_position", place)

@@ -25,7 +25,7 @@ from ros2_memory.counts.numbers import SUM_SCALE, Part, PieceNumbers
 from ros2_memory.history.no_data import (
     resolve_topic,
     topics_of_robot,
-    topics_that_show_poses,
+    topics_that_show,
     topics_with,
 )
 from ros2_memory.history.scan import scan
@@ -285,7 +285,7 @@ def _places_robot(view: View) -> list[JsonValue]:
         return [topic.partition(" ")[0] for topic in described]
 
     of_robot = {*topics_of_robot(view, "position")}
-    posed = names(topics_with(view, "position") or topics_that_show_poses(view))
+    posed = names(topics_with(view, "position") or topics_that_show(view))
     posed.sort(key=lambda topic: (topic not in of_robot, topic))
     fixes = names(topics_with(view, "geodetic"))
     kinds = {**dict.fromkeys(fixes, "fixes"), **dict.fromkeys(posed, "poses")}
