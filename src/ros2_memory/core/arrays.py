@@ -62,6 +62,13 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
     return greatest
 
 
+def in_ranges(starts: Ints, sizes: Ints) -> Ints:
+    """Returns the numbers of ranges, one range after another."""
+    before = np.cumsum(sizes) - sizes
+    numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
+    return numbers
+
+
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
     """Returns some rows of a table, which is a dataclass with a column in each field."""
     names = [column.name for column in fields(table)]
@@ -120,6 +127,36 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
         keys = keys * size + (column - low)
     _, first, number = np.unique(keys, return_index=True, return_inverse=True)
     return np.stack([column[first] for column in columns], axis=1), number.reshape(-1)
+
+
+def narrowed(column: Ints) -> Ints:
+    """Returns integers in as few bytes each as they need."""
+    low, high = int(column.min(initial=0)), int(column.max(initial=0))
+    kinds = (np.int8, np.int16, np.int32, np.int64)
+    kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
+    narrow: Ints = column.astype(kind)
+    return narrow
+
+
+class Columns:
+    """A table of integers, which is read like an array of rows, in as few bytes as they need.
+
+    Args:
+        table: the rows.
+    """
+
+    def __init__(self, table: Ints) -> None:
+        self._columns = [narrowed(column) for column in table.T]
+        self.nbytes = sum(column.nbytes for column in self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns[0])
+
+    def __getitem__(self, at: Ints | tuple[Ints | slice[None, None, None], int]) -> Ints:
+        """Returns some rows, or these of one column."""
+        if isinstance(at, tuple):
+            return self._columns[at[1]][at[0]].astype(np.int64)
+        return np.stack([column[at] for column in self._columns], axis=1, dtype=np.int64)
 
 
 class Groups(NamedTuple):

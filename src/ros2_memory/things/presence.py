@@ -30,7 +30,7 @@ from ros2_memory.analysis.sights import (
     Sights,
     Unplaced,
 )
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import distinct_rows, in_ranges, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -82,7 +82,7 @@ class Cells:
     """
 
     def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
-        looks = sights.looks
+        looks = self._looks = sights.looks
         # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.slice, self.n, self.first, self.last, self.topic = (
             np.ascontiguousarray(looks[:, column])
@@ -112,6 +112,13 @@ class Cells:
         is_next &= self.slice[after] - self.slice[before] <= 1
         self._previous = np.full(len(order), -1, np.int64)
         self._previous[after] = np.where(is_next, before, -1)
+
+    @property
+    def looks(self) -> Looks:
+        """What answers need of the looks."""
+        names = (Look.SLICE, Look.FIRST, Look.LAST, Look.X, Look.Y, Look.YAW)
+        columns = (*(self._looks[:, name] for name in names), self.cell)
+        return Looks(*map(narrowed, columns))
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -222,13 +229,6 @@ def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topi
     return fields
 
 
-def in_ranges(starts: Ints, sizes: Ints) -> Ints:
-    """Returns the numbers of ranges, one range after another."""
-    before = np.cumsum(sizes) - sizes
-    numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
-    return numbers
-
-
 def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
     order = np.argsort(values, kind="stable")
     running = np.cumsum(n[order])
@@ -262,21 +262,44 @@ class Evidence(NamedTuple):
     times: Ints
     fair: Flags
 
-    def at(self, place: int) -> Evidence:
-        """Returns that for one place."""
-        ends = np.array([place, place + 1]) << _BITS
-        looks, blind = (
-            np.arange(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind)
+    def at(self, place: int) -> SeenFrom:
+        """Returns what `looks_without` takes of one place."""
+        begin, end = np.searchsorted(self.looks, np.array([place, place + 1]) << _BITS)
+        rows = slice(int(begin), int(end))
+        return SeenFrom(
+            narrowed(_number(self.looks[rows])),
+            narrowed(self.cell[rows]),
+            narrowed(self.n[rows]),
+            narrowed(self.hits[rows]),
+            self.fair[rows].copy(),
         )
-        return Evidence(
-            self.looks[looks],
-            self.cell[looks],
-            self.n[looks],
-            self.hits[looks],
-            self.blind[blind],
-            self.times[blind],
-            self.fair[looks],
-        )
+
+
+class SeenFrom(NamedTuple):
+    """The looks that tell whether a thing is at one place; as in `Evidence`."""
+
+    looks: Ints
+    cell: Ints
+    n: Ints
+    hits: Ints
+    fair: Flags
+
+
+class Looks(NamedTuple):
+    """From where detectors looked: a column each, in as few bytes as it needs.
+
+    Attributes:
+        slice, first, last, x, y, yaw: as in `Look`.
+        cell: that of the robot's pose, as in `Cells`.
+    """
+
+    slice: Ints
+    first: Ints
+    last: Ints
+    x: Ints
+    y: Ints
+    yaw: Ints
+    cell: Ints
 
 
 class Stay(NamedTuple):
@@ -462,19 +485,17 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
 
 
 def looks_without(
-    cells: Cells, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
+    every: Looks, evidence: SeenFrom, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
 ) -> tuple[int, Ns | None]:
     """Returns how many messages of a window [start, stop) could have had a thing, and have not.
 
     And when the chance that all of them missed it fell below 1 %; None where it did not.
 
-    `evidence` is that for this place.
-
     By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
-    looks, is_hit = _number(evidence.looks), evidence.hits > 0
-    slices, first, last = cells.slice[looks], cells.first[looks], cells.last[looks]
+    looks, is_hit = evidence.looks, evidence.hits > 0
+    slices, first, last = every.slice[looks], every.first[looks], every.last[looks]
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window
