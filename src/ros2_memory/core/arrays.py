@@ -132,7 +132,7 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
 def narrowed(column: Ints) -> Ints:
     """Returns integers in as few bytes each as they need."""
     low, high = int(column.min(initial=0)), int(column.max(initial=0))
-    kinds = (np.int8, np.int16, np.int32, np.int64)
+    kinds = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)
     kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
     narrow: Ints = column.astype(kind)
     return narrow

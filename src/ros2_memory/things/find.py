@@ -389,7 +389,7 @@ class _Finder:
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
         """Returns the state of a thing since it was last seen in the window, by all sightings."""
-        spots, looked = self.known.estimate.spots[rows], self.known.estimate.looks.last
+        spots, (_, looked) = self.known.estimate.spots[rows], self.known.estimate.looks.times()
         last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
         if by_all is not self.known:
             newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")

@@ -246,7 +246,7 @@ class Estimate:
             return None
         cells, cell_of = np.unique(self.looks.cell[looks], return_inverse=True)
         messages, last = np.bincount(cell_of, n), np.zeros(len(cells), np.int64)
-        np.maximum.at(last, cell_of, self.looks.last[looks])
+        np.maximum.at(last, cell_of, self.looks.times(looks)[1])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
         x, y, yaw = (

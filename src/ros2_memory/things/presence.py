@@ -21,6 +21,7 @@ import numpy as np
 from ros2_memory.analysis.sights import (
     CELL_DECIDEG,
     CELL_MM,
+    SLICE_NS,
     STOREY_MM,
     Flags,
     Floats,
@@ -67,6 +68,7 @@ _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 """A cell with so many looks is blocked if its share of hits is below this part of the others'."""
 _YAWS: Final = 3600 // CELL_DECIDEG
+_NS_PER_US: Final = np.int64(1_000)
 _PRIME: Final = 1_000_003
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
@@ -116,9 +118,12 @@ class Cells:
     @property
     def looks(self) -> Looks:
         """What answers need of the looks."""
-        names = (Look.SLICE, Look.FIRST, Look.LAST, Look.X, Look.Y, Look.YAW)
-        columns = (*(self._looks[:, name] for name in names), self.cell)
-        return Looks(*map(narrowed, columns))
+        begins = np.zeros(int(self.slice.max(initial=-1)) + 1, np.int64)
+        begins[self.slice] = self.first // SLICE_NS * SLICE_NS
+        after, lasted = self.first - begins[self.slice], self.last - self.first
+        poses = (self._looks[:, name] for name in (Look.X, Look.Y, Look.YAW))
+        columns = (self.slice, after // _NS_PER_US, lasted // _NS_PER_US, *poses, self.cell)
+        return Looks(begins, *map(narrowed, columns))
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -289,17 +294,26 @@ class Looks(NamedTuple):
     """From where detectors looked: a column each, in as few bytes as it needs.
 
     Attributes:
-        slice, first, last, x, y, yaw: as in `Look`.
+        begins: when each slice begins (ns).
+        slice, x, y, yaw: as in `Look`.
+        after_us: from the beginning of the slice to the first message; `lasted_us` from there on.
         cell: that of the robot's pose, as in `Cells`.
     """
 
+    begins: Ints
     slice: Ints
-    first: Ints
-    last: Ints
+    after_us: Ints
+    lasted_us: Ints
     x: Ints
     y: Ints
     yaw: Ints
     cell: Ints
+
+    def times(self, looks: Ints | None = None) -> tuple[Ints, Ints]:
+        """Returns the times (ns) of the first and the last message of some looks, or of all."""
+        which = slice(None) if looks is None else looks
+        first = self.begins[self.slice[which]] + self.after_us[which] * _NS_PER_US
+        return first, first + self.lasted_us[which] * _NS_PER_US
 
 
 class Stay(NamedTuple):
@@ -495,7 +509,7 @@ def looks_without(
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
     looks, is_hit = evidence.looks, evidence.hits > 0
-    slices, first, last = every.slice[looks], every.first[looks], every.last[looks]
+    slices, (first, last) = every.slice[looks], every.times(looks)
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window

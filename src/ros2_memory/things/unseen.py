@@ -234,10 +234,10 @@ def _labels_left_out(known: KnownThings) -> list[str]:
 
 def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    looks, window = known.estimate.looks, asked.window
+    window, (first, last) = asked.window, known.estimate.looks.times()
     topics = [topic for topic in known.estimate.topics if topic not in asked.undecoded]
     # Each message of a detector is a look.
-    is_empty = not ((looks.first < window.stop) & (looks.last >= window.start)).any()
+    is_empty = not ((first < window.stop) & (last >= window.start)).any()
     if topics and is_empty and known.reaches_back(window):
         yield (
             f"{listed(topics)} published nothing in this window: whether things were there "
