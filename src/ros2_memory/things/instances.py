@@ -166,9 +166,9 @@ class Tally(NamedTuple):
 
     def rows_of(self, spots: Ints) -> tuple[Ints, Ints, Ints]:
         """Returns how many rows each of some spots has, and what and how often in these."""
-        sizes = self.starts[spots + 1] - self.starts[spots]
-        rows = in_ranges(self.starts[spots], sizes)
-        return sizes, self.what[rows].astype(np.int64), self.n[rows].astype(np.int64)
+        begin, end = (self.starts[spots + nth].astype(np.int64) for nth in (0, 1))
+        rows = in_ranges(begin, end - begin)
+        return end - begin, self.what[rows].astype(np.int64), self.n[rows].astype(np.int64)
 
 
 @dataclass(slots=True)

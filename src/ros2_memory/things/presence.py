@@ -69,7 +69,6 @@ _BLOCKED_SHARE: Final = 0.1
 """A cell with so many looks is blocked if its share of hits is below this part of the others'."""
 _YAWS: Final = 3600 // CELL_DECIDEG
 _NS_PER_US: Final = np.int64(1_000)
-_PRIME: Final = 1_000_003
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
 
@@ -99,7 +98,7 @@ class Cells:
             looks[:, Look.Y] // CELL_MM,
             self.topic + poor * (len(sights.topics) + 1),
             epoch[self.slice],
-            looks[:, Look.PAN],
+            looks[:, Look.PAN] // CELL_DECIDEG,
             (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM,
         )
         cells, cell = distinct_rows(columns)
@@ -194,29 +193,37 @@ def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
     weight = np.bincount(cell, n)
     x, y, yaw = (np.bincount(cell, n * axis) / weight for axis in poses)
     rank = np.argsort(np.argsort(weight, kind="stable"), kind="stable")
-    keys, best = _hashed(cells), rank
+    best = rank.copy()
+    # With room for a step: what is in order, and each step from it, is found quickest.
+    sizes = cells.max(axis=0, initial=0) - cells.min(axis=0, initial=0) + 3
+    keys = _hashed(cells, sizes)
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    for step in product((-1, 0, 1), repeat=3):
+    for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
         beside = cells.copy()
         beside[:, :3] += step
         beside[:, 0] %= _YAWS
-        wanted = _hashed(beside)
-        other = order[np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)]
-        turn = np.abs((yaw[other] - yaw + 180.0) % 360.0 - 180.0)
-        near = (keys[other] == wanted) & (turn < CELL_DECIDEG / 10) & (cells[:, 0] >= 0)
-        near &= np.hypot(x[other] - x, y[other] - y) < CELL_MM
-        best = np.where(near, np.maximum(best, rank[other]), best)
+        wanted = _hashed(beside, sizes)
+        place = np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)
+        one = np.flatnonzero((ordered[place] == wanted) & (cells[:, 0] >= 0))
+        other = order[place[one]]
+        turn = np.abs((yaw[other] - yaw[one] + 180.0) % 360.0 - 180.0)
+        near = (turn < CELL_DECIDEG / 10) & (
+            np.hypot(x[other] - x[one], y[other] - y[one]) < CELL_MM
+        )
+        one, other = one[near], other[near]
+        best[one] = np.maximum(best[one], rank[other])
+        best[other] = np.maximum(best[other], rank[one])
     leader = np.argsort(rank, kind="stable")[best]
     joined: Ints = np.where(leader[leader] == leader, leader, np.arange(len(cells)))
     return joined
 
 
-def _hashed(rows: Ints) -> Ints:
-    """Returns a number for each row; of different ones, hardly ever the same."""
+def _hashed(rows: Ints, sizes: Ints) -> Ints:
+    """Returns a number for each row, in their order unless there may be too many of them."""
     numbers = np.zeros(len(rows), np.int64)
-    for column in rows.T:
-        numbers = numbers * _PRIME + column
+    for column, size in zip(rows.T, sizes, strict=True):
+        numbers = numbers * size + column
     return numbers
 
 
