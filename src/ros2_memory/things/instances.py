@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import chain, groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -73,6 +74,8 @@ _SEVERAL_SHARE: Final = 0.1
 _FEWEST_BESIDE: Final = 3
 _NEWEST_BESIDE: Final = 9
 """So many slices say how many there are now: of more, some may have been taken away since."""
+_STAYS_AT_ONCE: Final = 64
+"""So many are compared with all at once."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -466,7 +469,7 @@ def _groups(observed: _Observations, epoch: Ints, keys: Sequence[str]) -> list[_
     group_of = epoch[spots[:, Spot.SLICE]] * width + key_of_label[spots[:, Spot.LABEL]]
     group_of[observed.counts == 0] = -1
     groups = []
-    for number in np.unique(group_of[group_of >= 0]).tolist():
+    for number in np.flatnonzero(np.bincount(group_of[group_of >= 0])).tolist():
         group_epoch, key = divmod(number, width)
         without_place = unplaced[key_of_label[unplaced[:, Unplaced.LABEL]] == key]
         rows = np.flatnonzero(group_of == number)
@@ -511,8 +514,7 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
     """Returns at which places slices have several spots of a label: things that stand together."""
-    width = int(groups.max(initial=0)) + 1
-    distinct = np.bincount(np.unique(place * width + groups) // width)
+    distinct = np.bincount(distinct_rows((place, groups))[0][:, 0])
     several: Flags = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
     return several
 
@@ -580,26 +582,28 @@ def _remove_false_stays(
     What a thing was called wrongly is counted in `PlacedStay.also`.
     """
     stays = [(group, stay) for group in groups for stay in group.stays]
-    hosts = _Hosts(stays, observed, keys)
-    for number in sorted(range(len(stays)), key=lambda number: stays[number][1].count):
+    candidates = _Hosts(stays, observed, keys)
+    hosts: dict[int, list[int]] = {}
+    for begin in range(0, len(stays), _STAYS_AT_ONCE):
         observed.go_on()
-        group, stay = stays[number]
-        host_group, host = hosts.take(number) or (None, None)
-        if host is not None and host_group is not group:
-            host.also += spellings(observed.sights, observed.counts, stay.spots)
+        hosts.update(candidates.of(np.arange(begin, min(begin + _STAYS_AT_ONCE, len(stays)))))
+    taken: set[int] = set()
+    for number in sorted(hosts, key=lambda number: (stays[number][1].count, number)):
+        host = next((host for host in hosts[number] if host not in taken), None)
+        if host is not None:
+            taken.add(number)
+            (group, stay), (host_group, hosting) = stays[number], stays[host]
+            if host_group is not group:
+                hosting.also += spellings(observed.sights, observed.counts, stay.spots)
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):
-        if not hosts.taken[number] and not stay.weak:
+        if number not in taken and not stay.weak:
             group.stays.append(stay)
 
 
 class _Hosts:
-    """Finds the stays that others are a wrong name of, or the noise around.
-
-    Attributes:
-        taken: which stays are part of another one.
-    """
+    """Finds the stays that others may be a wrong name of, or the noise around."""
 
     def __init__(
         self,
@@ -607,71 +611,64 @@ class _Hosts:
         observed: _Observations,
         keys: Sequence[str],
     ) -> None:
-        self.taken = np.zeros(len(stays), np.bool_)
-        self._stays = stays
+        self._stays = [stay for _, stay in stays]
         self._beside = Tally.of(observed.sights.beside, len(observed.sights.spots))
         distinct = [*dict.fromkeys(keys)]
         self._key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
-        rows = [
-            (distinct.index(group.key), group.epoch, stay.count, stay.first, stay.last, stay.weak)
-            for group, stay in stays
-        ]
-        self._columns = np.array(rows, np.int64).reshape(-1, 6).T
-        places = [(stay.x, stay.y, stay.z) for _, stay in stays]
+        self._key = np.array([distinct.index(group.key) for group, _ in stays], np.int64)
+        self._epoch = np.array([group.epoch for group, _ in stays], np.int64)
+        rows = [(stay.count, stay.first, stay.last, stay.weak) for stay in self._stays]
+        self._count, self._first, self._last, self._weak = np.array(rows, np.int64).reshape(-1, 4).T
+        slices = [(stay.stay.first_slice, stay.stay.last_slice + 1) for stay in self._stays]
+        self._slices = np.array(slices, np.int64).reshape(-1, 2).T
+        places = [(stay.x, stay.y, stay.z) for stay in self._stays]
         self._places = np.array(places, np.float64).reshape(-1, 3).T
         self._order = np.argsort(self._places[0], kind="stable")
-        self._x = self._places[0, self._order]
         # The spots of all stays, as numbers in order, and how often these and those before count.
-        sizes = [len(stay.spots) for _, stay in stays]
+        sizes = [len(stay.spots) for stay in self._stays]
         number = np.repeat(np.arange(len(stays)), sizes)
-        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in self._stays)])
         self._width = observed.sights.slices + 1
         self._seen = number * self._width + observed.sights.spots[spots, Spot.SLICE]
         self._times = np.append(0, np.cumsum(observed.counts[spots]))
         together = observed.sights.spots[spots, Spot.TOGETHER] > 1
         self._are_several = 2 * np.bincount(number, together, len(stays)) >= sizes
 
-    def take(self, number: int) -> tuple[_Group, PlacedStay] | None:
-        """Returns the host of a stay, which is taken then; None where it is none's part."""
-        _, stay = self._stays[number]
-        others, away_mm = self._near(number)
-        key, _, counts, *_ = self._columns[:, others]
-        is_same = key == self._columns[0, number]
-        ends = stay.stay.first_slice, stay.stay.last_slice + 1
-        begin, end = (np.searchsorted(self._seen, others * self._width + at) for at in ends)
-        hosted = self._times[end] - self._times[begin]
-        is_tiny = (stay.count <= hosted) & (stay.count <= _TINY_SHARE * counts)
+    def of(self, numbers: Ints) -> Iterator[tuple[int, list[int]]]:
+        """Yields which of some stays may be part of others, with these, the likeliest first."""
+        one, other, away_mm = self._near(numbers)
+        begin, end = (
+            np.searchsorted(self._seen, other * self._width + at[one]) for at in self._slices
+        )
+        count, hosted = self._count[one], self._times[end] - self._times[begin]
+        is_same = self._key[one] == self._key[other]
+        is_tiny = (count <= hosted) & (count <= _TINY_SHARE * self._count[other])
         # Where most messages that have one have both of them, this one is no noise.
-        if self._are_several[number]:
-            is_tiny &= ~is_same | (2 * stay.count <= hosted)
-        is_part = is_tiny | (stay.count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
-        is_part &= is_same | (away_mm <= _SAME_PLACE_MM)
-        is_part &= (hosted > 0) & ~self.taken[others]
-        if is_part.any():
-            is_part &= is_same | (self._beside_of(stay)[key] < _BESIDE_SHARE * stay.count)
-        if not is_part.any():
-            return None
-        self.taken[number] = True
-        return self._stays[int(others[np.where(is_part, hosted, 0).argmax()])]
+        is_tiny &= ~(self._are_several[one] & is_same) | (2 * count <= hosted)
+        is_part = is_tiny | (count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
+        is_part &= (is_same | (away_mm <= _SAME_PLACE_MM)) & (hosted > 0)
+        order = np.lexsort((other, -hosted, one))
+        order = order[is_part[order]]
+        pairs = zip(one[order].tolist(), other[order].tolist(), strict=True)
+        for number, hosts in groupby(pairs, itemgetter(0)):
+            # How often its detections had labels of each key beside them.
+            _, label, n = self._beside.rows_of(self._stays[number].spots)
+            beside = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
+            is_apart = beside >= _BESIDE_SHARE * self._count[number]
+            is_apart[self._key[number]] = False
+            yield number, [host for _, host in hosts if not is_apart[self._key[host]]]
 
-    def _near(self, number: int) -> tuple[Ints, Floats]:
-        """Returns the numbers of stays near one at that time, in order, and how far (mm)."""
-        x, y, z = self._places[:, number]
-        _, epoch, _, first, last, _ = self._columns[:, number]
-        start, stop = np.searchsorted(self._x, (x - _HALO_MM, x + _HALO_MM))
-        others = np.sort(self._order[start:stop])
-        other_x, other_y, other_z = self._places[:, others]
-        _, epochs, _, firsts, lasts, weak = self._columns[:, others]
-        away = np.hypot(other_x - x, other_y - y)
-        is_near = (away <= _HALO_MM) & (firsts <= last) & (lasts >= first) & (others != number)
-        is_near &= (epochs == epoch) & (weak == 0) & (np.abs(other_z - z) <= STOREY_MM)
-        return others[is_near], away[is_near]
-
-    def _beside_of(self, stay: PlacedStay) -> Ints:
-        """Returns how often its detections had labels of each key beside them."""
-        _, label, n = self._beside.rows_of(stay.spots)
-        counts: Ints = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
-        return counts
+    def _near(self, numbers: Ints) -> tuple[Ints, Ints, Floats]:
+        """Returns some stays and others near each at that time, as pairs, and how far (mm)."""
+        x, y, z = self._places
+        ends = (x[numbers] - _HALO_MM, x[numbers] + _HALO_MM)
+        start, stop = (np.searchsorted(x[self._order], end) for end in ends)
+        one, other = np.repeat(numbers, stop - start), self._order[in_ranges(start, stop - start)]
+        away = np.hypot(x[other] - x[one], y[other] - y[one])
+        is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
+        is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
+        is_near &= (self._epoch[other] == self._epoch[one]) & (self._weak[other] == 0)
+        return one[is_near], other[is_near], away[is_near]
 
 
 def _link(group: _Group, observed: _Observations) -> list[Instance]:

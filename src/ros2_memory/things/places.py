@@ -273,7 +273,7 @@ def _differences(series: _Series) -> tuple[Floats, Ints]:
     means = sums / sums[:, :1]
     begins = np.flatnonzero(np.diff(thing, prepend=-1))
     normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins)
-    fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR[:3]), normal[:, :3, 3:])
+    fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR), normal[:, :3, 3:])
     off = means[:, 3:] - np.einsum("vi,vij->vj", means[:, :3], fit[thing])
     by_looks = 1 / sums[:-1, 0] + 1 / sums[1:, 0]
     variance = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
@@ -304,10 +304,10 @@ def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Flo
     return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
 
 
-_PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2, 0.0])
-"""What is known (1/mm²) before any look of the place, the bias by side in x and y, and the step.
+_PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2])
+"""What is known (1/mm²) before any look of the place, and of the bias by side in x and y.
 
-Of the place next to nothing, so that the equations have a solution; of the step nothing.
+Of the place next to nothing, so that the equations have a solution.
 """
 
 
@@ -372,15 +372,17 @@ def _squared_errors(old: Floats, new: Floats) -> Floats:
 
     By the squares before and after it. Unknown are the place, the bias in x and y, and the step.
     """
-    both = old + new
-    normal = np.zeros((len(both), 4, 4))
-    normal[:, :3, :3] = both[:, :3, :3]
-    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
-    normal[:, 3, 3] = new[:, 0, 0]
-    right = np.concatenate((both[:, :3, 3:], new[:, :1, 3:]), axis=1)
-    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
-    length_squared = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
-    return np.where(length_squared >= LEAST_MM**2, length_squared / inverse[:, 3, 3], 0.0)
+    both, of_new = (old + new).transpose(1, 2, 0), new[:, 0].T
+    both[[0, 1, 2], [0, 1, 2]] += _PRIOR[:, None]
+    # The equations, and the right sides in x and y; from the last one the others are eliminated.
+    rows = np.insert(both, 3, of_new[:3], axis=1)
+    rows = np.concatenate((rows, of_new[None, [0, 1, 2, 0, 3, 4]]))
+    for nth in range(3):
+        share = rows[nth + 1 :, nth] / rows[nth, nth]
+        rows[nth + 1 :] -= share[:, None] * rows[nth]
+    weight, *sums = rows[3, 3:]
+    length_squared = sum((side / weight) ** 2 for side in sums)
+    return np.where(length_squared >= LEAST_MM**2, length_squared * weight, 0.0)
 
 
 def _before_and_after(

@@ -233,7 +233,7 @@ def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topi
     That is for each of so many topics where nearly all its detections lie: `n` at each.
     """
     fields = np.full((topics, 3), -1.0)
-    for number in np.unique(topic).tolist():
+    for number in np.flatnonzero(np.bincount(topic)).tolist():
         rows = topic == number
         [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
         sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
