@@ -103,8 +103,9 @@ class Cells:
         )
         cells, cell = distinct_rows(columns)
         self.cell = _joined(cells, cell, np.stack((self.x, self.y, self.yaw)), self.n)[cell]
-        order = np.argsort(self.cell, kind="stable")
+        order = np.argsort(narrowed(self.cell), kind="stable")  # of 16 bits it is much faster
         self._by_cell = order
+        self._slice_starts = np.searchsorted(self.slice, np.arange(sights.slices + 1))
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
@@ -132,9 +133,7 @@ class Cells:
 
     def looks_during(self, slices: Ints) -> Ints:
         """Returns all looks of some slices of places, by slice."""
-        start, stop = (
-            np.searchsorted(self.slice, _number(slices), side) for side in ("left", "right")
-        )
+        start, stop = (self._slice_starts[_number(slices) + nth] for nth in (0, 1))
         looks = in_ranges(start, stop - start)
         return _keys(np.repeat(_place(slices), stop - start), looks)
 
@@ -152,7 +151,7 @@ class Cells:
 
     def looked_in(self, number: int) -> Ns | None:
         """Returns when the first look of a slice ended; None without any."""
-        start, stop = np.searchsorted(self.slice, (number, number + 1))
+        start, stop = self._slice_starts[number : number + 2].tolist()
         return int(self.last[start:stop].min()) if start < stop else None
 
     def cells_of(self, looks: Ints) -> Ints:
@@ -242,7 +241,7 @@ def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topi
 
 
 def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
-    order = np.argsort(values, kind="stable")
+    order = np.argsort(values)
     running = np.cumsum(n[order])
     ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
     return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
@@ -364,9 +363,15 @@ def evidence_at(
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
-    beside = beside[_are_in(hit_cells, cells.cells_of(beside))]
-    looks = _distinct(np.concatenate((beside, cells.looks_from(hit_cells[sees]))))
-    cell = np.searchsorted(hit_cells, cells.cells_of(looks))
+    keys = cells.cells_of(beside)
+    cell = np.searchsorted(hit_cells, keys)
+    is_of_one = np.append(hit_cells, -1)[cell] == keys
+    looks_in = cells.looks_in[_number(hit_cells[sees])]
+    cell = np.concatenate((cell[is_of_one], np.repeat(np.flatnonzero(sees), looks_in)))
+    looks = np.concatenate((beside[is_of_one], cells.looks_from(hit_cells[sees])))
+    order = np.argsort(looks, kind="stable")
+    order = order[np.diff(looks[order], prepend=-1) > 0]
+    looks, cell = looks[order], cell[order]
     hits = np.zeros(len(looks), np.int64)
     hits[np.searchsorted(looks, hit_looks)] = hits_of
     fair = sees[cell]
