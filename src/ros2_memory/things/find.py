@@ -94,7 +94,9 @@ def find_things(
     note_other_frames(view, known, region)
     asked = {known.labels.key(label): label for label in labels}
     places = places_asked(limits, region, known.frames)
-    finder = _Finder(known, window, region, places, now)
+    _, looked = known.estimate.looks.times()
+    latest_look = int(looked[looked < window.stop].max(initial=0))
+    finder = _Finder(known, window, region, places, now, latest_look)
     found = sorted(finder.find(asked), key=lambda row: (-row.last, row.label, row.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
@@ -235,6 +237,7 @@ class _Finder:
         where: the region they are to be in; None for all.
         places: the named ones.
         now: the time of the call (ns).
+        latest_look: when the last look that ended in the window did.
     """
 
     known: KnownThings
@@ -242,6 +245,7 @@ class _Finder:
     where: Where | None
     places: tuple[Place, ...]
     now: Ns
+    latest_look: Ns
 
     def find(self, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields the things of these keys, or all where there are none."""
@@ -389,7 +393,7 @@ class _Finder:
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
         """Returns the state of a thing since it was last seen in the window, by all sightings."""
-        spots, (_, looked) = self.known.estimate.spots[rows], self.known.estimate.looks.times()
+        spots = self.known.estimate.spots[rows]
         last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
         if by_all is not self.known:
             newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
@@ -405,7 +409,7 @@ class _Finder:
             looks, missed = by_all.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
-        if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
+        if last + _JUST_NOW_NS >= self.latest_look:
             return StillThere("in_view", last)
         # Of a later look nothing is known where the estimate ends.
         return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None
