@@ -237,7 +237,7 @@ class _Finder:
         where: the region they are to be in; None for all.
         places: the named ones.
         now: the time of the call (ns).
-        latest_look: when the last look that ended in the window did.
+        latest_look: when the last of the looks that end before the window does ended (ns).
     """
 
     known: KnownThings

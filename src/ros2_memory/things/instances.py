@@ -44,7 +44,6 @@ from ros2_memory.things.presence import (
     Cells,
     Evidence,
     Looks,
-    SeenFrom,
     Stay,
     evidence_at,
     fields_of_view,
@@ -195,7 +194,7 @@ class Estimate:
     """Which spots were seen while localisation was poor."""
     names: dict[str, str]
     """The name to show of each key."""
-    evidence: dict[tuple[str, int, int], SeenFrom]
+    evidence: dict[tuple[str, int, int], Evidence]
     """By key, epoch and place: the evidence for the places of things."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
     stay_of: Ints = field(init=False)
@@ -344,7 +343,7 @@ def estimate(
     _remove_false_stays(groups, observed, keys)
     instances: list[Instance] = []
     movers: list[Mover] = []
-    evidence: dict[tuple[str, int, int], SeenFrom] = {}
+    evidence: dict[tuple[str, int, int], Evidence] = {}
     for group in groups:
         linked = _link(group, observed)
         _add_poorly_localised(group, linked, observed)

@@ -273,27 +273,21 @@ class Evidence(NamedTuple):
     times: Ints
     fair: Flags
 
-    def at(self, place: int) -> SeenFrom:
-        """Returns what `looks_without` takes of one place."""
-        begin, end = np.searchsorted(self.looks, np.array([place, place + 1]) << _BITS)
-        rows = slice(int(begin), int(end))
-        return SeenFrom(
-            narrowed(_number(self.looks[rows])),
-            narrowed(self.cell[rows]),
-            narrowed(self.n[rows]),
-            narrowed(self.hits[rows]),
-            self.fair[rows].copy(),
+    def at(self, place: int) -> Evidence:
+        """Returns that for one place alone, in few bytes."""
+        ends = np.array([place, place + 1]) << _BITS
+        looks, blind = (
+            slice(*np.searchsorted(keys, ends).tolist()) for keys in (self.looks, self.blind)
         )
-
-
-class SeenFrom(NamedTuple):
-    """The looks that tell whether a thing is at one place; as in `Evidence`."""
-
-    looks: Ints
-    cell: Ints
-    n: Ints
-    hits: Ints
-    fair: Flags
+        return Evidence(
+            narrowed(_number(self.looks[looks])),
+            narrowed(self.cell[looks]),
+            narrowed(self.n[looks]),
+            narrowed(self.hits[looks]),
+            narrowed(_number(self.blind[blind])),
+            narrowed(self.times[blind]),
+            self.fair[looks].copy(),
+        )
 
 
 class Looks(NamedTuple):
@@ -511,11 +505,12 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
 
 
 def looks_without(
-    every: Looks, evidence: SeenFrom, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
+    every: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
 ) -> tuple[int, Ns | None]:
     """Returns how many messages of a window [start, stop) could have had a thing, and have not.
 
     And when the chance that all of them missed it fell below 1 %; None where it did not.
+    `evidence` is that for this place alone.
 
     By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
     cell's own rate is known as well as its messages make it (a uniform prior).
