@@ -13,7 +13,7 @@ a thing was missed before or after it was last seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from itertools import combinations, groupby
 from operator import attrgetter
@@ -102,7 +102,6 @@ AHEAD_MM: Final = 2_000
 TABLES: Final = (Spot, Look, Hit, Score, Beside, Unplaced, Fix)
 """The columns of each table of `Sights`."""
 _NAMES: Final = ("spots", "looks", "hits", "scores", "beside", "unplaced", "fixes")
-_ONLY_ESTIMATED: Final = ("looks", "hits", "beside", "fixes")
 
 
 class DetectorMessages(NamedTuple):
@@ -162,12 +161,6 @@ class Sights:
         tables: tuple[Ints, ...] = attrgetter(*_NAMES)(self)
         return tables
 
-    def seen(self, lowest: int) -> Sights:
-        """Returns what answers show of these sights: of scores no lower bins."""
-        scores = self.scores[self.scores[:, Score.BIN] >= lowest]
-        none = {name: getattr(self, name)[:0].copy() for name in _ONLY_ESTIMATED}
-        return replace(self, scores=scores, **none)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Detections:
@@ -203,7 +196,7 @@ def sights_of(topic: str, seen: DetectorMessages) -> Sights:
         _spots(kept, spot, seen.times, together[group[cluster >= 0]]),
         looks,
         _tallied(spot, look[kept.message]),
-        _tallied(spot[scored], _bins(kept.score[scored])),
+        _tallied(spot[scored], bin_of(_thousandths(kept.score[scored]))),
         _tallied(spot[which], other),
         _unplaced(lost, seen.times),
         np.zeros((0, len(Fix)), np.int64),
@@ -450,8 +443,9 @@ def _thousandths(scores: Floats) -> Ints:
     return np.rint(np.clip(np.nan_to_num(scores), 0.0, _MAX_SCORE) * 1000).astype(np.int64)
 
 
-def _bins(scores: Floats) -> Ints:
-    return np.minimum(_thousandths(scores) * SCORE_BINS // 1000, SCORE_BINS - 1)
+def bin_of(thousandths: Ints) -> Ints:
+    """Returns the bins of scores; -1 of what has none."""
+    return np.minimum(thousandths * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 
 def _rounded(times: Ints) -> Ints:

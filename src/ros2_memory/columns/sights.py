@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import math
+from itertools import chain
 from struct import Struct
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -43,6 +44,11 @@ _NS_PER_US: Final = 1_000
 _SLICE_US: Final = SLICE_NS // _NS_PER_US
 _SIGN: Final = 63
 _SPOTS, _LOOKS, _HITS, _SCORES, _BESIDE, _UNPLACED, _FIXES = range(len(TABLES))
+_NAMED: Final = (
+    ((_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)),
+    ((_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)),
+)
+"""Which columns of which tables are topics, and labels."""
 
 
 class _Times(NamedTuple):
@@ -95,32 +101,28 @@ def joined(
     epoch (the coordinate system of a part) are different ones. Fixes are in order of time for each
     session: at one time there may be several robots.
     """
-    unpacked = _Unpacked(parts)
-    spots, looks, hits, scores, beside, unplaced, fixes = unpacked.tables
-    topics, labels = unpacked.names()
+    topics, labels, tables, part = _unpacked(parts)
     epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
-    slices = unpacked.with_slices_numbered(epoch)
-    spot_order = _order(spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL])
-    look_order = _order(looks[:, Look.SLICE], looks[:, Look.TOPIC])
-    unpacked.renumber_references(_places_of(spot_order), _places_of(look_order))
     session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
-    tables = (
-        spots[spot_order],
-        looks[look_order],
-        *(table[_order(table[:, 0], table[:, 1])] for table in (hits, scores, beside)),
-        unplaced[_order(unplaced[:, 0], unplaced[:, 1], unplaced[:, 2])],
-        _distinct_fixes(fixes, session[unpacked.part[_FIXES]]),
-    )
-    return Sights(topics, labels, *tables, slices=len(slices)), slices[:, 1]
+    slices = np.concatenate([tables[at][0] for at in _IN_SLICES])
+    rows, number = distinct_rows((slices, np.concatenate([epoch[part[at]] for at in _IN_SLICES])))
+    for at in _IN_SLICES:
+        tables[at][0], number = np.split(number, [tables[at].shape[1]])
+    spots, looks, hits, scores, beside, unplaced, fixes = tables
+    spots, place = _ordered(spots, 3)
+    for table in (hits, scores, beside):
+        table[0] = place[table[0]]
+    looks, place = _ordered(looks, 2)
+    hits[Hit.LOOK] = np.append(place, -1)[hits[Hit.LOOK]]
+    ordered = (spots, looks, *(_ordered(table, 2)[0] for table in (hits, scores, beside)))
+    ordered += _ordered(unplaced, 3)[0], _distinct_fixes(fixes, session[part[_FIXES]])
+    return Sights(topics, labels, *(table.T for table in ordered), slices=len(rows)), rows[:, 1]
 
 
 def united(parts: Sequence[bytes]) -> bytes:
     """Returns packed parts as one: their rows one after the other."""
-    unpacked = _Unpacked(parts)
-    names = unpacked.names()
-    spots, looks, *_ = (np.arange(len(table)) for table in unpacked.tables)
-    unpacked.renumber_references(spots, looks)
-    return packed(Sights(*names, *unpacked.tables))
+    topics, labels, tables, _ = _unpacked(parts)
+    return packed(Sights(topics, labels, *(table.T for table in tables)))
 
 
 def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
@@ -128,125 +130,76 @@ def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
 
     Where a stretch of the clock ends, both that it parts have the fix.
     """
-    order = np.lexsort((*fixes.T[::-1], session))
-    fixes, session = fixes[order], session[order]
-    is_other = np.ones(len(fixes), np.bool_)
-    is_other[1:] = (fixes[1:] != fixes[:-1]).any(axis=1) | (session[1:] != session[:-1])
-    return fixes[is_other]
+    order = np.lexsort((*fixes[::-1], session))
+    fixes, session = fixes[:, order], session[order]
+    is_other = np.ones(len(session), np.bool_)
+    is_other[1:] = (np.diff(fixes) != 0).any(axis=0) | (np.diff(session) != 0)
+    return fixes[:, is_other]
 
 
-class _Unpacked:
-    """Parts unpacked together: numpy takes longer to be called than to go through a part.
+def _unpacked(
+    parts: Sequence[bytes],
+) -> tuple[tuple[str, ...], tuple[str, ...], list[Ints], list[Ints]]:
+    """Returns the topics and labels of all parts, their tables, and the part of each row of these.
 
-    Attributes:
-        topics: the names of the topics of each part.
-        labels: likewise.
-        part: by table, the part of each row.
-        tables: the rows of all parts, with slices and times as in `Sights`.
+    Each table has its columns one after the other; numbers of spots and looks are of the whole.
     """
-
-    def __init__(self, parts: Sequence[bytes]) -> None:
-        self.topics: list[list[str]] = []
-        self.labels: list[list[str]] = []
-        counts, slices = [], []
-        planes: list[list[Bytes]] = [[] for _ in TABLES]
-        for part in parts:
-            data = decompressed(part)
-            width, begin, *rows, size = _HEAD.unpack_from(data)
-            at = _HEAD.size + size
-            topics, labels = json.loads(data[_HEAD.size : at])
-            self.topics.append(topics)
-            self.labels.append(labels)
-            counts.append(rows)
-            slices.append(begin)
-            for blocks, columns, count in zip(planes, TABLES, rows, strict=True):
-                shape = (len(columns), width, count)
+    planes: list[list[Bytes]] = [[] for _ in TABLES]
+    names, heads = [], []
+    for part in parts:
+        data = decompressed(part)
+        width, begin, *counts, size = _HEAD.unpack_from(data)
+        at = _HEAD.size + size
+        names.append(json.loads(data[_HEAD.size : at]))
+        heads.append((begin, *counts))
+        for blocks, columns, count in zip(planes, TABLES, counts, strict=True):
+            shape = (len(columns), width, count)
+            if count:
                 blocks.append(np.frombuffer(data, np.uint8, math.prod(shape), at).reshape(shape))
-                at += math.prod(shape)
-        self._sizes = np.array(counts, np.int64).reshape(-1, len(TABLES)).T
-        self.part = [np.repeat(np.arange(len(parts)), sizes) for sizes in self._sizes]
-        first = np.array(slices, np.int64)
-        self.tables = [
-            _table(at, planes.pop(0), part, first[part]) for at, part in enumerate(self.part)
-        ]
-
-    def renumber_references(self, spots: Ints, looks: Ints) -> None:
-        """Changes numbers of spots and looks inside their part into their places in the whole.
-
-        Args:
-            spots: the place of each spot of all parts.
-            looks: likewise; a hit without a look keeps -1.
-        """
-        for number in (_HITS, _SCORES, _BESIDE):
-            table = self.tables[number]
-            table[:, 0] = spots[table[:, 0] + self.begins(_SPOTS)[self.part[number]]]
-        hits = self.tables[_HITS]
-        look = hits[:, Hit.LOOK] + self.begins(_LOOKS)[self.part[_HITS]]
-        look = np.where(hits[:, Hit.LOOK] < 0, -1, look)
-        hits[:, Hit.LOOK] = np.append(looks, [-1])[look]
-
-    def begins(self, at: int) -> Ints:
-        """Returns where the rows of each part begin in a table."""
-        sizes = self._sizes[at]
-        begins: Ints = np.cumsum(sizes) - sizes
-        return begins
-
-    def names(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Returns the names of topics and of labels, having changed their numbers in the tables."""
-        topics = self._renamed(self.topics, [(_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)])
-        return topics, self._renamed(self.labels, [(_SPOTS, 2), (_UNPLACED, 2), (_BESIDE, 1)])
-
-    def _renamed(
-        self, names: Sequence[Sequence[str]], columns: Sequence[tuple[int, int]]
-    ) -> tuple[str, ...]:
-        """Returns the names of all parts, sorted, having changed their numbers in some columns."""
-        united = sorted({name for part_names in names for name in part_names})
-        number = {name: nth for nth, name in enumerate(united)}
-        numbers = np.array([number[name] for part_names in names for name in part_names], np.int64)
-        begins = np.cumsum([0, *map(len, names)])
-        for at, column in columns:
-            table = self.tables[at]
-            table[:, column] = numbers[table[:, column] + begins[self.part[at]]]
-        return tuple(united)
-
-    def with_slices_numbered(self, epoch: Ints) -> Ints:
-        """Returns all slices with their epochs, having changed slices to their numbers."""
-        tables = [self.tables[at] for at in _IN_SLICES]
-        slices = np.concatenate([table[:, 0] for table in tables])
-        epochs = np.concatenate([epoch[self.part[at]] for at in _IN_SLICES])
-        rows, number = distinct_rows((slices, epochs))
-        ends = np.cumsum([len(table) for table in tables])[:-1]
-        for table, table_slices in zip(tables, np.split(number, ends), strict=True):
-            table[:, 0] = table_slices
-        return rows
+            at += math.prod(shape)
+    starts, *sizes = np.array(heads, np.int64).reshape(-1, 1 + len(TABLES)).T
+    numbers = np.arange(len(parts))
+    part_of = [np.repeat(numbers, rows) for rows in sizes]
+    # Of all parts at once: numpy takes longer to be called than to go through a part.
+    tables = [_restored(planes.pop(0), part, at) for at, part in enumerate(part_of)]
+    for at, times in _IN_SLICES.items():
+        table = tables[at]
+        table[0] += starts[part_of[at]]
+        table[times.first] = (table[times.first] + table[0] * _SLICE_US) * _NS_PER_US
+        if times.last is not None:
+            table[times.last] = table[times.last] * _NS_PER_US + table[times.first]
+    for at in (_HITS, _SCORES, _BESIDE):
+        tables[at][0] += (np.cumsum(sizes[_SPOTS]) - sizes[_SPOTS])[part_of[at]]
+    look = tables[_HITS][Hit.LOOK]
+    look += (look >= 0) * (np.cumsum(sizes[_LOOKS]) - sizes[_LOOKS])[part_of[_HITS]]
+    united_names = []
+    for kind, places in enumerate(_NAMED):
+        of_parts = [part_names[kind] for part_names in names]
+        united_names.append(tuple(sorted({*chain.from_iterable(of_parts)})))
+        number = {name: nth for nth, name in enumerate(united_names[-1])}
+        codes = np.array([number[name] for name in chain.from_iterable(of_parts)], np.int64)
+        begins = np.cumsum([0, *map(len, of_parts)])
+        for at, column in places:
+            tables[at][column] = codes[tables[at][column] + begins[part_of[at]]]
+    topics, labels = united_names
+    return topics, labels, tables, part_of
 
 
-def _table(at: int, planes: Sequence[Bytes], part: Ints, begin: Ints) -> Ints:
-    """Returns the rows of one table of all parts; `part` and its first slice are of each row."""
+def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
+    """Returns the columns of a table; `planes` of parts are by column, and by byte of a number."""
     width = max((block.shape[1] for block in planes), default=4)
     wide = [np.zeros((len(TABLES[at]), width, 0), np.uint8)]
     wide += [block if block.shape[1] == width else _widened(block) for block in planes]
     stacked = np.ascontiguousarray(np.concatenate(wide, axis=2).transpose(0, 2, 1))
-    coded = stacked.view(f"<u{width}")[:, :, 0].astype(np.uint64)
-    del wide, stacked
-    # In place: in a week of a detector that sees things everywhere there are millions.
-    sign = coded & 1
-    coded >>= 1
-    columns: Ints = coded.view(np.int64)
-    columns ^= -sign.view(np.int64)
-    del sign
+    coded = stacked.view(f"<u{width}")[:, :, 0]
+    steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
+    columns = np.empty(steps.shape, np.int64)
     firsts = np.flatnonzero(np.diff(part, prepend=-1))
-    before = columns[:, firsts]
-    np.cumsum(columns, axis=1, out=columns)
-    before = columns[:, firsts] - before
-    columns -= np.repeat(before, np.diff(firsts, append=len(part)), axis=1)
-    times = _IN_SLICES.get(at)
-    if times is not None:
-        columns[0] += begin
-        columns[times.first] = (columns[times.first] + columns[0] * _SLICE_US) * _NS_PER_US
-        if times.last is not None:
-            columns[times.last] = columns[times.last] * _NS_PER_US + columns[times.first]
-    return columns.T
+    sizes = np.diff(firsts, append=len(part))
+    for column, of_column in zip(columns, steps, strict=True):  # one is in the processor's cache
+        np.cumsum(of_column, out=column)
+        np.subtract(column, np.repeat(column[firsts] - of_column[firsts], sizes), out=column)
+    return columns
 
 
 def _widened(planes: Bytes) -> Bytes:
@@ -254,17 +207,15 @@ def _widened(planes: Bytes) -> Bytes:
     return np.concatenate((planes, np.zeros_like(planes)), axis=1)
 
 
-def _order(*columns: Ints) -> Ints:
-    """Returns the order of rows by their columns: quickly, as most are in it already."""
-    keys = columns[0]
-    for column in columns[1:]:
+def _ordered(table: Ints, keys: int) -> tuple[Ints, Ints]:
+    """Returns a table in the order of its first columns, so many, and the new place of each row."""
+    key = table[0]
+    for column in table[1:keys]:
         low = column.min(initial=0)
-        keys = keys * (column.max(initial=0) - low + 1) + (column - low)
-    return np.argsort(keys, kind="stable")
-
-
-def _places_of(order: Ints) -> Ints:
-    """Returns where each row goes in an order."""
-    places = np.empty(len(order), np.int64)
-    places[order] = np.arange(len(order))
-    return places
+        key = key * (column.max(initial=0) - low + 1) + (column - low)
+    places = np.arange(len(key))
+    if (np.diff(key) >= 0).all():  # most are in it already
+        return table, places
+    order = np.argsort(key, kind="stable")
+    places[order] = np.arange(len(key))
+    return table[:, order], places

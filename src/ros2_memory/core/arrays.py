@@ -26,6 +26,8 @@ Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
 Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
 _MOST_KEYS: Final = 2**62
+_KEYS_OF_ROW: Final = 8
+"""Of no more possible rows for each that there is, looking them up is quicker than sorting."""
 _EVERY_BYTE: Final = (1,)
 
 
@@ -60,6 +62,13 @@ def row_maxima(rows: NDArray[np.float64]) -> Floats:
     for column in rows.T[1:]:
         np.maximum(greatest, column, out=greatest)
     return greatest
+
+
+def in_ranges(starts: Ints, sizes: Ints) -> Ints:
+    """Returns the numbers of ranges, one range after another."""
+    before = np.cumsum(sizes) - sizes
+    numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
+    return numbers
 
 
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
@@ -111,15 +120,51 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     sizes = [
         int(column.max(initial=0)) - low + 1 for column, low in zip(columns, lows, strict=True)
     ]
-    if math.prod(sizes) >= _MOST_KEYS:
+    most = math.prod(sizes)
+    if most >= _MOST_KEYS:
         rows, number = np.unique(np.stack(columns, axis=1), axis=0, return_inverse=True)
         return rows, number.reshape(-1)
     # One number for each row, in the order of the rows: sorting rows takes ten times as long.
     keys = np.zeros(len(columns[0]), np.int64)
     for column, low, size in zip(columns, lows, sizes, strict=True):
         keys = keys * size + (column - low)
-    _, first, number = np.unique(keys, return_index=True, return_inverse=True)
-    return np.stack([column[first] for column in columns], axis=1), number.reshape(-1)
+    if most <= _KEYS_OF_ROW * len(keys):
+        is_there = np.zeros(most, np.bool_)
+        is_there[keys] = True
+        distinct, number = np.flatnonzero(is_there), (np.cumsum(is_there) - 1)[keys]
+    else:
+        distinct, number = np.unique(keys, return_inverse=True)
+    return np.stack(np.unravel_index(distinct, sizes), axis=1) + np.array(lows), number
+
+
+def narrowed(column: Ints) -> Ints:
+    """Returns integers in as few bytes each as they need."""
+    low, high = int(column.min(initial=0)), int(column.max(initial=0))
+    kinds = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)
+    kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
+    narrow: Ints = column.astype(kind)
+    return narrow
+
+
+class Columns:
+    """A table of integers, which is read like an array of rows, in as few bytes as they need.
+
+    Args:
+        table: the rows.
+    """
+
+    def __init__(self, table: Ints) -> None:
+        self._columns = [narrowed(column) for column in table.T]
+        self.nbytes = sum(column.nbytes for column in self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns[0])
+
+    def __getitem__(self, at: Ints | tuple[Ints | slice[None, None, None], int]) -> Ints:
+        """Returns some rows, or these of one column."""
+        if isinstance(at, tuple):
+            return self._columns[at[1]][at[0]].astype(np.int64)
+        return np.stack([column[at] for column in self._columns], axis=1, dtype=np.int64)
 
 
 class Groups(NamedTuple):

@@ -320,7 +320,7 @@ class _ThingsBetween:
         rows = self.known.seen_there(mover, window, self.where, before)
         if not len(rows):
             return None
-        spots = estimate.sights.spots[rows]
+        spots = estimate.spots[rows]
         newest = spots[spots[:, Spot.LAST].argmax()]
         x, y, z, last = newest[[Spot.X, Spot.Y, Spot.Z, Spot.LAST]].tolist()
         place = x / 1000, y / 1000, z / 1000

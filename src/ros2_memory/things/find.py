@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import SCORE_BINS, Ints, Score, Spot
+from ros2_memory.analysis.sights import SCORE_BINS, Ints, Spot, bin_of
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import Circle, Place, places_at
@@ -31,7 +31,6 @@ from ros2_memory.things.instances import (
     spellings,
 )
 from ros2_memory.things.known import KnownThings, known_things, note_other_frames
-from ros2_memory.things.presence import in_ranges
 from ros2_memory.things.routine import usual_places
 from ros2_memory.things.unseen import Asked, note_undecoded, notes_on
 
@@ -95,7 +94,9 @@ def find_things(
     note_other_frames(view, known, region)
     asked = {known.labels.key(label): label for label in labels}
     places = places_asked(limits, region, known.frames)
-    finder = _Finder(known, window, region, places, now)
+    _, looked = known.estimate.looks.times()
+    latest_look = int(looked[looked < window.stop].max(initial=0))
+    finder = _Finder(known, window, region, places, now, latest_look)
     found = sorted(finder.find(asked), key=lambda row: (-row.last, row.label, row.place))
     if beside is not None:
         anywhere = replace(finder, where=None)
@@ -236,6 +237,7 @@ class _Finder:
         where: the region they are to be in; None for all.
         places: the named ones.
         now: the time of the call (ns).
+        latest_look: when the last of the looks that end before the window does ended (ns).
     """
 
     known: KnownThings
@@ -243,6 +245,7 @@ class _Finder:
     where: Where | None
     places: tuple[Place, ...]
     now: Ns
+    latest_look: Ns
 
     def find(self, keys: Collection[str]) -> Iterator[_FoundThing]:
         """Yields the things of these keys, or all where there are none."""
@@ -278,7 +281,7 @@ class _Finder:
         rows = np.concatenate([rows for _, rows in parts])
         number = estimate.side_by_side(newest)
         at_once = number if number > 1 else None
-        last = int(estimate.sights.spots[rows, Spot.LAST].max())
+        last = int(estimate.spots[rows, Spot.LAST].max())
         yield _FoundThing(instance, instance.label, keys, last, stay.at, at_once, rows, newest)
 
     def _found_mover(self, mover: Mover, keys: Collection[str]) -> Iterator[_FoundThing]:
@@ -287,7 +290,7 @@ class _Finder:
         rows = self.known.seen_there(mover, self.window, self.where)
         if not len(rows):
             return
-        spots = estimate.sights.spots[rows]
+        spots = estimate.spots[rows]
         newest = int(spots[:, Spot.LAST].argmax())
         places = [(x, y, z) for x, y, z in (spots[:, [Spot.X, Spot.Y, Spot.Z]] / _MM).tolist()]
         in_slice = np.flatnonzero(spots[:, Spot.SLICE] == spots[newest, Spot.SLICE]).tolist()
@@ -306,13 +309,13 @@ class _Finder:
     def described(self, found: _FoundThing) -> Thing:
         """Returns a thing as it is shown."""
         estimate, thing, rows = self.known.estimate, found.thing, found.rows
-        frame, spots = self.known.frames[thing.epoch], estimate.sights.spots[rows]
+        frame, spots = self.known.frames[thing.epoch], estimate.spots[rows]
         best, median = self._scores(rows)
         shown = Thing(
             label=found.label,
             also_seen_as=(),
             place=found.place,
-            spread_m=int(estimate.sights.spots[found.newest[0], Spot.DEV]) / _MM,
+            spread_m=int(estimate.spots[found.newest[0], Spot.DEV]) / _MM,
             frame_id=frame,
             inside=places_at(self.places, frame, *found.place[:2]),
             first=int(spots[:, Spot.FIRST].min()),
@@ -338,7 +341,7 @@ class _Finder:
         ]
         labels = self._labels(rows)
         rows_of_all = np.concatenate([stay.spots for stay in thing.stays])
-        written = spellings(estimate.sights, estimate.counts, rows_of_all)
+        written = spellings(estimate, estimate.counts, rows_of_all)
         misread = Counter[str]()
         for stay in thing.stays:
             misread.update(stay.also)
@@ -356,12 +359,12 @@ class _Finder:
     def _labels(self, rows: Ints) -> dict[str, int]:
         """Returns how often each label has these spots, the commonest first."""
         estimate = self.known.estimate
-        written = spellings(estimate.sights, estimate.counts, rows)
+        written = spellings(estimate, estimate.counts, rows)
         return named(written, self.known.labels, estimate.names)
 
     def _usually(self, frame: str, rows: Ints) -> tuple[UsualPlace, ...] | None:
         """Returns where a thing usually is, by its spots."""
-        spots = self.known.estimate.sights.spots[rows]
+        spots = self.known.estimate.spots[rows]
         spots = spots[np.argsort(spots[:, Spot.LAST], kind="stable")]
         now = min(self.now, self.window.stop)
         usual = usual_places(spots[:, Spot.LAST], spots[:, [Spot.X, Spot.Y]], now)
@@ -378,23 +381,19 @@ class _Finder:
         Of detections that count; None where none of them has a score. The median is the best score
         in its bin, where that is known: of spots with none in a higher one.
         """
-        sights = self.known.estimate.sights
-        best = int(sights.spots[rows, Spot.BEST].max())
-        # Ordered by spot, and by bin.
-        begin, end = (np.searchsorted(sights.scores[:, Score.SPOT], rows + nth) for nth in (0, 1))
-        scores = sights.scores[in_ranges(begin, end - begin)]
-        if not len(scores):
+        best = self.known.estimate.spots[rows, Spot.BEST]
+        _, bins, n = self.known.estimate.scores.rows_of(rows)
+        if not len(bins):
             return None, None
-        counts = np.bincount(scores[:, Score.BIN], scores[:, Score.N], SCORE_BINS)
+        counts = np.bincount(bins, n, SCORE_BINS)
         middle = int(np.searchsorted(np.cumsum(counts), counts.sum() / 2))
-        highest = np.where(end > begin, sights.scores[end - 1, Score.BIN], -1)
-        in_bin = sights.spots[rows[highest == middle], Spot.BEST]
-        median = int(in_bin.max()) / 1000 if len(in_bin) else (middle + 0.5) / SCORE_BINS
-        return best / 1000, min(median, best / 1000)
+        in_bin = best[bin_of(best) == middle]
+        median = int(in_bin.max()) if len(in_bin) else (middle + 0.5) * 1000 / SCORE_BINS
+        return int(best.max()) / 1000, min(median, int(best.max())) / 1000
 
     def _still_there(self, instance: Instance, stay: PlacedStay, rows: Ints) -> StillThere | None:
         """Returns the state of a thing since it was last seen in the window, by all sightings."""
-        spots, looked = self.known.estimate.sights.spots[rows], self.known.estimate.cells.last
+        spots = self.known.estimate.spots[rows]
         last, by_all = int(spots[:, Spot.LAST].max()), self.known.by_all
         if by_all is not self.known:
             newest_first = np.argsort(-spots[:, Spot.LAST], kind="stable")
@@ -410,7 +409,7 @@ class _Finder:
             looks, missed = by_all.estimate.missing(instance, stay)
         if missed is not None:
             return StillThere("not_seen_where_expected", missed, looks)
-        if last + _JUST_NOW_NS >= looked[looked < self.window.stop].max(initial=0):
+        if last + _JUST_NOW_NS >= self.latest_look:
             return StillThere("in_view", last)
         # Of a later look nothing is known where the estimate ends.
         return StillThere("not_looked_at_since", last) if by_all.until == MAX_NS else None

@@ -11,7 +11,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from itertools import chain, groupby
+from operator import itemgetter
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -27,7 +29,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.core.arrays import Groups, distinct_rows
+from ros2_memory.core.arrays import Columns, Groups, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
@@ -41,10 +43,10 @@ from ros2_memory.things.places import (
 from ros2_memory.things.presence import (
     Cells,
     Evidence,
+    Looks,
     Stay,
     evidence_at,
     fields_of_view,
-    in_ranges,
     looks_without,
     stays_at,
 )
@@ -71,6 +73,8 @@ _SEVERAL_SHARE: Final = 0.1
 _FEWEST_BESIDE: Final = 3
 _NEWEST_BESIDE: Final = 9
 """So many slices say how many there are now: of more, some may have been taken away since."""
+_STAYS_AT_ONCE: Final = 64
+"""So many are compared with all at once."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -143,24 +147,53 @@ class Mover:
     spots: Ints
 
 
+class Tally(NamedTuple):
+    """How often spots have something, by spot: were seen in a look, have a score in a bin.
+
+    Attributes:
+        starts: where the rows of each spot begin, and where the last ones end.
+        what: the look, the bin, or the label beside it.
+        n: how often.
+    """
+
+    starts: Ints
+    what: Ints
+    n: Ints
+
+    @classmethod
+    def of(cls, table: Ints, spots: int) -> Tally:
+        """Returns the rows of a table: which of so many spots, what, and how often."""
+        spot, what, n = table[np.argsort(table[:, 0], kind="stable")].T
+        return cls(np.searchsorted(spot, np.arange(spots + 1)), what, n)
+
+    def rows_of(self, spots: Ints) -> tuple[Ints, Ints, Ints]:
+        """Returns how many rows each of some spots has, and what and how often in these."""
+        begin, end = (self.starts[spots + nth].astype(np.int64) for nth in (0, 1))
+        rows = in_ranges(begin, end - begin)
+        return end - begin, self.what[rows].astype(np.int64), self.n[rows].astype(np.int64)
+
+
 @dataclass(slots=True)
 class Estimate:
-    """The things in sights, sorted by label and place."""
+    """The things in sights, sorted by label and place, and of the sights what answers need."""
 
-    sights: Sights
-    """Without what is in `cells` and `hits`, what only an estimate needs, and too low scores."""
+    topics: tuple[str, ...]
+    labels: tuple[str, ...]
+    spots: Columns
+    unplaced: Ints
+    scores: Tally
+    """Of the detections that count."""
+    hits: Tally
+    """Likewise."""
+    looks: Looks
     instances: list[Instance]
     movers: list[Mover]
     counts: Ints
     """How many detections of each spot count."""
     poor: Flags
     """Which spots were seen while localisation was poor."""
-    hits: Ints
-    """The hits of these, by spot; `hit_starts` is where each spot's begin."""
-    hit_starts: Ints
     names: dict[str, str]
     """The name to show of each key."""
-    cells: Cells
     evidence: dict[tuple[str, int, int], Evidence]
     """By key, epoch and place: the evidence for the places of things."""
     stays: list[tuple[Instance, PlacedStay]] = field(init=False)
@@ -169,37 +202,38 @@ class Estimate:
 
     def __post_init__(self) -> None:
         self.stays = [(instance, stay) for instance in self.instances for stay in instance.stays]
-        self.stay_of = np.full(len(self.sights.spots), -1, np.int64)
+        self.stay_of = np.full(len(self.spots), -1, np.int32)
         for number, (_, stay) in reversed([*enumerate(self.stays)]):
             self.stay_of[stay.spots] = number
 
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        tables = sum(table.nbytes for table in (*self.sights.tables, self.hits))
-        looks = len(self.cells.slice) + sum(len(place.looks) for place in self.evidence.values())
-        return tables + 100 * looks
+        tables: list[Columns | Ints | Flags] = [self.spots, self.unplaced, self.counts, self.poor]
+        tables += chain((self.stay_of,), self.scores, self.hits, self.looks)
+        tables += chain(*self.evidence.values(), (stay.spots for _, stay in self.stays))
+        return sum(table.nbytes for table in tables)
 
     def seen_in(self, rows: Ints, window: TimeWindow, before: Ns = MAX_NS) -> Ints:
         """Returns which of some spots are of slices that reach into a window and end before a time.
 
         Slices count as a whole; a spot without detections that count is left out.
         """
-        first, last = (self.sights.spots[rows, column] for column in (Spot.FIRST, Spot.LAST))
+        first, last = (self.spots[rows, column] for column in (Spot.FIRST, Spot.LAST))
         inside = (first < window.stop) & (last >= window.start) & (last < before)
         counting: Ints = rows[inside & (self.counts[rows] > 0)]
         return counting
 
     def is_vague(self, rows: Ints) -> bool:
         """Whether the newest of some spots was seen while localisation was poor."""
-        return bool(self.poor[rows[self.sights.spots[rows, Spot.LAST].argmax()]])
+        return bool(self.poor[rows[self.spots[rows, Spot.LAST].argmax()]])
 
     def place_of(self, stay: PlacedStay, rows: Ints) -> Vector3:
         """Returns the mean place (m) of some spots of a stay; of all of it if these are poor."""
         rows = rows[~self.poor[rows]]
         if not len(rows):
             return stay.at
-        spots = self.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z]]
+        spots = self.spots[rows][:, [Spot.X, Spot.Y, Spot.Z]]
         x, y, z = (np.average(spots, axis=0, weights=self.counts[rows]) / 1000).tolist()
         return x, y, z
 
@@ -208,21 +242,20 @@ class Estimate:
 
         That is the mean pose in one cell; of two with equal numbers, in the one that saw it later.
         """
-        hits = _rows_of(spots, self.hits, self.hit_starts)
-        hits = hits[hits[:, Hit.LOOK] >= 0]
-        if not len(hits):
+        _, looks, n = self.hits.rows_of(spots)
+        looks, n = looks[looks >= 0], n[looks >= 0]
+        if not len(looks):
             return None
-        looks, n = hits[:, Hit.LOOK], hits[:, Hit.N]
-        cells, cell_of = np.unique(self.cells.cell[looks], return_inverse=True)
+        cells, cell_of = np.unique(self.looks.cell[looks], return_inverse=True)
         messages, last = np.bincount(cell_of, n), np.zeros(len(cells), np.int64)
-        np.maximum.at(last, cell_of, self.cells.last[looks])
+        np.maximum.at(last, cell_of, self.looks.times(looks)[1])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
         x, y, yaw = (
             float((column[looks] * n).sum() / n.sum())
-            for column in (self.cells.x, self.cells.y, self.cells.yaw)
+            for column in (self.looks.x, self.looks.y, self.looks.yaw)
         )
-        return x / 1000, y / 1000, math.radians((yaw + 180) % 360 - 180)
+        return x / 1000, y / 1000, math.radians((yaw / 10 + 180) % 360 - 180)
 
     def side_by_side(self, rows: Ints) -> int:
         """Returns how many of a label are at one place, by its spots: what messages have at once.
@@ -234,7 +267,7 @@ class Estimate:
         counts = self.counts[rows]
         is_often = counts >= min(_FEWEST_BESIDE, int(counts.max()))
         rows, counts = rows[is_often], counts[is_often]
-        slices, together = self.sights.spots[rows][:, [Spot.SLICE, Spot.TOGETHER]].T
+        slices, together = (self.spots[rows, name] for name in (Spot.SLICE, Spot.TOGETHER))
         by = Groups.of(np.unique(slices, return_inverse=True)[1])
         most = np.repeat(by.ends(counts)[1], by.sizes)
         beside = np.add.reduceat((2 * counts[by.order] >= most).astype(np.int64), by.begins)
@@ -250,7 +283,7 @@ class Estimate:
         evidence = self.evidence[instance.key, instance.epoch, stay.place]
         seen_to = stay.last if window is None else MAX_NS
         window = window or (stay.last + 1, MAX_NS)
-        return looks_without(self.cells, evidence, stay.stay, seen_to, window)
+        return looks_without(self.looks, evidence, stay.stay, seen_to, window)
 
     def stay_with(self, foreign: Ints) -> tuple[Instance, PlacedStay] | None:
         """Returns the thing, and its stay, that has the first of some spots that any thing has.
@@ -259,10 +292,10 @@ class Estimate:
         Returns None where no thing has any of them.
         """
         alike = [Spot.N, Spot.X, Spot.Y, Spot.LAST]
-        spots = self.sights.spots
+        firsts = self.spots[:, Spot.FIRST]
         for spot in foreign:
-            rows = np.flatnonzero(spots[:, Spot.FIRST] == spot[Spot.FIRST])
-            rows = rows[(spots[rows][:, alike] == spot[alike]).all(axis=1)]
+            rows = np.flatnonzero(firsts == spot[Spot.FIRST])
+            rows = rows[(self.spots[rows][:, alike] == spot[alike]).all(axis=1)]
             stays = self.stay_of[rows]
             if (stays >= 0).any():
                 return self.stays[int(stays[stays >= 0].min())]
@@ -327,16 +360,20 @@ def estimate(
         rows = np.concatenate([stay.spots for stay in instance.stays])
         instance.labels = named(spellings(sights, observed.counts, rows), labels, names)
     instances.sort(key=lambda thing: (thing.label, thing.stays[0].first, thing.stays[0].x))
+    scores = sights.scores[sights.scores[:, Score.BIN] >= _lowest_bin(min_score)]
     result = Estimate(
-        sights=sights.seen(_lowest_bin(min_score)),
+        topics=sights.topics,
+        labels=sights.labels,
+        spots=Columns(sights.spots),
+        unplaced=sights.unplaced,
+        scores=Tally(*map(narrowed, Tally.of(scores, len(sights.spots)))),
+        hits=Tally(*map(narrowed, observed.hits)),
+        looks=observed.cells.looks,
         instances=instances,
         movers=movers,
         counts=observed.counts,
         poor=observed.poor,
-        hits=observed.hits,
-        hit_starts=observed.hit_starts,
         names=names,
-        cells=observed.cells,
         evidence=evidence,
     )
     for instance in instances:
@@ -344,7 +381,7 @@ def estimate(
     return result
 
 
-def spellings(sights: Sights, counts: Ints, rows: Ints) -> Counter[str]:
+def spellings(sights: Sights | Estimate, counts: Ints, rows: Ints) -> Counter[str]:
     """Returns how often some spots were seen under each label, as detectors write it."""
     often = np.bincount(sights.spots[rows, Spot.LABEL], counts[rows])
     return Counter(
@@ -366,8 +403,7 @@ class _Observations:
     Attributes:
         counts: how many detections of each spot count.
         poor: which spots were seen while localisation was poor: these move nothing.
-        hits: the hits of detections that count, by spot; `hit_starts` is where each spot's begin.
-            Without a look where localisation was poor.
+        hits: the looks of detections that count, by spot; -1 where localisation was poor.
         groups: of each spot a number; those of one slice, topic and label have the same.
         fields: the field of view of each topic, as of `fields_of_view`.
         side: of each spot, the mean of the unit vectors to it from where it was seen; 0 where that
@@ -387,13 +423,14 @@ class _Observations:
         # Those of detections that count: in proportion, rounded up.
         hits, spot = sights.hits.copy(), sights.hits[:, Hit.SPOT]
         hits[:, Hit.N] = -(-hits[:, Hit.N] * self.counts[spot] // spots[spot, Spot.N])
-        self.hits, self.hit_starts = _by_spot(hits[hits[:, Hit.N] > 0], sights)
-        self.hits[np.append(poor_looks, [False])[self.hits[:, Hit.LOOK]], Hit.LOOK] = -1
+        hits = hits[hits[:, Hit.N] > 0]
+        hits[np.append(poor_looks, [False])[hits[:, Hit.LOOK]], Hit.LOOK] = -1
+        self.hits = Tally.of(hits, len(spots))
         self.groups = distinct_rows(
             [spots[:, Spot.SLICE], spots[:, Spot.TOPIC], spots[:, Spot.LABEL]]
         )[1]
         self.cells = Cells(sights, epoch, poor_looks)
-        hits = self.hits[self.hits[:, Hit.LOOK] >= 0]
+        hits = hits[hits[:, Hit.LOOK] >= 0]
         spot, look, n = hits[:, Hit.SPOT], hits[:, Hit.LOOK], hits[:, Hit.N]
         distance, bearing = self.cells.seen_at(look, spots[spot, Spot.X], spots[spot, Spot.Y])
         topic = spots[spot, Spot.TOPIC]
@@ -417,18 +454,6 @@ class _Observations:
         return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
 
 
-def _by_spot(table: Ints, sights: Sights) -> tuple[Ints, Ints]:
-    """Returns rows ordered by spot, their column 0, and where those of each spot begin."""
-    ordered = table[np.argsort(table[:, 0], kind="stable")]
-    return ordered, np.cumsum(np.append(0, np.bincount(table[:, 0], minlength=len(sights.spots))))
-
-
-def _rows_of(spots: Ints, table: Ints, starts: Ints) -> Ints:
-    """Returns the rows of some spots in a table that is ordered by spot."""
-    rows: Ints = table[in_ranges(starts[spots], starts[spots + 1] - starts[spots])]
-    return rows
-
-
 def _lowest_bin(min_score: float) -> int:
     """Returns the lowest bin of scores that count."""
     return min(round(min_score * 1000) * SCORE_BINS // 1000, SCORE_BINS - 1)
@@ -443,7 +468,7 @@ def _groups(observed: _Observations, epoch: Ints, keys: Sequence[str]) -> list[_
     group_of = epoch[spots[:, Spot.SLICE]] * width + key_of_label[spots[:, Spot.LABEL]]
     group_of[observed.counts == 0] = -1
     groups = []
-    for number in np.unique(group_of[group_of >= 0]).tolist():
+    for number in np.flatnonzero(np.bincount(group_of[group_of >= 0])).tolist():
         group_epoch, key = divmod(number, width)
         without_place = unplaced[key_of_label[unplaced[:, Unplaced.LABEL]] == key]
         rows = np.flatnonzero(group_of == number)
@@ -488,8 +513,7 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
 
 def _are_several(place: Ints, groups: Ints) -> Flags:
     """Returns at which places slices have several spots of a label: things that stand together."""
-    width = int(groups.max(initial=0)) + 1
-    distinct = np.bincount(np.unique(place * width + groups) // width)
+    distinct = np.bincount(distinct_rows((place, groups))[0][:, 0])
     several: Flags = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
     return several
 
@@ -504,9 +528,9 @@ def _find_stays(group: _Group, observed: _Observations) -> None:
     n = observed.counts[rows]
     sums = [np.bincount(place, n * spots[rows, column]) for column in (Spot.X, Spot.Y)]
     centres = np.stack(sums, axis=1) / np.bincount(place, n)[:, None]
-    hits = _rows_of(rows, observed.hits, observed.hit_starts)
-    hits[:, Hit.SPOT] = spots[hits[:, Hit.SPOT], Spot.SLICE]  # as `evidence_at` takes them
-    place_of_hit = np.repeat(place, observed.hit_starts[rows + 1] - observed.hit_starts[rows])
+    sizes, look, n_of_look = observed.hits.rows_of(rows)
+    hits = np.stack((np.repeat(spots[rows, Spot.SLICE], sizes), look, n_of_look), axis=1)
+    place_of_hit = np.repeat(place, sizes)
     group.evidence = evidence_at(
         observed.cells,
         observed.fields,
@@ -557,26 +581,28 @@ def _remove_false_stays(
     What a thing was called wrongly is counted in `PlacedStay.also`.
     """
     stays = [(group, stay) for group in groups for stay in group.stays]
-    hosts = _Hosts(stays, observed, keys)
-    for number in sorted(range(len(stays)), key=lambda number: stays[number][1].count):
+    candidates = _Hosts(stays, observed, keys)
+    hosts: dict[int, list[int]] = {}
+    for begin in range(0, len(stays), _STAYS_AT_ONCE):
         observed.go_on()
-        group, stay = stays[number]
-        host_group, host = hosts.take(number) or (None, None)
-        if host is not None and host_group is not group:
-            host.also += spellings(observed.sights, observed.counts, stay.spots)
+        hosts.update(candidates.of(np.arange(begin, min(begin + _STAYS_AT_ONCE, len(stays)))))
+    taken: set[int] = set()
+    for number in sorted(hosts, key=lambda number: (stays[number][1].count, number)):
+        host = next((host for host in hosts[number] if host not in taken), None)
+        if host is not None:
+            taken.add(number)
+            (group, stay), (host_group, hosting) = stays[number], stays[host]
+            if host_group is not group:
+                hosting.also += spellings(observed.sights, observed.counts, stay.spots)
     for group in groups:
         group.stays = []
     for number, (group, stay) in enumerate(stays):
-        if not hosts.taken[number] and not stay.weak:
+        if number not in taken and not stay.weak:
             group.stays.append(stay)
 
 
 class _Hosts:
-    """Finds the stays that others are a wrong name of, or the noise around.
-
-    Attributes:
-        taken: which stays are part of another one.
-    """
+    """Finds the stays that others may be a wrong name of, or the noise around."""
 
     def __init__(
         self,
@@ -584,71 +610,64 @@ class _Hosts:
         observed: _Observations,
         keys: Sequence[str],
     ) -> None:
-        self.taken = np.zeros(len(stays), np.bool_)
-        self._stays = stays
-        self._beside = _by_spot(observed.sights.beside, observed.sights)
+        self._stays = [stay for _, stay in stays]
+        self._beside = Tally.of(observed.sights.beside, len(observed.sights.spots))
         distinct = [*dict.fromkeys(keys)]
         self._key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
-        rows = [
-            (distinct.index(group.key), group.epoch, stay.count, stay.first, stay.last, stay.weak)
-            for group, stay in stays
-        ]
-        self._columns = np.array(rows, np.int64).reshape(-1, 6).T
-        places = [(stay.x, stay.y, stay.z) for _, stay in stays]
+        self._key = np.array([distinct.index(group.key) for group, _ in stays], np.int64)
+        self._epoch = np.array([group.epoch for group, _ in stays], np.int64)
+        rows = [(stay.count, stay.first, stay.last, stay.weak) for stay in self._stays]
+        self._count, self._first, self._last, self._weak = np.array(rows, np.int64).reshape(-1, 4).T
+        slices = [(stay.stay.first_slice, stay.stay.last_slice + 1) for stay in self._stays]
+        self._slices = np.array(slices, np.int64).reshape(-1, 2).T
+        places = [(stay.x, stay.y, stay.z) for stay in self._stays]
         self._places = np.array(places, np.float64).reshape(-1, 3).T
         self._order = np.argsort(self._places[0], kind="stable")
-        self._x = self._places[0, self._order]
         # The spots of all stays, as numbers in order, and how often these and those before count.
-        sizes = [len(stay.spots) for _, stay in stays]
+        sizes = [len(stay.spots) for stay in self._stays]
         number = np.repeat(np.arange(len(stays)), sizes)
-        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in self._stays)])
         self._width = observed.sights.slices + 1
         self._seen = number * self._width + observed.sights.spots[spots, Spot.SLICE]
         self._times = np.append(0, np.cumsum(observed.counts[spots]))
         together = observed.sights.spots[spots, Spot.TOGETHER] > 1
         self._are_several = 2 * np.bincount(number, together, len(stays)) >= sizes
 
-    def take(self, number: int) -> tuple[_Group, PlacedStay] | None:
-        """Returns the host of a stay, which is taken then; None where it is none's part."""
-        _, stay = self._stays[number]
-        others, away_mm = self._near(number)
-        key, _, counts, *_ = self._columns[:, others]
-        is_same = key == self._columns[0, number]
-        ends = stay.stay.first_slice, stay.stay.last_slice + 1
-        begin, end = (np.searchsorted(self._seen, others * self._width + at) for at in ends)
-        hosted = self._times[end] - self._times[begin]
-        is_tiny = (stay.count <= hosted) & (stay.count <= _TINY_SHARE * counts)
+    def of(self, numbers: Ints) -> Iterator[tuple[int, list[int]]]:
+        """Yields which of some stays may be part of others, with these, the likeliest first."""
+        one, other, away_mm = self._near(numbers)
+        begin, end = (
+            np.searchsorted(self._seen, other * self._width + at[one]) for at in self._slices
+        )
+        count, hosted = self._count[one], self._times[end] - self._times[begin]
+        is_same = self._key[one] == self._key[other]
+        is_tiny = (count <= hosted) & (count <= _TINY_SHARE * self._count[other])
         # Where most messages that have one have both of them, this one is no noise.
-        if self._are_several[number]:
-            is_tiny &= ~is_same | (2 * stay.count <= hosted)
-        is_part = is_tiny | (stay.count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
-        is_part &= is_same | (away_mm <= _SAME_PLACE_MM)
-        is_part &= (hosted > 0) & ~self.taken[others]
-        if is_part.any():
-            is_part &= is_same | (self._beside_of(stay)[key] < _BESIDE_SHARE * stay.count)
-        if not is_part.any():
-            return None
-        self.taken[number] = True
-        return self._stays[int(others[np.where(is_part, hosted, 0).argmax()])]
+        is_tiny &= ~(self._are_several[one] & is_same) | (2 * count <= hosted)
+        is_part = is_tiny | (count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
+        is_part &= (is_same | (away_mm <= _SAME_PLACE_MM)) & (hosted > 0)
+        order = np.lexsort((other, -hosted, one))
+        order = order[is_part[order]]
+        pairs = zip(one[order].tolist(), other[order].tolist(), strict=True)
+        for number, hosts in groupby(pairs, itemgetter(0)):
+            # How often its detections had labels of each key beside them.
+            _, label, n = self._beside.rows_of(self._stays[number].spots)
+            beside = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
+            is_apart = beside >= _BESIDE_SHARE * self._count[number]
+            is_apart[self._key[number]] = False
+            yield number, [host for _, host in hosts if not is_apart[self._key[host]]]
 
-    def _near(self, number: int) -> tuple[Ints, Floats]:
-        """Returns the numbers of stays near one at that time, in order, and how far (mm)."""
-        x, y, z = self._places[:, number]
-        _, epoch, _, first, last, _ = self._columns[:, number]
-        start, stop = np.searchsorted(self._x, (x - _HALO_MM, x + _HALO_MM))
-        others = np.sort(self._order[start:stop])
-        other_x, other_y, other_z = self._places[:, others]
-        _, epochs, _, firsts, lasts, weak = self._columns[:, others]
-        away = np.hypot(other_x - x, other_y - y)
-        is_near = (away <= _HALO_MM) & (firsts <= last) & (lasts >= first) & (others != number)
-        is_near &= (epochs == epoch) & (weak == 0) & (np.abs(other_z - z) <= STOREY_MM)
-        return others[is_near], away[is_near]
-
-    def _beside_of(self, stay: PlacedStay) -> Ints:
-        """Returns how often its detections had labels of each key beside them."""
-        _, label, n = _rows_of(stay.spots, *self._beside).T
-        counts: Ints = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
-        return counts
+    def _near(self, numbers: Ints) -> tuple[Ints, Ints, Floats]:
+        """Returns some stays and others near each at that time, as pairs, and how far (mm)."""
+        x, y, z = self._places
+        ends = (x[numbers] - _HALO_MM, x[numbers] + _HALO_MM)
+        start, stop = (np.searchsorted(x[self._order], end) for end in ends)
+        one, other = np.repeat(numbers, stop - start), self._order[in_ranges(start, stop - start)]
+        away = np.hypot(x[other] - x[one], y[other] - y[one])
+        is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
+        is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
+        is_near &= (self._epoch[other] == self._epoch[one]) & (self._weak[other] == 0)
+        return one[is_near], other[is_near], away[is_near]
 
 
 def _link(group: _Group, observed: _Observations) -> list[Instance]:

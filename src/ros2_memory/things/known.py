@@ -99,12 +99,12 @@ class KnownThings:
         if where is None:
             return rows
         frame = self.frames[mover.epoch]
-        places = (self.estimate.sights.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
+        places = (self.estimate.spots[rows][:, [Spot.X, Spot.Y]] / 1000).tolist()
         return rows[[where.contains(frame, x, y) for x, y in places]]
 
     def stay(self, rows: Ints, place: Vector3, frame: str, places: Sequence[Place]) -> ThingStay:
         """Returns some spots as the stay of a thing at a place (m) of a frame."""
-        spots = self.estimate.sights.spots[rows]
+        spots = self.estimate.spots[rows]
         return ThingStay(
             start=int(spots[:, Spot.FIRST].min()),
             end=int(spots[:, Spot.LAST].max()),

@@ -239,12 +239,12 @@ def stays_in(things: Sequence[Sightings]) -> list[Ints]:
 
 
 class _Series(NamedTuple):
-    """Sightings as rows of 1, the side and the place, by the weight of their looks (1/mm²).
+    """Sightings as columns of 1, the side and the place, by the weight of their looks (1/mm²).
 
     Of all things, which are numbered; visits are numbered through all of them.
     """
 
-    rows: Floats
+    columns: Floats
     n: Ints
     visit: Ints
     thing: Ints
@@ -259,8 +259,8 @@ class _Series(NamedTuple):
         usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks
         weight = n * (n - 1 + _USUAL) / (squares + _USUAL * usual[thing])
         place = xy - (np.add.reduceat(xy, begins) / sizes[:, None])[thing]
-        rows = np.hstack((np.ones((len(weight), 1)), side, place)) * weight[:, None]
-        return cls(rows, n, visits_of(first, last, thing), thing)
+        columns = np.vstack((np.ones(len(weight)), side.T, place.T)) * weight
+        return cls(columns, n, visits_of(first, last, thing), thing)
 
 
 def _differences(series: _Series) -> tuple[Floats, Ints]:
@@ -269,14 +269,14 @@ def _differences(series: _Series) -> tuple[Floats, Ints]:
     Not by the two that differ most: between these it may have been moved. Ascending for each thing.
     """
     starts = np.flatnonzero(np.diff(series.visit, prepend=-1))
-    sums, thing = np.add.reduceat(series.rows, starts), series.thing[starts]
-    means = sums / sums[:, :1]
+    sums, thing = np.add.reduceat(series.columns, starts, axis=1), series.thing[starts]
+    means = sums / sums[0]
     begins = np.flatnonzero(np.diff(thing, prepend=-1))
-    normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins)
-    fit = np.linalg.solve(normal[:, :3, :3] + np.diag(_PRIOR[:3]), normal[:, :3, 3:])
-    off = means[:, 3:] - np.einsum("vi,vij->vj", means[:, :3], fit[thing])
-    by_looks = 1 / sums[:-1, 0] + 1 / sums[1:, 0]
-    variance = ((np.diff(off, axis=0) ** 2).sum(axis=1) / (2 * math.log(2)) - by_looks) / 2
+    normal = np.add.reduceat(_squares(sums, _VISIT_MM**2), begins, axis=2).transpose(2, 0, 1)
+    fit = np.linalg.solve(normal[:, :, :3] + np.diag(_PRIOR), normal[:, :, 3:])
+    off = means[3:] - np.einsum("iv,vij->jv", means[:3], fit[thing])
+    by_looks = 1 / sums[0, :-1] + 1 / sums[0, 1:]
+    variance = ((np.diff(off) ** 2).sum(axis=0) / (2 * math.log(2)) - by_looks) / 2
     is_of_one = thing[1:] == thing[:-1]
     variance, thing = variance[is_of_one], thing[1:][is_of_one]
     order = np.lexsort((variance, thing))
@@ -304,10 +304,10 @@ def _shrunk(n: Ints | int, median: Floats | float, usual: Floats | float) -> Flo
     return np.maximum((n * median + _USUAL * usual) / (n + _USUAL), _LEAST_VISIT_MM**2)
 
 
-_PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2, 0.0])
-"""What is known (1/mm²) before any look of the place, the bias by side in x and y, and the step.
+_PRIOR: Final = np.array([1e-12, _BIAS_MM**-2, _BIAS_MM**-2])
+"""What is known (1/mm²) before any look of the place, and of the bias by side in x and y.
 
-Of the place next to nothing, so that the equations have a solution; of the step nothing.
+Of the place next to nothing, so that the equations have a solution.
 """
 
 
@@ -316,9 +316,8 @@ def _squares(sums: Floats, visit: Floats | float) -> Floats:
 
     Without those of the place alone, which nothing needs.
     """
-    weight = np.maximum(sums[:, 0], 1e-30)
-    scale = 1 / weight / (1 + visit * weight)
-    squares: Floats = sums[:, :3, None] * sums[:, None, :] * scale[:, None, None]
+    weight = np.maximum(sums[0], 1e-30)
+    squares: Floats = sums[:3, None] * sums * (1 / weight / (1 + visit * weight))
     return squares
 
 
@@ -335,7 +334,7 @@ def _are_moved(series: _Series, variance: Floats) -> Flags:
             size += stop - start
         rows = np.concatenate([np.arange(*span) for span in spans])
         number = np.repeat(np.arange(len(spans)), [stop - start for start, stop in spans])
-        batch = _Series(series.rows[rows], series.n[rows], series.visit[rows], number)
+        batch = _Series(series.columns[:, rows], series.n[rows], series.visit[rows], number)
         for span, row in _steps(batch, variance[series.thing[rows]]):
             start, stop = spans[span]
             step = int(rows[row])
@@ -372,15 +371,17 @@ def _squared_errors(old: Floats, new: Floats) -> Floats:
 
     By the squares before and after it. Unknown are the place, the bias in x and y, and the step.
     """
-    both = old + new
-    normal = np.zeros((len(both), 4, 4))
-    normal[:, :3, :3] = both[:, :3, :3]
-    normal[:, 3, :3] = normal[:, :3, 3] = new[:, 0, :3]
-    normal[:, 3, 3] = new[:, 0, 0]
-    right = np.concatenate((both[:, :3, 3:], new[:, :1, 3:]), axis=1)
-    inverse = np.linalg.inv(normal + np.diag(_PRIOR))
-    length_squared = ((inverse @ right)[:, 3] ** 2).sum(axis=1)
-    return np.where(length_squared >= LEAST_MM**2, length_squared / inverse[:, 3, 3], 0.0)
+    both, of_new = old + new, new[0]
+    both[[0, 1, 2], [0, 1, 2]] += _PRIOR[:, None]
+    # The equations, and the right sides in x and y; from the last one the others are eliminated.
+    rows = np.insert(both, 3, of_new[:3], axis=1)
+    rows = np.concatenate((rows, of_new[None, [0, 1, 2, 0, 3, 4]]))
+    for nth in range(3):
+        share = rows[nth + 1 :, nth] / rows[nth, nth]
+        rows[nth + 1 :] -= share[:, None] * rows[nth]
+    weight, *sums = rows[3, 3:]
+    length_squared = sum((side / weight) ** 2 for side in sums)
+    return np.where(length_squared >= LEAST_MM**2, length_squared * weight, 0.0)
 
 
 def _before_and_after(
@@ -394,14 +395,15 @@ def _before_and_after(
     is_start[begins] = True
     starts = np.flatnonzero(is_start)
     ends = np.append(starts, len(series.n))
-    sums = np.vstack((np.zeros((1, 5)), np.cumsum(series.rows, axis=0)))
-    squares = _squares(np.diff(sums[ends], axis=0), variance[starts])
-    until = np.concatenate((np.zeros((1, 3, 5)), np.cumsum(squares, axis=0)))
+    sums = np.hstack((np.zeros((5, 1)), np.cumsum(series.columns, axis=1)))
+    squares = _squares(np.diff(sums[:, ends]), variance[starts])
+    until = np.concatenate((np.zeros((3, 5, 1)), np.cumsum(squares, axis=2)), axis=2)
     first = np.searchsorted(starts, begins)
     stop = np.append(first[1:], len(starts))
     visit, thing, own = np.searchsorted(starts, at) - 1, series.thing[at], variance[at]
-    old = until[visit] - until[first[thing]] + _squares(sums[at] - sums[ends[visit]], own)
-    new = until[stop[thing]] - until[visit + 1] + _squares(sums[ends[visit + 1]] - sums[at], own)
+    here, begin, end = sums[:, at], sums[:, ends[visit]], sums[:, ends[visit + 1]]
+    old = until[..., visit] - until[..., first[thing]] + _squares(here - begin, own)
+    new = until[..., stop[thing]] - until[..., visit + 1] + _squares(end - here, own)
     return old, new
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from ros2_memory.analysis.sights import (
     CELL_DECIDEG,
     CELL_MM,
+    SLICE_NS,
     STOREY_MM,
     Flags,
     Floats,
@@ -30,7 +31,7 @@ from ros2_memory.analysis.sights import (
     Sights,
     Unplaced,
 )
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import distinct_rows, in_ranges, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -67,7 +68,7 @@ _MANY_LOOKS: Final = 10
 _BLOCKED_SHARE: Final = 0.1
 """A cell with so many looks is blocked if its share of hits is below this part of the others'."""
 _YAWS: Final = 3600 // CELL_DECIDEG
-_PRIME: Final = 1_000_003
+_NS_PER_US: Final = np.int64(1_000)
 _VIEW_SHARE: Final = 0.02
 """What lies farther out at each side of a field of view is mistaken."""
 
@@ -82,7 +83,7 @@ class Cells:
     """
 
     def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
-        looks = sights.looks
+        looks = self._looks = sights.looks
         # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.slice, self.n, self.first, self.last, self.topic = (
             np.ascontiguousarray(looks[:, column])
@@ -97,13 +98,14 @@ class Cells:
             looks[:, Look.Y] // CELL_MM,
             self.topic + poor * (len(sights.topics) + 1),
             epoch[self.slice],
-            looks[:, Look.PAN],
+            looks[:, Look.PAN] // CELL_DECIDEG,
             (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM,
         )
         cells, cell = distinct_rows(columns)
         self.cell = _joined(cells, cell, np.stack((self.x, self.y, self.yaw)), self.n)[cell]
-        order = np.argsort(self.cell, kind="stable")
+        order = np.argsort(narrowed(self.cell), kind="stable")  # of 16 bits it is much faster
         self._by_cell = order
+        self._slice_starts = np.searchsorted(self.slice, np.arange(sights.slices + 1))
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
@@ -113,6 +115,16 @@ class Cells:
         self._previous = np.full(len(order), -1, np.int64)
         self._previous[after] = np.where(is_next, before, -1)
 
+    @property
+    def looks(self) -> Looks:
+        """What answers need of the looks."""
+        begins = np.zeros(int(self.slice.max(initial=-1)) + 1, np.int64)
+        begins[self.slice] = self.first // SLICE_NS * SLICE_NS
+        after, lasted = self.first - begins[self.slice], self.last - self.first
+        poses = (self._looks[:, name] for name in (Look.X, Look.Y, Look.YAW))
+        columns = (self.slice, after // _NS_PER_US, lasted // _NS_PER_US, *poses, self.cell)
+        return Looks(begins, *map(narrowed, columns))
+
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
         cell = _number(cells)
@@ -121,9 +133,7 @@ class Cells:
 
     def looks_during(self, slices: Ints) -> Ints:
         """Returns all looks of some slices of places, by slice."""
-        start, stop = (
-            np.searchsorted(self.slice, _number(slices), side) for side in ("left", "right")
-        )
+        start, stop = (self._slice_starts[_number(slices) + nth] for nth in (0, 1))
         looks = in_ranges(start, stop - start)
         return _keys(np.repeat(_place(slices), stop - start), looks)
 
@@ -141,7 +151,7 @@ class Cells:
 
     def looked_in(self, number: int) -> Ns | None:
         """Returns when the first look of a slice ended; None without any."""
-        start, stop = np.searchsorted(self.slice, (number, number + 1))
+        start, stop = self._slice_starts[number : number + 2].tolist()
         return int(self.last[start:stop].min()) if start < stop else None
 
     def cells_of(self, looks: Ints) -> Ints:
@@ -182,29 +192,37 @@ def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
     weight = np.bincount(cell, n)
     x, y, yaw = (np.bincount(cell, n * axis) / weight for axis in poses)
     rank = np.argsort(np.argsort(weight, kind="stable"), kind="stable")
-    keys, best = _hashed(cells), rank
+    best = rank.copy()
+    # With room for a step: what is in order, and each step from it, is found quickest.
+    sizes = cells.max(axis=0, initial=0) - cells.min(axis=0, initial=0) + 3
+    keys = _hashed(cells, sizes)
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
-    for step in product((-1, 0, 1), repeat=3):
+    for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
         beside = cells.copy()
         beside[:, :3] += step
         beside[:, 0] %= _YAWS
-        wanted = _hashed(beside)
-        other = order[np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)]
-        turn = np.abs((yaw[other] - yaw + 180.0) % 360.0 - 180.0)
-        near = (keys[other] == wanted) & (turn < CELL_DECIDEG / 10) & (cells[:, 0] >= 0)
-        near &= np.hypot(x[other] - x, y[other] - y) < CELL_MM
-        best = np.where(near, np.maximum(best, rank[other]), best)
+        wanted = _hashed(beside, sizes)
+        place = np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)
+        one = np.flatnonzero((ordered[place] == wanted) & (cells[:, 0] >= 0))
+        other = order[place[one]]
+        turn = np.abs((yaw[other] - yaw[one] + 180.0) % 360.0 - 180.0)
+        near = (turn < CELL_DECIDEG / 10) & (
+            np.hypot(x[other] - x[one], y[other] - y[one]) < CELL_MM
+        )
+        one, other = one[near], other[near]
+        best[one] = np.maximum(best[one], rank[other])
+        best[other] = np.maximum(best[other], rank[one])
     leader = np.argsort(rank, kind="stable")[best]
     joined: Ints = np.where(leader[leader] == leader, leader, np.arange(len(cells)))
     return joined
 
 
-def _hashed(rows: Ints) -> Ints:
-    """Returns a number for each row; of different ones, hardly ever the same."""
+def _hashed(rows: Ints, sizes: Ints) -> Ints:
+    """Returns a number for each row, in their order unless there may be too many of them."""
     numbers = np.zeros(len(rows), np.int64)
-    for column in rows.T:
-        numbers = numbers * _PRIME + column
+    for column, size in zip(rows.T, sizes, strict=True):
+        numbers = numbers * size + column
     return numbers
 
 
@@ -214,7 +232,7 @@ def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topi
     That is for each of so many topics where nearly all its detections lie: `n` at each.
     """
     fields = np.full((topics, 3), -1.0)
-    for number in np.unique(topic).tolist():
+    for number in np.flatnonzero(np.bincount(topic)).tolist():
         rows = topic == number
         [far] = _weighted_quantiles(distance[rows], n[rows], 1 - _VIEW_SHARE)
         sides = _weighted_quantiles(bearing[rows], n[rows], _VIEW_SHARE, 1 - _VIEW_SHARE)
@@ -222,15 +240,8 @@ def fields_of_view(topic: Ints, distance: Floats, bearing: Floats, n: Ints, topi
     return fields
 
 
-def in_ranges(starts: Ints, sizes: Ints) -> Ints:
-    """Returns the numbers of ranges, one range after another."""
-    before = np.cumsum(sizes) - sizes
-    numbers: Ints = np.arange(int(sizes.sum())) + np.repeat(starts - before, sizes)
-    return numbers
-
-
 def _weighted_quantiles(values: Floats, n: Ints, *shares: float) -> list[float]:
-    order = np.argsort(values, kind="stable")
+    order = np.argsort(values)
     running = np.cumsum(n[order])
     ranks = [int(np.searchsorted(running, share * running[-1])) for share in shares]
     return [float(values[order[min(rank, len(order) - 1)]]) for rank in ranks]
@@ -263,20 +274,46 @@ class Evidence(NamedTuple):
     fair: Flags
 
     def at(self, place: int) -> Evidence:
-        """Returns that for one place."""
+        """Returns that for one place alone, in few bytes."""
         ends = np.array([place, place + 1]) << _BITS
         looks, blind = (
-            np.arange(*np.searchsorted(keys, ends)) for keys in (self.looks, self.blind)
+            slice(*np.searchsorted(keys, ends).tolist()) for keys in (self.looks, self.blind)
         )
         return Evidence(
-            self.looks[looks],
-            self.cell[looks],
-            self.n[looks],
-            self.hits[looks],
-            self.blind[blind],
-            self.times[blind],
-            self.fair[looks],
+            narrowed(_number(self.looks[looks])),
+            narrowed(self.cell[looks]),
+            narrowed(self.n[looks]),
+            narrowed(self.hits[looks]),
+            narrowed(_number(self.blind[blind])),
+            narrowed(self.times[blind]),
+            self.fair[looks].copy(),
         )
+
+
+class Looks(NamedTuple):
+    """From where detectors looked: a column each, in as few bytes as it needs.
+
+    Attributes:
+        begins: when each slice begins (ns).
+        slice, x, y, yaw: as in `Look`.
+        after_us: from the beginning of the slice to the first message; `lasted_us` from there on.
+        cell: that of the robot's pose, as in `Cells`.
+    """
+
+    begins: Ints
+    slice: Ints
+    after_us: Ints
+    lasted_us: Ints
+    x: Ints
+    y: Ints
+    yaw: Ints
+    cell: Ints
+
+    def times(self, looks: Ints | None = None) -> tuple[Ints, Ints]:
+        """Returns the times (ns) of the first and the last message of some looks, or of all."""
+        which = slice(None) if looks is None else looks
+        first = self.begins[self.slice[which]] + self.after_us[which] * _NS_PER_US
+        return first, first + self.lasted_us[which] * _NS_PER_US
 
 
 class Stay(NamedTuple):
@@ -320,9 +357,15 @@ def evidence_at(
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
-    beside = beside[_are_in(hit_cells, cells.cells_of(beside))]
-    looks = _distinct(np.concatenate((beside, cells.looks_from(hit_cells[sees]))))
-    cell = np.searchsorted(hit_cells, cells.cells_of(looks))
+    keys = cells.cells_of(beside)
+    cell = np.searchsorted(hit_cells, keys)
+    is_of_one = np.append(hit_cells, -1)[cell] == keys
+    looks_in = cells.looks_in[_number(hit_cells[sees])]
+    cell = np.concatenate((cell[is_of_one], np.repeat(np.flatnonzero(sees), looks_in)))
+    looks = np.concatenate((beside[is_of_one], cells.looks_from(hit_cells[sees])))
+    order = np.argsort(looks, kind="stable")
+    order = order[np.diff(looks[order], prepend=-1) > 0]
+    looks, cell = looks[order], cell[order]
     hits = np.zeros(len(looks), np.int64)
     hits[np.searchsorted(looks, hit_looks)] = hits_of
     fair = sees[cell]
@@ -462,19 +505,18 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
 
 
 def looks_without(
-    cells: Cells, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
+    every: Looks, evidence: Evidence, stay: Stay, seen_to: Ns, window: tuple[Ns, Ns]
 ) -> tuple[int, Ns | None]:
     """Returns how many messages of a window [start, stop) could have had a thing, and have not.
 
     And when the chance that all of them missed it fell below 1 %; None where it did not.
-
-    `evidence` is that for this place.
+    `evidence` is that for this place alone.
 
     By the looks then from cells that saw it during the stay, up to `seen_to` or with a hit; each
     cell's own rate is known as well as its messages make it (a uniform prior).
     """
-    looks, is_hit = _number(evidence.looks), evidence.hits > 0
-    slices, first, last = cells.slice[looks], cells.first[looks], cells.last[looks]
+    looks, is_hit = evidence.looks, evidence.hits > 0
+    slices, (first, last) = every.slice[looks], every.times(looks)
     during = (slices >= stay.first_slice) & (slices <= stay.last_slice)
     during &= (last <= seen_to) | is_hit
     start, stop = window

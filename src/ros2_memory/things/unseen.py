@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.conditions import Contains, Equals
 from ros2_memory.analysis.sights import MAX_LABELS, MAX_SPOTS, SLICE_NS, Ints, Spot, Unplaced
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import Columns, distinct_rows
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NotInLakeError,
@@ -173,7 +173,6 @@ def _found_in_singular(
 
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields what the things that were found do not say."""
-    sights = known.estimate.sights
     if not asked.found:
         yield from _silences(view, known, asked)
     if len(known.frames) > 2:  # the first is the map's
@@ -181,7 +180,7 @@ def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
             "without a map, each run of odometry has its own coordinates: a thing may be listed "
             "once for each run"
         )
-    if not sights.topics and known.since is None and not asked.undecoded:
+    if not known.estimate.topics and known.since is None and not asked.undecoded:
         yield (
             "no things are known: no message has a detection, which is an object with one of the "
             f"fields {', '.join(LABELS)}, as in vision_msgs/msg/Detection3DArray; find_matches "
@@ -205,13 +204,13 @@ def vague_notes(
     also: Collection[str] = (),
 ) -> Iterator[str]:
     """Yields which labels were detected last while localisation was poor, of some keys or all."""
-    estimate, spots = known.estimate, known.estimate.sights.spots
+    estimate, spots = known.estimate, known.estimate.spots
     labels = {*also}
     for window in windows if estimate.poor.any() else ():
         during = _during(window, spots, Spot.FIRST, Spot.LAST)
         during = during[estimate.counts[during] > 0]
         for label in np.unique(spots[during, Spot.LABEL]).tolist():
-            key = known.labels.key(estimate.sights.labels[label])
+            key = known.labels.key(estimate.labels[label])
             if not keys or key in keys:
                 of_label = during[spots[during, Spot.LABEL] == label]
                 labels |= {estimate.names[key]} if estimate.is_vague(of_label) else set()
@@ -253,11 +252,13 @@ def unplaced_notes(known: KnownThings, windows: Collection[TimeWindow]) -> Itera
 
 def _labels_left_out(known: KnownThings) -> list[str]:
     """Returns a note where some slice has more labels than are looked at; none where none has."""
-    sights = known.estimate.sights
-    if len(sights.labels) <= MAX_LABELS:
+    estimate = known.estimate
+    if len(estimate.labels) <= MAX_LABELS:
         return []
     # A slice, a topic and a label are the first columns of both.
-    labels, _ = distinct_rows([*np.concatenate((sights.spots[:, :3], sights.unplaced[:, :3])).T])
+    tables = (estimate.spots, estimate.unplaced)
+    columns = [np.concatenate([table[:, name] for table in tables]) for name in range(3)]
+    labels, _ = distinct_rows(columns)
     _, slice_of = distinct_rows([*labels[:, :2].T])
     if np.bincount(slice_of).max() <= MAX_LABELS:
         return []
@@ -266,34 +267,34 @@ def _labels_left_out(known: KnownThings) -> list[str]:
 
 def _silences(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:
     """Yields why no thing may be known of a window: its detectors published nothing in it."""
-    sights, cells, window = known.estimate.sights, known.estimate.cells, asked.window
-    topics = [topic for topic in sights.topics if topic not in asked.undecoded]
+    window, (first, last) = asked.window, known.estimate.looks.times()
+    topics = [topic for topic in known.estimate.topics if topic not in asked.undecoded]
     # Each message of a detector is a look.
-    is_empty = not ((cells.first < window.stop) & (cells.last >= window.start)).any()
+    is_empty = not ((first < window.stop) & (last >= window.start)).any()
     if topics and is_empty and known.reaches_back(window):
         yield (
             f"{listed(topics)} published nothing in this window: whether things were there "
             "is not known"
         )
-    yield from describe_silences(view, sights.topics, window)
+    yield from describe_silences(view, known.estimate.topics, window)
 
 
-def _during(window: TimeWindow, table: Ints, first: int, last: int) -> Ints:
+def _during(window: TimeWindow, table: Ints | Columns, first: int, last: int) -> Ints:
     """Returns the rows of a table that reach into a window, by their `first` and `last` column."""
     return np.flatnonzero((table[:, first] < window.stop) & (table[:, last] >= window.start))
 
 
 def _detected(known: KnownThings, keys: Iterable[str], window: TimeWindow) -> Iterator[_Detected]:
     """Yields how often each of some labels was detected in a window."""
-    estimate, sights = known.estimate, known.estimate.sights
-    during = _during(window, sights.spots, Spot.FIRST, Spot.LAST)
-    all_lost = sights.unplaced[_during(window, sights.unplaced, Unplaced.FIRST, Unplaced.LAST)]
-    label, lost_label = sights.spots[during, Spot.LABEL], all_lost[:, Unplaced.LABEL]
-    key_of_label = np.array([known.labels.key(name) for name in sights.labels], object)
+    estimate, unplaced = known.estimate, known.estimate.unplaced
+    during = _during(window, estimate.spots, Spot.FIRST, Spot.LAST)
+    all_lost = unplaced[_during(window, unplaced, Unplaced.FIRST, Unplaced.LAST)]
+    label, lost_label = estimate.spots[during, Spot.LABEL], all_lost[:, Unplaced.LABEL]
+    key_of_label = np.array([known.labels.key(name) for name in estimate.labels], object)
     for key in keys:
         has_key = key_of_label == key
         rows, lost = during[has_key[label]], all_lost[has_key[lost_label]]
-        spots, count = sights.spots[rows], int(estimate.counts[rows].sum())
+        spots, count = estimate.spots[rows], int(estimate.counts[rows].sum())
         yield _Detected(
             name=estimate.names[key],
             counted=count,
