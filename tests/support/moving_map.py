@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 from random import Random
-from typing import TYPE_CHECKING
+from tempfile import TemporaryDirectory
 
 from tests.support.bags import Msg, detections, odom, tf, transform, write_mcap
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 S = 10**9
 MS = 10**6
@@ -93,11 +92,22 @@ def write_moving_map(
     bag_dir: Path, seed: int, *, seconds: int = 120, split_s: float = 10.0
 ) -> MovingMap:
     """Writes one recording in splits."""
+    truth, files = _recorded(seed, seconds, split_s)
+    (bag_dir / "rec").mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (bag_dir / "rec" / name).write_bytes(content)
+    return truth
+
+
+@cache
+def _recorded(seed: int, seconds: int, split_s: float) -> tuple[MovingMap, dict[str, bytes]]:
+    """What is true, and the content of each file: many tests ask about the same drive."""
     truth, messages = moving_map(Random(seed), seconds)
     splits: dict[int, list[Msg]] = {}
     for each in messages:
         splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
-    for number, some in splits.items():
-        ordered = sorted(some, key=lambda each: each.log_time)
-        write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", ordered)
-    return truth
+    with TemporaryDirectory() as folder:
+        for number, some in splits.items():
+            ordered = sorted(some, key=lambda each: each.log_time)
+            write_mcap(Path(folder) / f"rec_{number}.mcap", ordered)
+        return truth, {path.name: path.read_bytes() for path in Path(folder).iterdir()}
