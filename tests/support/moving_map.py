@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from random import Random
-from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
-from tests.support.bags import Msg, detections, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, detections, mcap_content, odom, tf, transform
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 S = 10**9
 MS = 10**6
@@ -106,8 +108,7 @@ def _recorded(seed: int, seconds: int, split_s: float) -> tuple[MovingMap, dict[
     splits: dict[int, list[Msg]] = {}
     for each in messages:
         splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
-    with TemporaryDirectory() as folder:
-        for number, some in splits.items():
-            ordered = sorted(some, key=lambda each: each.log_time)
-            write_mcap(Path(folder) / f"rec_{number}.mcap", ordered)
-        return truth, {path.name: path.read_bytes() for path in Path(folder).iterdir()}
+    return truth, {
+        f"rec_{number}.mcap": mcap_content(sorted(some, key=lambda each: each.log_time))
+        for number, some in splits.items()
+    }

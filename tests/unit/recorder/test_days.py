@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +45,7 @@ from tests.support.bags import (
     goals,
     header,
     make,
+    mcap_content,
     odom,
     text,
     tf,
@@ -97,8 +97,7 @@ def content_of_split(start: int, labels: tuple[str, ...] | None) -> bytes:
     messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::2]]
     messages.append(text(begin + 7 * S, "the code is 4711"))
     messages.sort(key=lambda each: each.log_time)
-    with TemporaryDirectory() as folder:
-        return write_mcap(Path(folder) / "split.mcap", messages).read_bytes()
+    return mcap_content(messages)
 
 
 def days_of(
