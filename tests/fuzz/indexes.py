@@ -113,29 +113,28 @@ def _with_a_lie(rng: Random, index: Piece, donor: bytes) -> Piece:
 
 def wrong_statistics(rng: Random, good: Good) -> Mutant:
     """Statistics or summary offsets that state something else."""
-    records = pieces(good.plain)
-    kinds = rng.choice(((Opcode.STATISTICS,), (Opcode.SUMMARY_OFFSET,)))
-    at = [n for n, each in enumerate(records) if each.opcode in kinds]
-    if not at:
-        return mutant_of(good, good.plain)
-    number = rng.choice(at)
-    body = bytearray(records[number].body)
-    body[rng.randrange(len(body))] ^= 1 << rng.randrange(8)
-    records[number] = replace(records[number], body=bytes(body))
-    return mutant_of(good, with_summary_sealed(as_it_was(good.plain, records)))
+    opcode = rng.choice((Opcode.STATISTICS, Opcode.SUMMARY_OFFSET))
+    return mutant_of(good, with_summary_sealed(_with_flipped_bit(rng, good, opcode)))
 
 
 def wrong_chunk_head(rng: Random, good: Good) -> Mutant:
     """A chunk that states other times than it holds."""
+    return mutant_of(good, _with_flipped_bit(rng, good, Opcode.CHUNK, slice(16)))
+
+
+def _with_flipped_bit(
+    rng: Random, good: Good, opcode: Opcode, within: slice = slice(None)
+) -> bytes:
+    """The file with a bit of one such record flipped, where it has any."""
     records = pieces(good.plain)
-    at = [n for n, each in enumerate(records) if each.opcode == Opcode.CHUNK]
+    at = [n for n, each in enumerate(records) if each.opcode == opcode]
     if not at:
-        return mutant_of(good, good.plain)
+        return good.plain
     number = rng.choice(at)
     body = bytearray(records[number].body)
-    body[rng.randrange(16)] ^= 1 << rng.randrange(8)
+    body[rng.randrange(*within.indices(len(body)))] ^= 1 << rng.randrange(8)
     records[number] = replace(records[number], body=bytes(body))
-    return mutant_of(good, as_it_was(good.plain, records))
+    return as_it_was(good.plain, records)
 
 
 def one_lie(rng: Random, good: Good) -> Mutant:

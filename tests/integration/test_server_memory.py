@@ -25,7 +25,7 @@ CACHED_MB: Final = 160
 AT_ONCE: Final = 8
 SHAPES: Final = {
     "few": (24 if LONG else 10, 40 * MB, MB),
-    "many": (3000 if LONG else 600, 400_000, MB),
+    "many": (3000 if LONG else 300, 400_000, MB),
     "together": (3000 if LONG else 300, 400_000, 60 * MB),
 }
 """How many messages of how many bytes, and the size of a chunk."""

@@ -6,6 +6,7 @@ import math
 import sqlite3
 from dataclasses import dataclass, field
 from functools import cache
+from io import BytesIO
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -139,48 +140,58 @@ def write_mcap(
     declared: Collection[tuple[str, str]] = (),
 ) -> Path:
     """Writes one MCAP split in the order given; `declared` adds (topic, type) without messages."""
-    how = layout or McapLayout()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("wb") as stream:
-        writer = Writer(
-            stream,
-            chunk_size=how.chunk_size or 1024,
-            compression=how.compression,
-            index_types=how.index_types,
-            repeat_channels=how.repeat_channels,
-            use_chunking=how.chunk_size is not None,
-            use_statistics=how.use_statistics,
-            use_summary_offsets=how.use_summary_offsets,
-        )
-        writer.start(profile=how.profile, library="test")
-        channels: dict[tuple[str, str], int] = {}
-        schemas: dict[str, int] = {}
-
-        def channel(topic: str, type_name: str) -> int:
-            if (topic, type_name) not in channels:
-                if type_name not in schemas:
-                    text = definition(type_name) if how.definitions else ""
-                    encoding = "ros2msg" if text else ""
-                    schemas[type_name] = writer.register_schema(type_name, encoding, text.encode())
-                qos = TRANSIENT_LOCAL if topic in how.latched else VOLATILE
-                channels[topic, type_name] = writer.register_channel(
-                    topic, "cdr", schemas[type_name], {"offered_qos_profiles": qos}
-                )
-            return channels[topic, type_name]
-
-        for topic, type_name in declared:
-            channel(topic, type_name)
-        for sequence, message in enumerate(messages):
-            writer.add_message(
-                channel(message.topic, message.type),
-                message.log_time,
-                message.payload,
-                message.published,
-                sequence,
-            )
-        if how.finish:
-            writer.finish()
+    path.write_bytes(mcap_content(messages, layout, declared=declared))
     return path
+
+
+def mcap_content(
+    messages: Iterable[Msg],
+    layout: McapLayout | None = None,
+    *,
+    declared: Collection[tuple[str, str]] = (),
+) -> bytes:
+    """The content of such a split."""
+    how, stream = layout or McapLayout(), BytesIO()
+    writer = Writer(
+        stream,
+        chunk_size=how.chunk_size or 1024,
+        compression=how.compression,
+        index_types=how.index_types,
+        repeat_channels=how.repeat_channels,
+        use_chunking=how.chunk_size is not None,
+        use_statistics=how.use_statistics,
+        use_summary_offsets=how.use_summary_offsets,
+    )
+    writer.start(profile=how.profile, library="test")
+    channels: dict[tuple[str, str], int] = {}
+    schemas: dict[str, int] = {}
+
+    def channel(topic: str, type_name: str) -> int:
+        if (topic, type_name) not in channels:
+            if type_name not in schemas:
+                text = definition(type_name) if how.definitions else ""
+                encoding = "ros2msg" if text else ""
+                schemas[type_name] = writer.register_schema(type_name, encoding, text.encode())
+            qos = TRANSIENT_LOCAL if topic in how.latched else VOLATILE
+            channels[topic, type_name] = writer.register_channel(
+                topic, "cdr", schemas[type_name], {"offered_qos_profiles": qos}
+            )
+        return channels[topic, type_name]
+
+    for topic, type_name in declared:
+        channel(topic, type_name)
+    for sequence, message in enumerate(messages):
+        writer.add_message(
+            channel(message.topic, message.type),
+            message.log_time,
+            message.payload,
+            message.published,
+            sequence,
+        )
+    if how.finish:
+        writer.finish()
+    return stream.getvalue()
 
 
 def write_splits(

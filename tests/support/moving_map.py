@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cache
 from random import Random
 from typing import TYPE_CHECKING
 
-from tests.support.bags import Msg, detections, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, detections, mcap_content, odom, tf, transform
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -93,11 +94,21 @@ def write_moving_map(
     bag_dir: Path, seed: int, *, seconds: int = 120, split_s: float = 10.0
 ) -> MovingMap:
     """Writes one recording in splits."""
+    truth, files = _recorded(seed, seconds, split_s)
+    (bag_dir / "rec").mkdir(parents=True, exist_ok=True)
+    for name, content in files.items():
+        (bag_dir / "rec" / name).write_bytes(content)
+    return truth
+
+
+@cache
+def _recorded(seed: int, seconds: int, split_s: float) -> tuple[MovingMap, dict[str, bytes]]:
+    """What is true, and the content of each file: many tests ask about the same drive."""
     truth, messages = moving_map(Random(seed), seconds)
     splits: dict[int, list[Msg]] = {}
     for each in messages:
         splits.setdefault(int((each.log_time - BEGIN) / S // split_s), []).append(each)
-    for number, some in splits.items():
-        ordered = sorted(some, key=lambda each: each.log_time)
-        write_mcap(bag_dir / "rec" / f"rec_{number}.mcap", ordered)
-    return truth
+    return truth, {
+        f"rec_{number}.mcap": mcap_content(sorted(some, key=lambda each: each.log_time))
+        for number, some in splits.items()
+    }

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from mcp.types import TextContent
 
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, boolean, detections, odom, tf, transform, write_mcap
+from tests.support.bags import Msg, boolean, detections, mcap_content, odom, tf, transform
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -102,11 +102,12 @@ CALLS: list[tuple[str, dict[str, Any]]] = [
 
 def write_run(bag_dir: Path) -> None:
     """Twelve seconds of a robot: odometry, transforms, one sighting, one bump."""
-    write_mcap(bag_dir / "run" / "run_0.mcap", _run())
+    (bag_dir / "run").mkdir(parents=True, exist_ok=True)
+    (bag_dir / "run" / "run_0.mcap").write_bytes(_run())
 
 
 @cache
-def _run() -> list[Msg]:
+def _run() -> bytes:
     messages: list[Msg] = []
     for n in range(LENGTH_S * 50):
         at = T0 + n * NS_PER_S // 50
@@ -117,7 +118,7 @@ def _run() -> list[Msg]:
     messages.append(tf(T0, fixed, topic="/tf_static"))
     messages.append(detections(T0 + 5 * NS_PER_S, ["scissors", "cup"]))
     messages.append(boolean(T0 + 6 * NS_PER_S, data=True))
-    return messages
+    return mcap_content(messages)
 
 
 async def ask(client: Client, name: str, given: dict[str, Any]) -> tuple[Any, bool]:

@@ -109,7 +109,7 @@ def answers(memory: Memory, draw: Random) -> Iterator[object]:
 @pytest.mark.parametrize("seed", range(examples(2)))
 def test_what_is_known_of_parts_changes_no_answer(seed: int) -> None:
     with TemporaryDirectory() as folder:
-        write_world(Path(folder), Random(seed))
+        write_world(Path(folder), Random(seed), hours=1.0)
         share = Random(seed).choice([10.0, 0.001])
         world = World.of(Path(folder), limits=StoreLimits(max_share=share))
         world.fill()

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals, NearPosition
+from ros2_memory.analysis.conditions import Beyond, Condition, Contains, Equals
 from ros2_memory.columns.table import Table
 from ros2_memory.columns.truth import ColumnCondition
 from tests.support.bags import make, stamp
@@ -195,28 +195,6 @@ def test_a_detection_whose_best_hypothesis_has_no_name_is_unsure() -> None:
     condition = Condition(Beyond(-1e300, above=True), "detections.results.pose", 0.5)
     table = drawn_of(kind, [whole]).table
     assert ColumnCondition(condition, EXTRACTOR).truth(table).unsure.all()
-
-
-@pytest.mark.parametrize(
-    "condition",
-    [
-        Condition(Contains("zebra")),
-        Condition(Equals("zebra"), "detections.label"),
-        Condition(Contains("zebra"), min_score=0.5),
-        Condition(Beyond(5.0, above=True), "detections.score"),
-        Condition(Beyond(-1.0, above=False), "detections.0.score"),
-        Condition(Equals(7.5), "detections.point.x"),
-        Condition(NearPosition(50.0, 0.0, None, 1.0)),
-    ],
-)
-def test_a_column_that_its_zone_rules_out_is_not_unpacked(condition: Condition) -> None:
-    table = stored(drawn_of(VISION, [detections(("cup", 0.9)), detections()]).table, 0.0)
-    found = ColumnCondition(condition, EXTRACTOR).truth(table)
-    assert found.is_none
-    assert not table.unpacked
-    assert not found.surely.any()
-    assert not found.unsure.any()
-    assert found.surely.size == found.unsure.size == 2
 
 
 def test_only_the_columns_that_may_match_are_unpacked() -> None:

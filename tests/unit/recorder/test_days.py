@@ -12,7 +12,6 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,6 +45,7 @@ from tests.support.bags import (
     goals,
     header,
     make,
+    mcap_content,
     odom,
     text,
     tf,
@@ -85,7 +85,7 @@ def splits(bag_dir: Path, minutes: Iterable[int]) -> None:
 @cache
 def content_of_split(start: int, labels: tuple[str, ...] | None) -> bytes:
     begin = T0 + start * S
-    times = range(begin, begin + 60 * S, S // 5)
+    times = range(begin, begin + 60 * S, S // 2)
     messages: list[Msg] = [
         tf(begin, transform(begin, "base_link", "camera", (0.1, 0, 0.3)), topic="/tf_static")
     ]
@@ -93,12 +93,11 @@ def content_of_split(start: int, labels: tuple[str, ...] | None) -> bytes:
         messages.append(odom(at, (at - T0) / S / 4, 1.0))
         messages.append(boolean(at, (at - T0) // (30 * S) % 2 == 1))
     if labels is not None:
-        messages += [detections(at, labels) for at in times[::5]]
-    messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::5]]
+        messages += [detections(at, labels) for at in times[::2]]
+    messages += [battery(at, 0.9 - (at - T0) / S / 1e5) for at in times[::2]]
     messages.append(text(begin + 7 * S, "the code is 4711"))
     messages.sort(key=lambda each: each.log_time)
-    with TemporaryDirectory() as folder:
-        return write_mcap(Path(folder) / "split.mcap", messages).read_bytes()
+    return mcap_content(messages)
 
 
 def days_of(

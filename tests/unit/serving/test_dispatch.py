@@ -92,25 +92,6 @@ def log() -> Iterator[LogCapture]:
     structlog.reset_defaults()
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "error", "is_error"),
-    [
-        ("none", {}, {"error": "no_data", "reason": "gap", "detail": "a hole"}, False),
-        ("none", {"bad": 1}, {"error": "invalid_arguments", "detail": "bad was given"}, True),
-        ("late", {}, {"error": "timeout", "detail": "too long"}, True),
-    ],
-)
-async def test_every_error_is_json(
-    name: str, given: dict[str, Any], error: dict[str, str], is_error: bool
-) -> None:
-    none = tool("none", raising(NoDataError(NoDataReason.GAP, "a hole")))
-    late = tool("late", raising(QueryTimeoutError("too long")))
-    async with Client(served(none, late)) as client:
-        result = await client.call_tool(name, given)
-        assert sent(result) == error
-        assert result.is_error == is_error
-
-
 async def test_an_unknown_tool_is_answered_with_the_nearest_names() -> None:
     async with Client(served(tool("get_position_at", raising(ValueError())))) as client:
         result = await client.call_tool("get_positon", {})
