@@ -269,8 +269,9 @@ class Scanner:
             topic = None if self.store is None else self.store.topic(number)
             if topic is not None:
                 is_of_topic = topics == number
-                zones = partial(self._zones, number, numbers[is_of_topic])
-                possible[is_of_topic] = may_match(PartZones(topic, zones))
+                of_topic = numbers[is_of_topic]
+                zones = partial(self._zones, number, of_topic)
+                possible[is_of_topic] = may_match(PartZones(topic, of_topic, zones))
         return possible
 
     def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:

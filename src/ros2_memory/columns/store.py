@@ -65,6 +65,8 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 
 T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
+Key: TypeAlias = "tuple[str, int, Ns, Ns, Ns, Ns]"
+"""A `BagKey`, of which a week has 60,000, as SQLite returns it."""
 
 
 class BagKey(NamedTuple):
@@ -119,17 +121,6 @@ class Written(NamedTuple):
 
     bags: int
     parts: Mapping[int, PackedPart]
-
-
-class StoredBag(NamedTuple):
-    """A bag that is stored: its key, and whether copies of its messages can be recognised.
-
-    `row` is its number less the store's `offset`: a week of these is made at once.
-    """
-
-    key: BagKey
-    row: int
-    hashed: bool
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -223,15 +214,17 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
-        """Returns the bags that are stored, by their paths; among some, or all of them."""
+    def bags(self, paths: Sequence[str] | None = None) -> Mapping[Key, tuple[int, int]]:
+        """Returns the bags that are stored, by what a `BagKey` has; among some, or all of them.
+
+        Of each its number less the `offset`, and whether copies of its messages can be recognised.
+        """
         condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
+        size = len(BagKey._fields)
         return self._asked(
-            lambda rows: {
-                key[0]: StoredBag(BagKey(*key), row, bool(hashed)) for row, hashed, *key in rows
-            },
+            lambda rows: {row[:size]: row[size:] for row in rows},
             {},
-            f"SELECT id, hashed, {_KEY} FROM bag WHERE definitions IN ('', ?) {condition}",
+            f"SELECT {_KEY}, id, hashed FROM bag WHERE definitions IN ('', ?) {condition}",
             *(self._definitions, *(() if paths is None else (json.dumps(paths),))),
         )
 
