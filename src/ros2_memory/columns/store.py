@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import accumulate, pairwise
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -123,8 +122,7 @@ class Written(NamedTuple):
     parts: Mapping[int, PackedPart]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PartHead:
+class PartHead(NamedTuple):
     """What is known of a part without reading a column.
 
     Attributes:
@@ -301,9 +299,10 @@ class ColumnStore(Database):
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(numbers) for numbers, *_ in rows]
-            all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
-            bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
+            texts = [bags[1:-1] for bags, *_ in rows]
+            all_bags = np.array(json.loads(f"[{','.join(texts)}]"), np.int64) + self.offset
+            ends = accumulate((text.count(",") + 1 for text in texts), initial=0)
+            bags_of_parts = [all_bags[begin:end] for begin, end in pairwise(ends)]
             return [
                 PartHead(
                     self.offset + number,
