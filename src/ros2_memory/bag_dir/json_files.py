@@ -16,7 +16,7 @@ import json
 import os
 import re
 from contextlib import suppress
-from functools import lru_cache, wraps
+from functools import cached_property, lru_cache, wraps
 from typing import (
     TYPE_CHECKING,
     Annotated,
@@ -87,9 +87,13 @@ class JsonLog(Generic[_T]):
         self, name: str, row: type[_T], *, most_bytes: int = MOST_BYTES, is_brief: bool = False
     ) -> None:
         self.name = name
-        self._adapter = TypeAdapter(row)
+        self._row = row
         self._most_bytes = most_bytes
         self._is_brief = is_brief
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[_T]:  # takes some ms to make, and most files are never there
+        return TypeAdapter(self._row)
 
     def lines(self, bag_dir: Path) -> Iterator[Line[_T]]:
         """Yields the lines that are not empty.
@@ -200,10 +204,14 @@ class JsonDocument(Generic[_T]):
         most_bytes: int = MAX_SMALL_FILE,
     ) -> None:
         self.name = name
-        self._adapter = TypeAdapter(content)
+        self._content = content
         self._is_ascii = is_ascii
         self._most_bytes = most_bytes
         self.current = until_changed(name)(self.read)
+
+    @cached_property
+    def _adapter(self) -> TypeAdapter[_T]:
+        return TypeAdapter(self._content)
 
     def read(self, bag_dir: Path) -> _T | None:
         """Returns the value; None where there is no file.

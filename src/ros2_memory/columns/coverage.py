@@ -7,12 +7,13 @@ timeline serves every later timeline that still has it.
 from __future__ import annotations
 
 from itertools import chain
+from operator import attrgetter
 from threading import Lock
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.store import BagKey, ColumnStore, State, StoredBag, relative
+from ros2_memory.columns.store import ColumnStore, Key, State, relative
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 _FEW: Final = 8
 """Segments that are looked up one by one; for more of them all stored bags are read at once."""
+_NONE: Final = (-1, 0)
+_stamps = attrgetter("size", "mtime_ns", "sidecar_ns", "start", "end")
 
 
 class CoveredSegment(NamedTuple):
@@ -128,7 +131,7 @@ class Covering:
 
     def __init__(self, store: ColumnStore, bag_dir: Path) -> None:
         self.store = store
-        self._bag_dir = bag_dir
+        self._root = str(bag_dir)
         self._lock = Lock()
         self._by_id: dict[int, CoveredSegment] = {}
         self._latest: tuple[Timeline, Coverage] | None = None
@@ -162,27 +165,26 @@ class Covering:
             and not (has_changed and covered.missing)
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
-        stored: Mapping[str, StoredBag] = {}
+        stored: Mapping[Key, tuple[int, int]] = {}
         if len(unknown) > _FEW:
             stored = self.store.bags()
         elif unknown:
-            root = str(self._bag_dir)
             bags = chain.from_iterable(segment.bags for segment in unknown)
-            stored = self.store.bags([relative(bag.file, root) for bag in bags])
+            stored = self.store.bags([relative(bag.file, self._root) for bag in bags])
         return [
             remembered.get(id(segment)) or self._covered_segment(segment, stored)
             for segment in timeline.segments
         ]
 
-    def _covered_segment(self, segment: Segment, stored: Mapping[str, StoredBag]) -> CoveredSegment:
-        offset = self.store.offset
-        numbers, is_hashed = np.full(len(segment.bags), -1), np.zeros(len(segment.bags), np.bool_)
-        missing: list[BagFile] = []
-        for nth, bag in enumerate(segment.bags):
-            key = BagKey.of(bag, self._bag_dir)
-            known = stored.get(key.path)
-            if known is not None and known.key == key and bag.state is BagState.CLOSED:
-                numbers[nth], is_hashed[nth] = offset + known.row, known.hashed
-            else:
-                missing.append(bag)
-        return CoveredSegment(segment, numbers, is_hashed, tuple(missing))
+    def _covered_segment(
+        self, segment: Segment, stored: Mapping[Key, tuple[int, int]]
+    ) -> CoveredSegment:
+        keys = [(relative(bag.file, self._root), *_stamps(bag)) for bag in segment.bags]
+        rows = [
+            stored.get(key, _NONE) if bag.state is BagState.CLOSED else _NONE
+            for key, bag in zip(keys, segment.bags, strict=True)
+        ]
+        numbers, hashed = np.array(rows, np.int64).T
+        missing = tuple(bag for bag, row in zip(segment.bags, rows, strict=True) if row is _NONE)
+        numbers = np.where(numbers < 0, -1, numbers + self.store.offset)
+        return CoveredSegment(segment, numbers, hashed > 0, missing)

@@ -547,9 +547,10 @@ class Scan:
         """Returns what tells messages apart, of some rows of each unit."""
         # By their names: of messages of one time that counts which lies in the first recording.
         recordings = sorted({unit.first_bag.recording for unit in units}, key=str)
+        number_of = {recording: nth for nth, recording in enumerate(recordings)}
         parts: list[Identities] = []
         for unit, unit_rows in zip(units, rows, strict=True):
-            recording = recordings.index(unit.first_bag.recording)
+            recording = number_of[unit.first_bag.recording]
             published, hashes = self._identities(unit, unit_rows)
             # Another for each recording: what has no hash is no copy.
             hashes = np.where(hashes == UNHASHED, UNHASHED - recording, hashes)

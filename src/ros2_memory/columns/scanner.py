@@ -110,7 +110,7 @@ class Caches:
     Attributes:
         read: by part and path, unpacked columns; by kind and key, fragments.
         packed: by part and path, what is known of a column.
-        fetched: by part and path, compressed columns that are wanted next.
+        fetched: by part and path, compressed columns that are wanted next, until they are.
         zones: by topic and path, the zones of its parts.
         heads: by topic and days, its parts.
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
@@ -269,8 +269,9 @@ class Scanner:
             topic = None if self.store is None else self.store.topic(number)
             if topic is not None:
                 is_of_topic = topics == number
-                zones = partial(self._zones, number, numbers[is_of_topic])
-                possible[is_of_topic] = may_match(PartZones(topic, zones))
+                of_topic = numbers[is_of_topic]
+                zones = partial(self._zones, number, of_topic)
+                possible[is_of_topic] = may_match(PartZones(topic, of_topic, zones))
         return possible
 
     def bounds(self, heads: Sequence[PartHead], path: str) -> dict[int, tuple[float, float]]:
@@ -440,23 +441,25 @@ class Scanner:
         return column
 
     def _stored(self, head: PartHead, path: str, together: Sequence[PartHead]) -> bytes:
-        """Returns the compressed bytes of a column.
+        """Returns the compressed bytes of a column, which are kept no longer.
 
         Where that of the part before was read, too, those of the next parts are fetched with it.
 
         Raises:
             GoneError: the part was deleted meanwhile, or the store cannot be read.
         """
-        stored = self.caches.fetched.get((head.number, path))
+        stored = self.caches.fetched.take((head.number, path))
         if stored is None:
             numbers = [part.number for part in together if part.topic == head.topic]
             nth = numbers.index(head.number) if head.number in numbers else 0
             goes_on = nth > 0 and self.caches.read.get((numbers[nth - 1], path)) is not None
-            numbers = numbers[nth:] if goes_on else [head.number]
-            fetched = self._store_of_parts.part_data(numbers, path, _FETCHED_BYTES)
+            later = numbers[nth + 1 :] if goes_on else []
+            unread = [one for one in later if self.caches.read.get((one, path)) is None]
+            wanted = [head.number, *unread]
+            fetched = self._store_of_parts.part_data(wanted, path, _FETCHED_BYTES)
+            stored = fetched.pop(head.number, None)
             for number, data in fetched.items():
                 self.caches.fetched.put((number, path), data, len(data) + _COLUMN_BYTES)
-            stored = fetched.get(head.number)
             if stored is None:
                 raise GoneError
         return stored

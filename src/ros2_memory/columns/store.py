@@ -17,9 +17,8 @@ from __future__ import annotations
 
 import json
 import os
-from dataclasses import dataclass
 from functools import partial
-from itertools import chain
+from itertools import accumulate, pairwise
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -65,6 +64,8 @@ LONG_NS: Final[Ns] = 2 * PART_NS
 
 T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
+Key: TypeAlias = "tuple[str, int, Ns, Ns, Ns, Ns]"
+"""A `BagKey`, of which a week has 60,000, as SQLite returns it."""
 
 
 class BagKey(NamedTuple):
@@ -121,19 +122,7 @@ class Written(NamedTuple):
     parts: Mapping[int, PackedPart]
 
 
-class StoredBag(NamedTuple):
-    """A bag that is stored: its key, and whether copies of its messages can be recognised.
-
-    `row` is its number less the store's `offset`: a week of these is made at once.
-    """
-
-    key: BagKey
-    row: int
-    hashed: bool
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PartHead:
+class PartHead(NamedTuple):
     """What is known of a part without reading a column.
 
     Attributes:
@@ -223,15 +212,17 @@ class ColumnStore(Database):
 
         return self.read(ask, {})
 
-    def bags(self, paths: Sequence[str] | None = None) -> dict[str, StoredBag]:
-        """Returns the bags that are stored, by their paths; among some, or all of them."""
+    def bags(self, paths: Sequence[str] | None = None) -> Mapping[Key, tuple[int, int]]:
+        """Returns the bags that are stored, by what a `BagKey` has; among some, or all of them.
+
+        Of each its number less the `offset`, and whether copies of its messages can be recognised.
+        """
         condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
+        size = len(BagKey._fields)
         return self._asked(
-            lambda rows: {
-                key[0]: StoredBag(BagKey(*key), row, bool(hashed)) for row, hashed, *key in rows
-            },
+            lambda rows: {row[:size]: row[size:] for row in rows},
             {},
-            f"SELECT id, hashed, {_KEY} FROM bag WHERE definitions IN ('', ?) {condition}",
+            f"SELECT {_KEY}, id, hashed FROM bag WHERE definitions IN ('', ?) {condition}",
             *(self._definitions, *(() if paths is None else (json.dumps(paths),))),
         )
 
@@ -308,9 +299,10 @@ class ColumnStore(Database):
                 (topic, span.stop, span.start, max(after - self.offset, 0)),
             ).fetchall()
             # Thousands of small arrays would keep other memory from going back: one has all.
-            bags = [json.loads(numbers) for numbers, *_ in rows]
-            all_bags = np.array([*chain.from_iterable(bags)], np.int64) + self.offset
-            bags_of_parts = np.split(all_bags, np.cumsum([*map(len, bags)])[:-1]) if rows else []
+            texts = [bags[1:-1] for bags, *_ in rows]
+            all_bags = np.array(json.loads(f"[{','.join(texts)}]"), np.int64) + self.offset
+            ends = accumulate((text.count(",") + 1 for text in texts), initial=0)
+            bags_of_parts = [all_bags[begin:end] for begin, end in pairwise(ends)]
             return [
                 PartHead(
                     self.offset + number,

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple
+from itertools import chain, compress
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -43,6 +43,7 @@ from ros2_memory.columns.shown import (
     placed,
     unknown,
 )
+from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import (
     ROWS,
@@ -57,7 +58,7 @@ from ros2_memory.columns.values import (
 from ros2_memory.messages.detections import looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask, Numeric, ZoneOf
@@ -73,6 +74,8 @@ _MOST_DECIDED: Final = 4_096
 _TINY_M: Final = 1e-150
 """The squares of shorter distances vanish."""
 
+_Test: TypeAlias = "_LeafTest | _PlaceTest"
+
 
 class ColumnCondition:
     """Tests one condition on tables; remembers what it means for each type that it met.
@@ -84,42 +87,60 @@ class ColumnCondition:
 
     def __init__(self, condition: Condition, extractor: SchemaExtractor) -> None:
         self._plans = ByType(extractor, partial(_Plan.of, condition))
+        self._possible: dict[int, Sequence[_Test]] = {}
 
     def truth(self, table: Table) -> TruthValues:
         """Returns which rows of a table meet the condition."""
         plan, values = self._plans.of(table), Values(table)
         if plan is None:
             return unknown(values.rows)
+        known = self._possible.get(table.number) if isinstance(table, StoredTable) else None
+        whole = _possible(plan.whole, values) if known is None else known
         if plan.counted is None:
-            return _any_of(plan.whole, values)
-        if not plan.may_match(values.zone):
+            return _any_of(whole, values)
+        whole = [*whole]
+        if not whole:
             return nowhere(values.rows)
         texts = tuple(
             t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
         )
-        counted = _any_of(plan.counted, values)
+        counted = _any_of(_possible(plan.counted, values), values)
         if not may_be_json(values, texts):
             return counted
         # A text in which detections were left out is another text: both have to pass.
-        whole = _any_of(plan.whole, values)
-        return TruthValues(counted.surely & whole.surely, counted.perhaps & whole.perhaps)
+        met = _any_of(whole, values)
+        return TruthValues(counted.surely & met.surely, counted.perhaps & met.perhaps)
 
-    def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
-        """Returns whether a row may meet the condition, as known without reading a column.
+    def may_match(self, parts: PartZones) -> bool | Mask:
+        """Returns which parts may have a row that meets the condition, by their zones.
 
-        Of several parts for each of them, or for all.
+        By which of its tests is remembered: to look at the zones of one part takes as long.
         """
-        plan = self._plans.of(table_or_parts)
+        plan = self._plans.of(parts)
         if plan is None:
             return True
-        return plan.may_match(lambda leaf: zone_of(leaf, table_or_parts.zone))
+        possible: list[Mask] = []
+        for test in plan.whole:
+            may_pass = test.may_match(lambda leaf: zone_of(leaf, parts.zone))
+            if may_pass is True:
+                return True
+            possible.append(np.broadcast_to(may_pass, parts.numbers.size))
+        if not possible:
+            return False
+        sets, nth = np.unique(possible, axis=1, return_inverse=True)
+        tests = [[*compress(plan.whole, one)] for one in sets.T]
+        self._possible |= {
+            part: tests[at] for part, at in zip(parts.numbers.tolist(), nth.tolist(), strict=True)
+        }
+        some: Mask = np.any(possible, axis=0)
+        return some
 
 
 class _Plan(NamedTuple):
     """What is tested on a value, and on the value without detections of a low score."""
 
-    whole: Sequence[_LeafTest | _PlaceTest]
-    counted: Sequence[_LeafTest | _PlaceTest] | None
+    whole: Sequence[_Test]
+    counted: Sequence[_Test] | None
 
     @classmethod
     def of(cls, condition: Condition, shape: Shape) -> _Plan:
@@ -133,21 +154,16 @@ class _Plan(NamedTuple):
             return cls(whole, None)
         return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
 
-    def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
-        possible: bool | Mask = False
-        for test in self.whole:
-            possible = possible | test.may_match(zone_of)
-            if possible is True:
-                break
-        return possible
+
+def _possible(tests: Iterable[_Test], values: Values) -> Iterator[_Test]:
+    """Yields the tests that some row may pass, as known without reading a column."""
+    return (test for test in tests if test.may_match(values.zone))
 
 
-def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> TruthValues:
+def _any_of(tests: Iterable[_Test], values: Values) -> TruthValues:
     """Returns which rows pass any of the tests."""
     surely, perhaps = nowhere(values.rows)
     for test in tests if values.rows else ():
-        if not test.may_match(values.zone):
-            continue
         try:
             for level, passing, limits in test.passing(values):
                 if level is ROWS and not limits:
@@ -164,7 +180,7 @@ def _any_of(tests: Sequence[_LeafTest | _PlaceTest], values: Values) -> TruthVal
     return TruthValues(surely, perhaps | surely)
 
 
-def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
+def _tests(condition: Condition, value: Node) -> list[_Test]:
     test, field = condition.test, condition.field
     spots = [Spot(value)] if field is None else at_field(value, field)
     if isinstance(test, NearPosition):
@@ -175,7 +191,7 @@ def _tests(condition: Condition, value: Node) -> list[_LeafTest | _PlaceTest]:
             # A missing z is NaN, which is near only what is infinitely far away.
             if test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
         ]
-    tests: list[_LeafTest | _PlaceTest] = []
+    tests: list[_Test] = []
     for spot in spots:
         for path, leaf, limits in leaves_below(spot):
             # Elements of lists have no name of their own.

@@ -133,10 +133,12 @@ class PartZones(NamedTuple):
 
     Attributes:
         topic: what they are of.
+        numbers: of the parts.
         zones: returns the zones of a column, by its path.
     """
 
     topic: Topic
+    numbers: IntArray
     zones: Callable[[str], Zones]
 
     @property

@@ -7,7 +7,7 @@ from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -69,13 +69,17 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
         held: first and last log times (inclusive) of files or recordings, and their recording.
     """
     spans: list[tuple[Ns, Ns]] = []
-    open_spans: list[tuple[Ns, object]] = []
-    for first, last, recording in sorted(held, key=lambda span: span[0]):
-        open_spans = [(end, folder) for end, folder in open_spans if end + COPY_HORIZON_NS >= first]
-        spans.extend(
-            (first - COPY_HORIZON_NS, min(end, last) + COPY_HORIZON_NS + 1)
-            for end, folder in open_spans
-            if folder != recording
-        )
-        open_spans.append((last, recording))
+    # What reaches farthest of all so far, and of all other recordings than that.
+    farthest: tuple[Ns, object] = (MIN_NS, None)
+    another: tuple[Ns, object] = (MIN_NS, None)
+    for first, last, recording in sorted(held, key=itemgetter(0)):
+        reach, holder = another if recording == farthest[1] else farthest
+        if holder is not None and reach + COPY_HORIZON_NS >= first:
+            spans.append((first - COPY_HORIZON_NS, min(reach, last) + COPY_HORIZON_NS + 1))
+        if recording == farthest[1]:
+            farthest = max(farthest[0], last), recording
+        elif last >= farthest[0]:
+            farthest, another = (last, recording), farthest
+        elif last > another[0]:
+            another = last, recording
     return united(spans)

@@ -22,6 +22,7 @@ from ros2_memory.analysis.motion.trajectory import (
 from ros2_memory.analysis.poses import Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
+from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -195,7 +196,12 @@ def slices_by_poses(
         ):
             if stretch.window.overlaps(pose_slice.start, pose_slice.stop - 1):
                 key, load = pose_slice.key(settings), partial(make, pose_slice)
-                yield pose_slice.start, remembered(view, kind, key, load, reader.trouble)
+                # Those before it in the stretch are wanted next.
+                before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
+                yield (
+                    pose_slice.start,
+                    remembered(view, kind, key, load, reader.trouble, also_before=before),
+                )
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
         around = stretch.window.widened(beside)

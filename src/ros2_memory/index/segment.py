@@ -24,12 +24,10 @@ from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ra
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
-
-    from ros2_memory.core.pauses import CountedPause
 
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
@@ -349,16 +347,25 @@ class Segment:
     def activities(self) -> dict[str, Activity]:
         """By topic, when the bags hold it and how often."""
         columns = _topic_columns(self)
-        lengths = np.array([bag.end - bag.start for bag in self.bags], np.int64)
-        absences: dict[str, dict[int, Sequence[CountedPause]]] = {}
+        topics = sorted(columns.topics)
+        numbers = columns.of_all(topics)
+        lengths = (numbers[:, :, 0] > 0) @ np.array([bag.end - bag.start for bag in self.bags])
+        # Between absences a bag is as many: what follows each comes behind all bags.
+        parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
         for row, bag in enumerate(self.bags):
             for topic, pauses in bag.summary.schema.absences:
-                absences.setdefault(topic, {})[row] = pauses
-        return {
-            topic: _activity_of(column, lengths, absences.get(topic, {}))
-            for topic in sorted(columns.topics)
-            if (column := columns.of(topic)) is not None
-        }
+                nth = topics.index(topic)
+                count, _, last = numbers[nth, row].tolist()
+                for start, end, sent in reversed(pauses):
+                    parts.append((nth, (count - sent, end, last)))
+                    count, last = sent, start
+                    lengths[nth] -= end - start
+                numbers[nth, row, [0, 2]] = count, last
+        more = np.zeros((len(topics), len(parts), 3), np.int64)
+        for at, (nth, part) in enumerate(parts):
+            more[nth, at] = part
+        activities = _activities(np.concatenate((numbers, more), axis=1), lengths)
+        return dict(zip(topics, activities, strict=True))
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -445,6 +452,19 @@ class _TopicColumns:
         for header, row in header_rows.items():
             self._rows_by_topic.setdefault(header.topic, []).append(row)
 
+    def of_all(self, topics: Sequence[str]) -> NDArray[np.int64]:
+        """Returns count, first and last by topic and bag; the types of a topic count together."""
+        rows = [self._rows_by_topic[topic] for topic in topics]
+        starts = np.cumsum([0, *map(len, rows)])[:-1]
+        numbers = self.numbers[[*chain.from_iterable(rows)]]
+        if len(numbers) == len(topics):
+            return numbers
+        has_none = numbers[:, :, 0] == 0
+        numbers[has_none] = (0, MAX_NS, MIN_NS)
+        joined = (np.add, np.minimum, np.maximum)
+        parts = [add.reduceat(numbers[:, :, nth], starts, axis=0) for nth, add in enumerate(joined)]
+        return np.stack(parts, axis=2)
+
     @property
     def topics(self) -> Collection[str]:
         """Their names."""
@@ -472,56 +492,43 @@ def _topic_columns(segment: Segment) -> _TopicColumns:
     return _TopicColumns(segment.bags)
 
 
-def _activity_of(
-    column: TopicColumn, lengths: _Times, absences: Mapping[int, Sequence[CountedPause]]
-) -> Activity:
-    """Returns when bags hold a topic, and how often.
+def _activities(numbers: NDArray[np.int64], lengths: _Times) -> Iterator[Activity]:
+    """Yields when bags hold each of some topics, and how often.
 
-    `lengths` (ns) are those of all bags, `absences` where some of them hold none of the topic.
+    Args:
+        numbers: count, first and last log time by topic and bag; a count of 0 where it has none.
+        lengths: of the bags that hold each topic, in all (ns).
     """
-    bags, firsts, lasts, counts = column
-    if (bags[1:] == bags[:-1]).any():  # the types of a topic count together
-        bags, rows = np.unique(bags, return_index=True)
-        counts = np.add.reduceat(counts, rows)
-        firsts, lasts = np.minimum.reduceat(firsts, rows), np.maximum.reduceat(lasts, rows)
-    length = int(lengths[bags].sum())
-    if absences:
-        parts = list(_parts(zip(bags.tolist(), firsts, lasts, counts, strict=True), absences))
-        firsts, lasts, counts = np.array(parts, np.int64).T
-        length -= sum(end - start for pauses in absences.values() for start, end, _ in pauses)
-    spacings = _spacings(counts, lasts - firsts)
-    return Activity(_runs(firsts, lasts), spacings, int(counts.sum()), length)
+    counts = numbers[:, :, 0]
+    spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
+    rows = zip(_runs(numbers), spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
+    yield from (Activity(*row) for row in rows)
 
 
-def _parts(
-    rows: Iterable[tuple[int, Ns, Ns, int]], absences: Mapping[int, Sequence[CountedPause]]
-) -> Iterator[tuple[Ns, Ns, int]]:
-    """Yields first and last time and count of each bag, or of its parts between absences."""
-    for bag, first, last, count in rows:
-        begin, before = first, 0
-        for start, end, sent in absences.get(bag, ()):
-            yield begin, start, sent - before
-            begin, before = end, sent
-        yield begin, last, count - before
+def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
+    """Yields the runs of each topic; see `Activity`."""
+    is_there = numbers[:, :, 0] > 0
+    firsts = np.where(is_there, numbers[:, :, 1], MAX_NS)
+    order = np.argsort(firsts, axis=1, kind="stable")
+    begins = np.take_along_axis(firsts, order, axis=1)
+    lasts = np.where(is_there, numbers[:, :, 2], MIN_NS)
+    reach = np.maximum.accumulate(np.take_along_axis(lasts, order, axis=1), axis=1)
+    is_break = (begins[:, 1:] - SHORTEST_NS > reach[:, :-1]) & (begins[:, 1:] < MAX_NS)
+    for nth, breaks in enumerate(is_break):
+        edges = np.flatnonzero(breaks)
+        starts = begins[nth, [0, *(edges + 1)]].tolist()
+        yield tuple(zip(starts, reach[nth, [*edges, -1]].tolist(), strict=True))
 
 
-def _runs(firsts: _Times, lasts: _Times) -> tuple[Span, ...]:
-    """Returns the runs of a topic; see `Activity`."""
-    order = np.argsort(firsts, kind="stable")
-    begins, reach = firsts[order], np.maximum.accumulate(lasts[order])
-    breaks = np.flatnonzero(begins[1:] - reach[:-1] > SHORTEST_NS)
-    starts = begins[[0, *(breaks + 1)]].tolist()
-    return tuple(zip(starts, reach[[*breaks, -1]].tolist(), strict=True))
-
-
-def _spacings(counts: _Times, spans: _Times) -> dict[int, Spacing]:
-    """Returns the spacings of the bags with a topic, by the part of an octave of the period."""
-    shows_period = (counts >= _FEWEST) & (spans > 0)
-    spans, intervals = spans[shows_period], counts[shows_period] - 1
+def _spacings(counts: NDArray[np.int64], spans: NDArray[np.int64]) -> list[dict[int, Spacing]]:
+    """Returns the spacings of each topic, by the part of an octave of the period."""
+    topics, bags = np.nonzero((counts >= _FEWEST) & (spans > 0))
+    spans, intervals = spans[topics, bags], counts[topics, bags] - 1
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
-    spacings: dict[int, Spacing] = {}
-    for octave in sorted({*octaves.tolist()}):
-        bags = octaves == octave
-        span, steps = int(spans[bags].sum()), int(intervals[bags].sum())
-        spacings[octave] = Spacing(int(bags.sum()), span, steps)
+    keys, nth = np.unique(topics << 32 | octaves, return_inverse=True)
+    sums = np.zeros((keys.size, 3), np.int64)
+    np.add.at(sums, nth, np.stack((np.ones_like(spans), spans, intervals), axis=1))
+    spacings: list[dict[int, Spacing]] = [{} for _ in counts]
+    for key, spacing in zip(keys.tolist(), sums.tolist(), strict=True):
+        spacings[key >> 32][key & (1 << 32) - 1] = Spacing(*spacing)
     return spacings

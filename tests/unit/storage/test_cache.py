@@ -21,3 +21,12 @@ def test_caches_apart_share_a_capacity_and_no_key() -> None:
     assert (one.get("a"), other.get("a"), cache.get("a")) == ("one's", None, None)
     other.put("a", "other's", 6)
     assert (one.get("a"), other.get("a")) == (None, "other's")
+
+
+def test_what_is_taken_is_cached_no_more_and_leaves_room() -> None:
+    cache: ByteLru[str] = ByteLru(10)
+    cache.put("a", "first", 6)
+    assert (cache.take("a"), cache.get("a"), cache.take("a")) == ("first", None, None)
+    cache.put("b", "second", 6)
+    cache.put("c", "third", 4)
+    assert (cache.get("b"), cache.get("c")) == ("second", "third")
