@@ -14,14 +14,12 @@ from __future__ import annotations
 import re
 import threading
 from contextlib import contextmanager
-from functools import cache, cached_property
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, cast
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from rosbags.interfaces import Nodetype
-from rosbags.serde.cdr import generate_deserialize_cdr, generate_getsize_cdr, generate_serialize_cdr
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
-from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from ros2_memory.core import directories
@@ -32,7 +30,6 @@ from ros2_memory.storage.cache import ByteLru
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-    from rosbags.interfaces import CDRDeser, CDRSer, CDRSerSize, Msgdef
     from rosbags.interfaces.typing import BaseDesc, FieldDesc, Typesdict
 
 MAX_TEXT_BYTES: Final = 1 << 20
@@ -80,14 +77,13 @@ class MessageType(NamedTuple):
     """
 
     fields: Definition
-    store: _Store
+    store: Typestore
 
     def compiled(self) -> MessageType | str:
         """Returns the type with a deserializer; or why none can be made."""
         try:
             with _run_by_rosbags():
-                for name in self.store.fielddefs:
-                    self.store.get_msgdef(name).deserialize_cdr_le  # noqa: B018 - compiled so
+                self.store.get_msgdef(self.fields.type)
         except _UnusableError as error:
             return str(error)
         return self
@@ -99,56 +95,6 @@ class MessageType(NamedTuple):
     def serialize(self, message: object) -> bytes:
         """Encodes a decoded message as CDR."""
         return bytes(self.store.serialize_cdr(message, self.fields.type))
-
-
-class _Store(Typestore):
-    """The types of one schema; what they need to be decoded is compiled when it is first used.
-
-    rosbags compiles thirteen functions of each type, of which most readers call one.
-    """
-
-    def get_msgdef(self, typename: str) -> Msgdef[object]:
-        """Returns the functions of a type."""
-        if typename not in self.cache:
-            self.cache[typename] = cast("Msgdef[object]", _Functions(self, typename))
-        return self.cache[typename]
-
-
-class _Functions:
-    """What a `Msgdef` has of CDR."""
-
-    def __init__(self, store: _Store, name: str) -> None:
-        self._store, self.name, self.cls = store, name, store.types[name]
-        named = store.fielddefs[name][1]
-        self.fields = [(normalize_fieldname(field), kind) for field, kind in named]
-
-    @cached_property
-    def deserialize_cdr_le(self) -> CDRDeser:
-        return generate_deserialize_cdr(self.fields, self._store, "le")
-
-    @cached_property
-    def deserialize_cdr_be(self) -> CDRDeser:
-        return generate_deserialize_cdr(self.fields, self._store, "be")
-
-    @cached_property
-    def serialize_cdr_le(self) -> CDRSer:
-        return generate_serialize_cdr(self.fields, self._store, "le")
-
-    @cached_property
-    def serialize_cdr_be(self) -> CDRSer:
-        return generate_serialize_cdr(self.fields, self._store, "be")
-
-    @cached_property
-    def _sizes(self) -> tuple[CDRSerSize, int]:
-        return generate_getsize_cdr(self.fields, self._store)
-
-    @property
-    def getsize_cdr(self) -> CDRSerSize:
-        return self._sizes[0]
-
-    @property
-    def size_cdr(self) -> int:
-        return self._sizes[1]
 
 
 class _UnusableError(Exception):
@@ -203,7 +149,7 @@ class Typestores:
         root = full_name(name)
         try:
             definitions = self._closure(root, _sections(root, encoding, text))
-            store = _Store()
+            store = Typestore()
             with _run_by_rosbags():
                 store.register(definitions)
         except _UnusableError as error:
