@@ -264,6 +264,7 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
             build_memory(own, shared, setting=ROBOTS_SETTING),
             shared.reader,
             reading_of(own, shared.schemas),
+            settings.lake.messages,
         )
         for name, own in robots.items()
     ]

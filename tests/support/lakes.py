@@ -49,11 +49,16 @@ def write_bag(
     return write_mcap(bag_dir / recording / f"{recording}_{number}.mcap", messages)
 
 
-def robot_bags(name: str, bag_dir: Path, clock: Clock | None = None) -> RobotBags:
+def robot_bags(
+    name: str,
+    bag_dir: Path,
+    clock: Clock | None = None,
+    messages: Sequence[str] = ("/chatter",),
+) -> RobotBags:
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    return RobotBags(name, memory, McapReader(), "test")
+    return RobotBags(name, memory, McapReader(), "test", messages)
 
 
 def location(folder: Path) -> LakeLocation:
@@ -67,7 +72,6 @@ def shipping(
     folder: Path,
     robots: Sequence[RobotBags],
     *,
-    messages: Sequence[str] = ("/chatter",),
     most_bags: int = 2,
     tombstones: set[Tombstone] | None = None,
 ) -> Iterator[Shipper]:
@@ -77,7 +81,6 @@ def shipping(
             lake,
             robots,
             FixedClock(LATER),
-            messages=messages,
             most_bags=most_bags,
             tombstones=tombstones or set(),
         )

@@ -118,6 +118,11 @@ class TimeWindow:
         start = max(self.start, other.start)
         return TimeWindow(start, max(start, min(self.stop, other.stop)))
 
+    def aligned(self, length: Ns) -> TimeWindow:
+        """Returns the slices of the clock of a length that this window is in."""
+        start, stop = self.start // length * length, -(-self.stop // length) * length
+        return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
+
     def widened(self, by: Ns) -> TimeWindow:
         """Returns a window that is longer by this on both sides."""
         return TimeWindow(max(self.start - by, MIN_NS), min(self.stop + by, MAX_NS))

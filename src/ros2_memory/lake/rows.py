@@ -12,6 +12,7 @@ import json
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from itertools import chain, starmap
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -32,6 +33,7 @@ from ros2_memory.analysis.motion.trajectory import path_slice
 from ros2_memory.analysis.sights import Spot
 from ros2_memory.analysis.topic_events import MAX_PER_BAG, TopicEvents
 from ros2_memory.columns.decode import BULKY_TYPES
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
@@ -47,8 +49,10 @@ from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
+
+    import pyarrow as pa
 
     from ros2_memory.storage.base import Batch, Channel, IntArray
 
@@ -94,112 +98,103 @@ def sha256_of(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def made_of(memory: Memory, bag: BagFile, config: str, messages: Collection[str] = ()) -> str:
-    """Returns a digest of all inputs of a bag's rows besides its bytes.
+class RowMaker:
+    """Makes the rows of a robot's bags, all as one call sees the memory.
 
-    These are the messages that count, the handovers of its recording, the static transforms in
-    force, the pose topic, the spellings of labels, the settings (`config`) and the topics whose
-    `messages` are shipped.
+    Who makes many takes a new one from time to time: it remembers what it has read.
+
+    Attributes:
+        memory: over the bag directory.
+        config: names the settings that rows depend on.
+        whole: topics whose messages are shipped, whatever they take.
     """
-    counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
-    view = View(memory, Call())
-    recordings = view.sessions.lending_to(bag.recording, bag.end)
-    statics = repr(static_at(view.sessions.static(recordings), bag.end))
-    labels = {name: sorted(variants) for name, variants in memory.limits.labels.items()}
-    joined = memory.index.joined_with(bag.recording)
-    made = ROWS_VERSION, config, view.pose_topic, labels, statics, sorted(messages), counted
-    return _digest([*made, *joined])
 
-
-def rows_of(
-    memory: Memory, bag: BagFile, shipped: ShippedBag, messages: Collection[str] = ()
-) -> dict[str, list[Row]]:
-    """Returns the rows of a bag, by table; `messages` are topics to ship whole.
-
-    Raises:
-        BagError: the bag, or a part of it, cannot be read.
-    """
-    keys = {name: getattr(shipped, name) for name in KEYS}
-    rows_by_table = _BagRows(memory, bag, messages).rows(shipped)
-    return {name: [{**keys, **row} for row in rows] for name, rows in rows_by_table.items()}
-
-
-class _BagRows:
-    """Makes the rows of one bag; the messages of the topics `whole` are among them."""
-
-    def __init__(self, memory: Memory, bag: BagFile, whole: Collection[str]) -> None:
-        self._memory = memory
-        self._bag = bag
-        self._whole = whole
-        self._view = view = View(memory, Call())
-        self._pose_topic = view.pose_topic
-        self._poses = poses_of_bag(view, bag, self._pose_topic)
+    def __init__(self, memory: Memory, config: str, whole: Collection[str]) -> None:
+        self._memory, self._config, self._whole = memory, config, whole
+        self._view = View(memory, Call())
+        self._watching = Watching(self._view)
         self._thing = Labels(memory.limits.labels).key
-        self._types = defaultdict[str, list[str]](list)
-        for topic in bag.summary.topics:
-            self._types[topic.topic].append(topic.type)
-        self._undecodable = 0
-        self._rows: dict[str, list[Row]] = {name: [] for name in TABLES}
 
-    def rows(self, shipped: ShippedBag) -> dict[str, list[Row]]:
-        """Returns the rows without the keys of the bag."""
-        tracks = self._tracks()
-        for frame, track in tracks:
-            same = {"topic": self._pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-            columns = (track.times, track.x, track.y, track.begins, track.heading)
-            for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
-                row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
-                known = None if math.isnan(heading) else heading
-                self._rows["poses"].append({**same, **row, "heading": known})
-        self._rows["things"] += self._things()
-        topics = [topic for topic, types in self._types.items() if any(map(has_events, types))]
-        seen = set[str]()
-        for topic, of_topic in events_of_bag(self._view, self._bag, topics).items():
-            events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
-            self._rows["events"] += self._events_of(topic, events)
-            # What the events of a topic rule out is not decoded.
-            if (events.visible.size or events.left_out) and any(
-                map(may_have_detections, self._types[topic])
-            ):
-                seen.add(topic)
-        driven = self._driven()
+    def made_of(self, bag: BagFile) -> str:
+        """Returns a digest of all inputs of a bag's rows besides its bytes.
+
+        These are the messages that count, the handovers of its recording, the static transforms in
+        force, the pose topic, the spellings of labels, the settings and the topics shipped whole.
+        """
+        counted = [*map(attrgetter("topic", "type", "count", "first", "last"), bag.summary.topics)]
+        sessions = self._view.sessions
+        recordings = sessions.lending_to(bag.recording, bag.end)
+        statics = repr(static_at(sessions.static(recordings), bag.end))
+        of_labels = self._memory.limits.labels.items()
+        labels = {name: sorted(variants) for name, variants in of_labels}
+        settings = ROWS_VERSION, self._config, self._view.pose_topic, labels
+        joined = self._memory.index.joined_with(bag.recording)
+        return _digest([*settings, statics, sorted(self._whole), counted, *joined])
+
+    def rows(self, bag: BagFile, shipped: ShippedBag) -> dict[str, pa.Table]:
+        """Returns the rows of a bag, by table.
+
+        Raises:
+            BagError: the bag, or a part of it, cannot be read.
+        """
+        tracks = self._tracks(bag)
         map_frame, track = tracks[0] if tracks else (None, empty_track())
-        self._add_messages(seen, map_frame, track)
-        self._rows["channels"] += self._channels()
-        self._rows["bags"].append(
-            {
-                **shipped._asdict(),
-                "recording": self._bag.recording.name,
-                "messages": self._bag.summary.count,
-                "undecodable": self._undecodable,
-                "detections": len(self._rows["sightings"]),
-                "pose_topic": self._pose_topic,
-                "map_frame": map_frame,
-                **driven,
-                "summary": self._bag.summary.schema.to_json(),
-                "counts": self._bag.summary.packed,
-                "joined": "/".join(self._memory.index.joined_with(self._bag.recording)) or None,
-            }
-        )
-        return self._rows
+        # What the events of a topic rule out is not decoded.
+        events, seen = self._events(bag)
+        driven, stood = self._driven(bag)
+        sightings, messages, undecodable = self._messages(bag, seen, map_frame, track)
+        of_bag = {
+            **shipped._asdict(),
+            "recording": bag.recording.name,
+            "messages": bag.summary.count,
+            "undecodable": undecodable,
+            "detections": len(sightings),
+            "pose_topic": self._view.pose_topic,
+            "map_frame": map_frame,
+            **driven,
+            "summary": bag.summary.schema.to_json(),
+            "counts": bag.summary.packed,
+            "joined": "/".join(self._memory.index.joined_with(bag.recording)) or None,
+        }
+        rows: dict[str, Iterable[Row]] = {
+            "channels": self._channels(bag),
+            "poses": chain.from_iterable(starmap(self._poses, tracks)),
+            "sightings": sightings,
+            "things": self._things(bag),
+            "events": [*stood, *events],
+            "messages": messages,
+            "bags": [of_bag],
+        }
+        keys = {name: getattr(shipped, name) for name in KEYS}
+        # As Python has them, they take many times as much.
+        return {name: table.filled(keys, rows[name]) for name, table in TABLES.items()}
 
-    def _tracks(self) -> list[tuple[str, RobotTrack]]:
+    def _tracks(self, bag: BagFile) -> list[tuple[str, RobotTrack]]:
         """Returns the robot's track in the bag, with its frame: in the map, and in the poses' own.
 
         The first of them has the place that other rows name.
         """
-        window = TimeWindow(self._bag.start, self._bag.end + 1)
+        window = TimeWindow(bag.start, bag.end + 1)
         places = robot_places(self._view, window)
         if places is None:
             return []
+        # That of the bags beside it is the same one, which is made once.
+        around = window.aligned(PART_NS)
         tracks = [
-            (frame, cut(TrackReader(self._view, frame).over(window).track, window))
+            (frame, cut(TrackReader(self._view, frame).over(around).track, window))
             for frame in dict.fromkeys((places.map_frame, places.pose_frame))
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]
 
-    def _things(self) -> Iterator[Row]:
-        for in_view in Watching(self._view).in_bag(self._bag):
+    def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
+        same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
+        columns = (track.times, track.x, track.y, track.begins, track.heading)
+        for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
+            row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
+            yield {**same, **row, "heading": None if math.isnan(heading) else heading}
+
+    def _things(self, bag: BagFile) -> Iterator[Row]:
+        for in_view in self._watching.in_bag(bag):
             for sights in in_view.sights:
                 for spot in sights.spots.tolist():
                     best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
@@ -218,22 +213,23 @@ class _BagRows:
                         "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
                     }
 
-    def _driven(self) -> Row:
-        """Returns what the row of the bag has of its poses, whose standstills are events."""
-        if self._poses is None:
-            return {}
-        whole = path_slice(self._poses, self._memory.limits.max_plausible_speed_mps).trajectory(0)
+    def _driven(self, bag: BagFile) -> tuple[Row, list[Row]]:
+        """Returns what the row of the bag has of its poses, and their standstills and drops."""
+        topic = self._view.pose_topic
+        poses = poses_of_bag(self._view, bag, topic)
+        if poses is None:
+            return {}, []
+        whole = path_slice(poses, self._memory.limits.max_plausible_speed_mps).trajectory(0)
         driven = {
             "poses": whole.poses,
             "distance_m": whole.totals.distance_m,
             "gap_m": whole.totals.gap_m,
             "max_mps": whole.max_speed,
         }
-        if not are_places(self._poses.positions).any():
-            return driven
-        stands = stands_of(self._poses, MIN_NS, MAX_NS)
+        if not are_places(poses.positions).any():
+            return driven, []
+        stands, events = stands_of(poses, MIN_NS, MAX_NS), list[Row]()
         standstills = standstills_of([stands.blocks])
-        topic, events = self._pose_topic, self._rows["events"]
         for start, end, box in standstills:
             x, y, _ = box.centre
             events.append(_event(topic, "stop", start, "stood", last_ns=end, x=x, y=y))
@@ -241,14 +237,14 @@ class _BagRows:
             text = f"slowed down suddenly from {before_mps:.2f} to {after_mps:.2f} m/s"
             events.append(_event(topic, "drop", time, text, value=before_mps - after_mps))
         stood_ns = sum(stop.end - stop.start for stop in standstills)
-        return {**driven, "stood_s": unix_from_ns(stood_ns)}
+        return {**driven, "stood_s": unix_from_ns(stood_ns)}, events
 
-    def _channels(self) -> Iterator[Row]:
+    def _channels(self, bag: BagFile) -> Iterator[Row]:
         """Yields the channels, by topic. A bag with damage anywhere is not shipped as if whole."""
         # By identity, since hashing a channel hashes its definition.
         by_channel: dict[int, _Messages] = {}
-        everything = TimeWindow.everything()
-        for batch in self._memory.reader.batches(self._bag.path, self._types, everything):
+        topics = {topic.topic for topic in bag.summary.topics}
+        for batch in self._memory.reader.batches(bag.path, topics, TimeWindow.everything()):
             channel = batch.channel
             if id(channel) not in by_channel:
                 is_whole = channel.topic in self._whole
@@ -264,12 +260,18 @@ class _BagRows:
         for number, messages in enumerate(order):
             yield messages.row(number, tied)
 
-    def _add_messages(self, seen: Collection[str], frame: str | None, track: RobotTrack) -> None:
-        """Adds whole messages, and the detections of the topics `seen`."""
+    def _messages(
+        self, bag: BagFile, seen: Collection[str], frame: str | None, track: RobotTrack
+    ) -> tuple[list[Row], list[Row], int]:
+        """Returns the detections of the topics `seen`, and the messages that are shipped whole.
+
+        The number is how many messages of the former cannot be decoded.
+        """
+        sightings, messages, undecodable = list[Row](), list[Row](), 0
         numbers = Counter[str]()
         topics, window = {*self._whole, *seen}, TimeWindow.everything()
         reader, extractor = self._memory.reader, self._memory.extractor
-        for record in reader.records(self._bag.path, topics, window):
+        for record in reader.records(bag.path, topics, window):
             topic, kind, time = record.channel.topic, record.channel.type, record.log_time
             detections: Sequence[Detection] = ()
             row = {"topic": topic, "type": kind, "time_ns": time, "message": numbers[topic]}
@@ -278,13 +280,13 @@ class _BagRows:
                 message = reader.decode(record)
                 shown = extractor.exact(message, kind)
             except UndecodableError as error:
-                self._undecodable += topic in seen
+                undecodable += topic in seen
                 value: Row = {"undecodable": error.reason}
             else:
                 value = taken_apart(shown) if topic in self._whole else {}
                 detections = detections_of(shown, extractor.frame(message)) if topic in seen else ()
             if topic in self._whole:
-                self._rows["messages"].append({**row, "publish_ns": record.publish_time, **value})
+                messages.append({**row, "publish_ns": record.publish_time, **value})
             at = place_at(track, time) if detections else None
             if at is not None:
                 row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
@@ -292,7 +294,24 @@ class _BagRows:
                 label, place = detection.label, detection.place or ()
                 named = {"label": label, "thing": self._thing(label), "score": detection.score}
                 where = {"frame_id": detection.frame_id, **dict(zip("xyz", place, strict=False))}
-                self._rows["sightings"].append({**row, **named, **where})
+                sightings.append({**row, **named, **where})
+        return sightings, messages, undecodable
+
+    def _events(self, bag: BagFile) -> tuple[list[Row], set[str]]:
+        """Returns the events of topics, and those that may have detections in the bag."""
+        types = defaultdict[str, list[str]](list)
+        for counted in bag.summary.topics:
+            types[counted.topic].append(counted.type)
+        topics = [topic for topic in types if any(map(has_events, types[topic]))]
+        rows, seen = list[Row](), set[str]()
+        for topic, of_topic in events_of_bag(self._view, bag, topics).items():
+            events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
+            rows += self._events_of(topic, events)
+            if (events.visible.size or events.left_out) and any(
+                map(may_have_detections, types[topic])
+            ):
+                seen.add(topic)
+        return rows, seen
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():

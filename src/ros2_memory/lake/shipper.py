@@ -38,7 +38,7 @@ from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
-from ros2_memory.lake.rows import bag_id_of, made_of, rows_of, sha256_of
+from ros2_memory.lake.rows import RowMaker, bag_id_of, sha256_of
 from ros2_memory.lake.tables import TABLES, ShippedBag, day_of, of_bags, overlapping
 from ros2_memory.lake.upkeep import Tombstone, append_tombstone, compact, expire, forget_in_lake
 
@@ -56,6 +56,8 @@ log = get_logger(__name__)
 MOST_BAGS: Final = 2_000
 MOST_BYTES: Final = 64 << 20
 """Of one batch: its rows are in memory, as Arrow has them, until it is committed."""
+_TOGETHER: Final = 64
+"""Bags whose rows are made together: what is read around one is that of the next."""
 PATIENCE_S: Final = 30.0
 """How long a bag directory may take to show that it is there."""
 _BESIDE_NS: Final[Ns] = 86_400 * NS_PER_S
@@ -101,7 +103,6 @@ class Shipper:
         lake: its tables.
         robots: whose bags are shipped.
         clock: dates receipts.
-        messages: topics whose messages are shipped whole.
         tombstones: what was forgotten; a bag with a message of it is not shipped.
         before_commit: called with whether the batch is full, else waits until one is allowed again.
         alive: called for each bag.
@@ -113,7 +114,6 @@ class Shipper:
     robots: Sequence[RobotBags]
     clock: Clock
     _: KW_ONLY
-    messages: Sequence[str] = ()
     tombstones: set[Tombstone] = field(default_factory=set)
     before_commit: Callable[[bool], object] = lambda _: None
     alive: Callable[[], object] = lambda: None
@@ -231,12 +231,14 @@ class RobotBags:
         memory: over its bag directory.
         reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
+        messages: topics whose messages are shipped whole.
     """
 
     name: str
     memory: Memory
     reader: BagReader
     config: str
+    messages: Sequence[str] = ()
     _looking: threading.Thread | None = field(default=None, init=False)
 
     def answers(self, patience_s: float) -> bool:
@@ -278,7 +280,9 @@ class RobotBags:
         ids, confirmed = set[str](), list[ShippedBag]()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
         # A saved moment's copy of a bag counts where the bag itself is gone.
-        for bag in sorted(bags, key=lambda bag: (bag.file in copies, bag.start)):
+        for nth, bag in enumerate(sorted(bags, key=lambda bag: (bag.file in copies, bag.start))):
+            if nth % _TOGETHER == 0:
+                maker = RowMaker(self.memory, self.config, self.messages)
             shipper.alive()
             try:
                 bag_id, is_forgotten = self._identified(bag, shipper.tombstones)
@@ -291,7 +295,7 @@ class RobotBags:
                     done.problems.append(f"{self.name}: {why}")
                     continue
                 ids.add(bag_id)
-                shipped = self._row_of(bag, bag_id, before, shipper.messages)
+                shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
                 # The rows of a copy are the same, which has another path and mtime.
                 if before and before == shipped._replace(
                     mtime_ns=before.mtime_ns, file=before.file
@@ -301,9 +305,7 @@ class RobotBags:
                 same_file = by_file.get(shipped.file)
                 if same_file is not None and self._is_cut(same_file, bag):
                     continue
-                by_table = rows_of(self.memory, bag, shipped, shipper.messages)
-                # As Python has them, they take many times as much.
-                rows = {name: table.filled(by_table[name]) for name, table in TABLES.items()}
+                rows = maker.rows(bag, shipped)
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
                 continue
@@ -375,15 +377,14 @@ class RobotBags:
         return known.bag_id, known.is_forgotten
 
     def _row_of(
-        self, bag: BagFile, bag_id: str, before: ShippedBag | None, messages: Sequence[str]
+        self, bag: BagFile, bag_id: str, before: ShippedBag | None, made_of: str
     ) -> ShippedBag:
         """Returns the row that a bag would have in `bags`; its file is hashed where it is new."""
         is_read = before is not None and (before.size, before.mtime_ns) == (bag.size, bag.mtime_ns)
         sha256 = before.sha256 if before is not None and is_read else sha256_of(bag.path)
         file_columns = self.name_of(bag), bag.size, sha256, bag.mtime_ns
-        made = made_of(self.memory, bag, self.config, messages)
         day = day_of(bag.start)
-        return ShippedBag(self.name, bag_id, day, *file_columns, made, bag.start, bag.end)
+        return ShippedBag(self.name, bag_id, day, *file_columns, made_of, bag.start, bag.end)
 
     def _is_cut(self, before: ShippedBag, bag: BagFile) -> bool:
         """Returns whether only retention took messages out of a bag after it was shipped.

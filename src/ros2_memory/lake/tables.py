@@ -122,15 +122,15 @@ class LakeTable:
         """Returns rows in the order of the table."""
         return rows.sort_by([(name, "ascending") for name in self.order])
 
-    def filled(self, rows: Sequence[Row]) -> pa.Table:
-        """Returns rows, sorted as the table is."""
+    def filled(self, keys: Row, rows: Iterable[Row]) -> pa.Table:
+        """Returns rows that have these keys, sorted as the table is."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
         for row in rows:
             # `time` repeats the first time, in microseconds.
             time = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
             key = str(row.get("topic", "")).strip("/").replace("/", ".")
-            whole.append({"topic_key": key, **time, **row})
+            whole.append({**keys, "topic_key": key, **time, **row})
         try:
             table = pa.Table.from_pylist(whole, self.arrow_schema)
         except UnicodeEncodeError:

@@ -171,7 +171,7 @@ class TrackReader:
         if key in known:
             return known[key]
         # Whole slices, so that no vertex depends on the window; and what may reach into it.
-        around = _aligned(window.widened(SILENCE_NS), TRACK_SLICE_NS)
+        around = window.widened(SILENCE_NS).aligned(TRACK_SLICE_NS)
         found: list[tuple[Ns, PartialTrack]] = []
         since: Ns | None = None
         try:
@@ -223,8 +223,8 @@ class TrackReader:
     ) -> Iterator[tuple[Ns, PartialTrack]]:
         """Yields partial tracks, the newest first, each with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
-        whole = _aligned(window, PART_NS)
-        around = _aligned(whole.widened(TF_CACHE_NS), PART_NS)
+        whole = window.aligned(PART_NS)
+        around = whole.widened(TF_CACHE_NS).aligned(PART_NS)
         topics = () if self._is_own else self._view.moving_topics
         moving = [open_scan(self._view, topic, around, copies=True) for topic in topics]
         for topic in self._topics:
@@ -496,12 +496,6 @@ def _placed_body(edges: Edges, body: Body, frames: FrameTree, span: TimeWindow) 
         headings(np.stack(in_target.rotation, axis=1))[valid],
         0,
     )
-
-
-def _aligned(window: TimeWindow, length: Ns) -> TimeWindow:
-    """Returns the slices of the clock of a length that a window is in."""
-    start, stop = window.start // length * length, -(-window.stop // length) * length
-    return TimeWindow(max(start, MIN_NS), min(stop, MAX_NS))
 
 
 def _positions_in(times: Times, window: TimeWindow) -> Times:

@@ -20,8 +20,9 @@ ROBOT = seeded("kitchen")
 def lake(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Memory]:
     """A lake with a robot's two bags, and the memory over these."""
     folder = tmp_path_factory.mktemp("lake")
-    robot = robot_bags("kitchen", write_robot(ROBOT, folder / "bags"), FixedClock(NOW))
-    assert ship(folder / "lake", [robot], messages=("/is_docked",)).bags == 2
+    bags = write_robot(ROBOT, folder / "bags")
+    robot = robot_bags("kitchen", bags, FixedClock(NOW), messages=("/is_docked",))
+    assert ship(folder / "lake", [robot]).bags == 2
     return folder / "lake", robot.memory
 
 
@@ -68,7 +69,7 @@ def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
     write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [*image, *scans, large_once])
 
     def whole(name: str, *messages: str) -> set[str]:
-        ship(tmp_path / name, [robot_bags("hall", tmp_path / "bags")], messages=messages)
+        ship(tmp_path / name, [robot_bags("hall", tmp_path / "bags", messages=messages)])
         rows = lake_rows(tmp_path / name, "channels")
         counts = {row["topic"]: row["messages"] for row in rows}
         assert counts == {"/camera": 3, "/map": 1, "/scan": 29}

@@ -198,10 +198,10 @@ def test_read_only_bags_are_shipped_and_reported_and_nothing_is_written_beside_t
     assert "hall" in problem
     (own / "recordings.jsonl").unlink()
     # With other settings its rows are others.
-    robot = robot_bags("hall", tmp_path / "hall")
+    robot = robot_bags("hall", tmp_path / "hall", messages=())
     for config in ("test", "other"):
         robot.config = config
-        done = ship(tmp_path / "lake", [robot], messages=())
+        done = ship(tmp_path / "lake", [robot])
         assert (done.bags, done.problems, values(tmp_path / "lake")) == (1, [], [])
     assert not (own / "shipped.jsonl").exists()
 

@@ -54,8 +54,10 @@ class World(NamedTuple):
 @pytest.fixture(scope="module")
 def world(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
-    of_robots = [robot_bags(name, write(folder / name)) for name, write in ROBOTS.items()]
-    shipped = ship(lake, of_robots, messages=MESSAGES, most_bags=100)
+    of_robots = [
+        robot_bags(name, write(folder / name), messages=MESSAGES) for name, write in ROBOTS.items()
+    ]
+    shipped = ship(lake, of_robots, most_bags=100)
     for number in DAMAGED:
         (folder / "damaged" / "rec" / f"rec_{number}.mcap").unlink()
     memories = {

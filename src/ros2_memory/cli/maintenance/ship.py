@@ -189,7 +189,6 @@ class _Shipping:
                 lake,
                 self.robots,
                 WallClock(),
-                messages=self.settings.lake.messages,
                 tombstones={*tombstones},
                 before_commit=self._before_commit,
                 alive=partial(notify, WATCHDOG),
