@@ -8,10 +8,12 @@ import pytest
 
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
+from ros2_memory.lake.tables import TABLES
 from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
 from tests.support.lakes import lake_rows, robot_bags, ship
+from tests.support.unlike_robots import ROBOTS
 
 ROBOT = seeded("kitchen")
 
@@ -51,6 +53,20 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(lake: tuple[Path, 
             second = row["time_ns"] / NS_PER_S - ROBOT.start_s
             truth = math.sin(second / 10) * 3, 0.1 * second
             assert math.dist((row["x"], row["y"]), truth) <= row["error_m"] + 1e-6
+
+
+def test_rows_of_a_bag_are_the_same_whatever_bags_they_are_made_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ROBOTS["twin"](tmp_path / "twin")
+    found = []
+    for together in (1, 3, 64):
+        monkeypatch.setattr("ros2_memory.lake.shipper._TOGETHER", together)
+        lake = tmp_path / f"lake_{together}"
+        ship(lake, [robot_bags("twin", tmp_path / "twin")], most_bags=100)
+        found.append({name: sorted(map(str, lake_rows(lake, name))) for name in TABLES})
+    assert len(found[0]["poses"]) > len(found[0]["bags"]) > 3
+    assert found[1:] == found[:1] * 2
 
 
 def test_messages_of_a_chosen_topic_are_whole(lake: tuple[Path, Memory]) -> None:
