@@ -6,7 +6,6 @@ import heapq
 import json
 import threading
 from bisect import bisect_right
-from collections import Counter
 from dataclasses import KW_ONLY, dataclass, field, replace
 from datetime import date, timedelta
 from itertools import chain
@@ -239,8 +238,7 @@ class LakeIndex:
         rows = self.lake.select(_BAGS, "bags", chain.from_iterable(made_of.values()))
         owners = {path: bag.bag_id for path, bag in known.items()}
         schemas: dict[str, SummarySchema] = {}
-        of_day = Counter[date]()
-        groups: dict[tuple[date, int], dict[str, int]] = {}
+        together, day = dict[str, int](), date.min
         bags: dict[str, LakeBag] = {}
         for row in rows.to_pylist():
             schema, counts, joined = map(row.pop, ("summary", "counts", "joined"))
@@ -259,9 +257,9 @@ class LakeIndex:
             before = known.get(path)
             if before is not None and before.file == file:
                 file = before.file  # what was remembered of it stays
-            together = groups.setdefault((bag.day, of_day[bag.day] // _TOGETHER), {})
+            if bag.day != day or len(together) == _TOGETHER:
+                together, day = {}, bag.day
             together[bag.bag_id] = state
-            of_day[bag.day] += 1
             names = tuple(joined.split("/")) if joined else ()
             bags[path] = LakeBag(bag.bag_id, bag.day, file, names, together)
         return bags
