@@ -17,6 +17,8 @@ from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.shipper import Shipped
+from ros2_memory.lake.warehouse import Lake
+from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
 from tests.support.lake_questions import Question, every_question
@@ -138,10 +140,25 @@ def run_views(code: str) -> duckdb.DuckDBPyConnection:
     return database
 
 
-def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
+def of_the_page(language: str) -> list[str]:
+    """The blocks of a language on the page about the lake."""
     page = (ROOT / "docs" / "how-to" / "lake.md").read_text(encoding="utf-8")
-    [views] = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    statements = re.findall(r"```sql\n(.*?)```", page, re.DOTALL)
+    return re.findall(rf"```{language}\n(.*?)```", page, re.DOTALL)
+
+
+def test_statements_of_the_page_find_nothing_in_tables_without_rows(tmp_path: Path) -> None:
+    """As without `lake.messages`, and of robots that have neither poses nor detections."""
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [text(BEGIN, "here")])
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags", messages=())])
+    [views] = of_the_page("python")
+    database = run_views(views.replace("LAKE", str(tmp_path / "lake")))
+    found = [database.sql(statement).fetchall() for statement in of_the_page("sql")]
+    assert [len(rows) for rows in found] == [1, 0, 0, 0, 0, 0]
+
+
+def test_statements_of_the_page_about_the_lake_give_what_answers_say(world: World) -> None:
+    [views] = of_the_page("python")
+    statements = of_the_page("sql")
     with location(world.folder).writable() as tables:  # as `ship` puts the files of a day together
         for name in ("bags", "poses", "sightings"):
             tables.replace(name, AlwaysTrue(), tables.rows(name, AlwaysTrue()))
