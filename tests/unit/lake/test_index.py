@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.core.bag_summary import BagSummary
-from ros2_memory.core.errors import NoDataError, RefusedError
+from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
@@ -29,7 +28,7 @@ from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
-from tests.support.lakes import lake_in, lake_robot, robot_bags, ship
+from tests.support.lakes import lake_robot, robot_bags, ship
 
 DAY_S = 86_400
 
@@ -181,24 +180,6 @@ def test_bags_of_one_name_have_paths_of_their_own(shipping: Shipping) -> None:
     for bag in bags:
         [record] = robot.reader.records(bag.path, [SEEN], TimeWindow(0, bag.end + 1))
         assert record.log_time == bag.start
-
-
-def test_a_column_that_an_old_file_lacks_is_null_and_a_file_that_is_gone_is_refused(
-    tmp_path: Path,
-) -> None:
-    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [text(START_S * NS_PER_S, "here")])
-    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
-    lake, columns = lake_in(tmp_path / "lake"), ["robot", "recording"]
-    assert lake.rows("bags", [], columns).to_pylist() == []
-    [[file]] = lake.days("bags")["hall"].values()
-    assert lake.rows("bags", [file], columns).to_pylist() == [{"robot": "hall", "recording": "rec"}]
-    path = Path(file.location.removeprefix("file://"))
-    pq.write_table(pq.read_table(path, partitioning=None).drop_columns(["recording"]), path)
-    assert lake.rows("bags", [file], columns).to_pylist() == [{"robot": "hall", "recording": None}]
-    path.unlink()
-    with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
-        lake.rows("bags", [file], columns)
-    assert str(tmp_path) not in str(raised.value)
 
 
 FIRST = date(2024, 2, 27)
