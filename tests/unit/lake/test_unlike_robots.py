@@ -17,7 +17,6 @@ from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.lake.engines.base import LakeEngine
 from ros2_memory.lake.shipper import Shipped
-from ros2_memory.lake.warehouse import Lake
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import reply, tools_of
