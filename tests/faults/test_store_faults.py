@@ -14,7 +14,7 @@ import pytest
 import structlog
 
 from ros2_memory.columns import database, fill
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.fill import RETRY_NS, Progress
 from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import BagError
@@ -232,7 +232,7 @@ def refused(_reader: object, path: Path, **_: object) -> NoReturn:
 async def test_bags_that_cannot_be_stored_have_the_helper_started_no_second_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fill, "decoded", refused)
+    monkeypatch.setattr(fill, "undecoded", refused)
     write_bags(tmp_path, BACKLOG + 1)
     memory, served_by = served(tmp_path)
     filler = Counted(memory, served_by.filling)
@@ -262,10 +262,10 @@ def test_a_bag_that_could_not_be_stored_is_tried_again_later(
     write_bags(tmp_path, 2)
     clock = SettableClock(NOW.now())
     _, filler = served(tmp_path, clock)
-    monkeypatch.setattr(fill, "decoded", refused)
+    monkeypatch.setattr(fill, "undecoded", refused)
     fill_up(filler)
     assert filler.progress() == Progress(2, refused=2)
-    monkeypatch.setattr(fill, "decoded", decoded)
+    monkeypatch.setattr(fill, "undecoded", undecoded)
     fill_up(filler)
     assert filler.progress() == Progress(2, refused=2)
     clock.at += RETRY_NS

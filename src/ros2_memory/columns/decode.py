@@ -7,11 +7,12 @@ decoder message by message (`_level_of`), into the same columns. No message is d
 from __future__ import annotations
 
 import zlib
+from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from itertools import chain
+from itertools import accumulate, chain
 from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -26,7 +27,15 @@ from ros2_memory.columns.plan import (
     UnplannedError,
     plan_of,
 )
-from ros2_memory.columns.table import MAX_RANGED_BYTES, Numbers, Table, Texts, joined, order_of
+from ros2_memory.columns.table import (
+    MAX_RANGED_BYTES,
+    UNHASHED,
+    Numbers,
+    Table,
+    Texts,
+    joined,
+    order_of,
+)
 from ros2_memory.columns.walk import LevelColumns, NotWalkedError, add_array, add_sequence, walked
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.large_reads import LARGE_BYTES
@@ -38,13 +47,15 @@ from ros2_memory.storage.base import (
     Batch,
     Channel,
     Definition,
+    IntArray,
+    Mask,
     Schema,
     or_errors,
     unless_error,
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
 GROUP_BYTES: Final = 64 << 20
@@ -67,6 +78,8 @@ BULKY_TYPES: Final = frozenset(
 )
 """Images and clouds, which have no columns in any file."""
 _BULKY: Final = "images, clouds and the like have no columns"
+_HELD_BYTES: Final = LARGE_BYTES
+"""Payloads, and what lies between them, that wait in a group to be decoded together."""
 LARGEST_MESSAGE_BYTES: Final = LARGE_BYTES
 """A topic has no columns in a bag once a message of it is larger."""
 _NOT_ASKED: Final = "only times were asked for"
@@ -76,8 +89,12 @@ _EVERYTHING: Final = TimeWindow.everything()
 
 
 class _Kind(NamedTuple):
-    """How the messages of a channel are decoded; without a plan, `reason` says why they are not."""
+    """How the messages of a channel are decoded; without a plan, `reason` says why they are not.
 
+    `first` is the bag's first channel of the same topic, type and definition.
+    """
+
+    first: Channel
     definition: Definition | None
     plan: Plan | None
     reason: str
@@ -118,8 +135,36 @@ def decoded(
         BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
             read.
     """
+    groups = undecoded(
+        reader,
+        path,
+        window,
+        topics=topics,
+        hashed=hashed,
+        columns=columns,
+        skip_undecodable=skip_undecodable,
+    )
+    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+    return map(Group.tables, groups)
 
-    def read() -> Iterator[list[Table] | BagError]:
+
+def undecoded(
+    reader: BagReader,
+    path: Path,
+    window: TimeWindow = _EVERYTHING,
+    *,
+    topics: Collection[str] | None = None,
+    hashed: Callable[[Channel], bool] = lambda _: False,
+    columns: bool = True,
+    skip_undecodable: bool = False,
+    number: int = 0,
+) -> Iterator[Group]:
+    """Yields the groups of `decoded`, which are decoded as far as they are large.
+
+    `number` becomes that of the bag in the tables.
+    """
+
+    def read() -> Iterator[Group | BagError]:
         channels = [
             channel
             for channel in reader.channels(path)
@@ -136,21 +181,21 @@ def decoded(
             if kind.plan is not None or (kind.is_hashed and topic not in alone)
         }
         wanted = {channel.topic for channel in channels}
-        group = _Group(reader, skip_undecodable)
+        group = Group(reader, skip_undecodable)
         for batch in or_errors(reader.batches(path, wanted, window, bare=bare)):
             if isinstance(batch, BagError):
                 yield batch
             elif batch.sizes.size:
                 if group.is_full_before(batch):
-                    full, group = group, _Group(reader, skip_undecodable)
-                    yield full.tables(group)
-                group.add(kinds.read(batch), batch)
+                    full, group = group, Group(reader, skip_undecodable)
+                    full.pass_on(group)
+                    yield full
+                    del full
+                group.add(_Undecoded(kinds.read(batch), batch, number))
             del batch  # and its buffer, before the next is read
-        tables = group.tables()
-        if tables:
-            yield tables
+        if group.has_messages:
+            yield group
 
-    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
     return map(unless_error, read())
 
 
@@ -163,6 +208,7 @@ class _Kinds:
     columns: bool
     _buffer: bytes = b""
     _read_bytes: int = 0
+    _firsts: dict[tuple[Schema, str, str], Channel] = field(default_factory=dict)
     # By identity, since hashing a channel hashes its definition.
     _known: dict[int, _Kind] = field(default_factory=dict)
     _bulky: set[str] = field(default_factory=set)
@@ -186,7 +232,9 @@ class _Kinds:
         if kind is None:
             definition = self.reader.definition(channel)
             plan, reason = self._plan(channel, definition)
-            kind = _Kind(definition, plan, reason, self.hashed(channel))
+            named = (channel.schema, channel.encoding, channel.topic)
+            first = self._firsts.setdefault(named, channel)
+            kind = _Kind(first, definition, plan, reason, self.hashed(channel))
             self._known[id(channel)] = kind
         return kind
 
@@ -217,63 +265,159 @@ class _Kinds:
             return None, str(error)
 
 
+_Key: TypeAlias = tuple[str, str, bool, Schema]
+"""A topic, its encoding, whether it is latched, and its definition."""
+
+
+class _Undecoded(NamedTuple):
+    """A batch, how it is decoded, and the number of its bag."""
+
+    kind: _Kind
+    batch: Batch
+    bag: int
+
+
 @dataclass(slots=True)
-class _Group:
-    """The tables of some buffers of one bag, while they are read."""
+class Group:
+    """Some buffers of one bag, or of several bags, of which each topic is decoded at once.
+
+    Attributes:
+        reader: of the bags.
+        skip_undecodable: as for `decoded`.
+        memory_bytes: what the tables take that are decoded so far.
+    """
 
     reader: BagReader
-    skip_undecodable: bool
-    _parts: dict[tuple[Schema, str, str], list[Table]] = field(default_factory=dict)
+    skip_undecodable: bool = False
+    memory_bytes: int = 0
+    _tables: dict[_Key, list[Table]] = field(default_factory=dict)
+    _waiting: list[_Undecoded] = field(default_factory=list)
+    _waiting_bytes: int = 0
     _buffer: bytes = b""
     _bytes: int = 0
 
+    @property
+    def has_messages(self) -> bool:
+        """Whether there are any."""
+        return bool(self._waiting or self._tables)
+
     def is_full_before(self, batch: Batch) -> bool:
         """Returns whether a batch begins the next group; only the first of a buffer may."""
-        if batch.buffer is self._buffer or not self._parts:
+        if batch.buffer is self._buffer or not self.has_messages:
             return False
         payload_bytes = self._bytes + len(batch.buffer)
         # Tables may take more than the payloads, but hardly four times as much.
         if payload_bytes <= GROUP_BYTES // 4 or payload_bytes > GROUP_BYTES:
             return payload_bytes > GROUP_BYTES
-        tables = (part for parts in self._parts.values() for part in parts)
-        return sum(table.memory_bytes for table in tables) > GROUP_BYTES
+        return self.memory_bytes > GROUP_BYTES
 
-    def add(self, kind: _Kind, batch: Batch) -> None:
-        """Decodes a batch."""
-        if batch.buffer is not self._buffer:
-            self._buffer = batch.buffer
-            self._bytes += len(batch.buffer)
-        channel = batch.channel
-        parts = self._parts.setdefault((channel.schema, channel.encoding, channel.topic), [])
-        for piece in _pieces_of(batch):
-            table = _decoded_batch(kind, piece, self.reader, skip=self.skip_undecodable)
-            # Of one topic all have columns, or none has.
-            if parts and ("" in table.left_out) != ("" in parts[0].left_out):
-                reason = table.left_out.get("") or parts[0].left_out[""]
-                parts[:] = [part.without_columns(reason) for part in parts]
-                table = table.without_columns(reason)
-            parts.append(table)
+    def add(self, undecoded: _Undecoded) -> None:
+        """Adds a batch; decodes those before it that take too much memory with it."""
+        buffer = undecoded.batch.buffer
+        if buffer is not self._buffer:
+            if self._waiting_bytes + len(buffer) > _HELD_BYTES:
+                self._decode()
+            self._buffer = buffer
+            self._bytes += len(buffer)
+            self._waiting_bytes += len(buffer)
+        for piece in _pieces_of(undecoded.batch):
+            self._waiting.append(undecoded._replace(batch=piece))
+            if len(buffer) > _HELD_BYTES:
+                self._decode()
 
-    def tables(self, following: _Group | None = None) -> list[Table]:
-        """Returns the tables, each of all its parts.
+    def take(self, other: Group) -> None:
+        """Adds all messages of another bag."""
+        for key, tables in other._tables.items():
+            self._tables.setdefault(key, []).extend(tables)
+        self.memory_bytes += other.memory_bytes
+        for undecoded in other._waiting:
+            self.add(undecoded)
 
-        The messages of each topic's last log time are left to the next group, unless they are many:
-        messages of one log time are numbered within a table.
+    def pass_on(self, following: Group) -> None:
+        """Leaves the messages of each topic's last log time to the next group of the bag.
+
+        Unless they are many: messages of one log time are numbered within a table.
         """
+        self._decode()
+        room = GROUP_BYTES // 4
+        for key, parts in self._tables.items():
+            [table] = parts[:] = _joined_alike(parts)
+            begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
+            last = table.rows(np.arange(begin, len(table)))
+            if last.memory_bytes <= room:
+                room -= last.memory_bytes
+                following._tables[key] = [last]
+                parts[:] = [table.rows(np.arange(begin))]
+
+    def tables(self) -> list[Table]:
+        """Returns the messages as tables, and has none of them any more."""
+        self._decode()
         self._buffer = b""
-        tables, room = [], GROUP_BYTES // 4
-        while self._parts:
-            key, parts = self._parts.popitem()
-            table = joined(parts)
-            if following is not None:
-                begin = int(np.searchsorted(table.log_times, table.log_times[-1]))
-                last = table.rows(np.arange(begin, len(table)))
-                if last.memory_bytes <= room:
-                    room -= last.memory_bytes
-                    following._parts[key] = [last]
-                    table = table.rows(np.arange(begin))
-            tables.append(table)
+        tables: list[Table] = []
+        while self._tables:
+            _, parts = self._tables.popitem()
+            tables += _joined_alike(parts)[::-1]
         return [table for table in reversed(tables) if len(table)]
+
+    def _decode(self) -> None:
+        """Decodes what waits, all messages of a topic at once."""
+        waiting, self._waiting, self._waiting_bytes = self._waiting, [], 0
+        buffers = {id(batch.buffer): batch.buffer for _, batch, _ in waiting}
+        begins = dict(zip(buffers, accumulate(map(len, buffers.values()), initial=0), strict=False))
+        buffer = b"".join(buffers.values())
+        alike: dict[tuple[_Key, Plan | None, str], list[_Undecoded]] = defaultdict(list)
+        for undecoded in waiting:
+            first, _, plan, reason, _ = undecoded.kind
+            key = (first.topic, first.encoding, first.latched, first.schema)
+            alike[key, plan, reason].append(undecoded)
+        for (key, _, _), of_topic in alike.items():
+            for table in self._decoded(of_topic, buffer, begins):
+                self.memory_bytes += table.memory_bytes
+                self._tables.setdefault(key, []).append(table)
+
+    def _decoded(
+        self, waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
+    ) -> Iterator[Table]:
+        """Yields messages of one topic and plan; what cannot be walked the reader decodes.
+
+        Args:
+            waiting: the messages.
+            buffer: all buffers, one after the other.
+            begins: by the identity of a buffer, where it begins there.
+        """
+        kind = waiting[0].kind
+        batch, bags, is_hashed = _as_one(waiting, buffer, begins)
+        hashes = None
+        if is_hashed.any():
+            spans = zip(batch.starts.tolist(), (batch.starts + batch.sizes).tolist(), strict=True)
+            crcs = np.array([zlib.crc32(buffer[begin:end]) for begin, end in spans], np.int64)
+            hashes = np.where(is_hashed, crcs, UNHASHED)
+        table = Table(
+            kind.first,
+            batch.log_times,
+            batch.publish_times,
+            batch.places,
+            left_out={"": kind.reason},
+            payload_hashes=hashes,
+            definition=kind.definition,
+            bags=bags,
+        )
+        if kind.plan is None:
+            yield table
+            return
+        with suppress(NotWalkedError):
+            yield _with_columns(table, walked(kind.plan, batch))
+            return
+        if len(waiting) > 1:
+            for undecoded in waiting:
+                yield from self._decoded([undecoded], buffer, begins)
+            return
+        try:
+            yield joined(
+                [*_one_by_one(self.reader, kind.plan, batch, table, skip=self.skip_undecodable)]
+            )
+        except UndecodableError as error:
+            yield table.without_columns(f"some cannot be decoded: {error.reason}")
 
 
 def _pieces_of(batch: Batch) -> Iterator[Batch]:
@@ -286,38 +430,52 @@ def _pieces_of(batch: Batch) -> Iterator[Batch]:
         yield batch.taken(rows)
 
 
-def _decoded_batch(kind: _Kind, batch: Batch, reader: BagReader, *, skip: bool) -> Table:
-    """Returns the messages of a batch as a table; what cannot be walked the reader decodes.
+def _as_one(
+    waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]
+) -> tuple[Batch, IntArray, Mask]:
+    """Returns batches as one in a common buffer, by log time.
 
-    With `skip` without those that it cannot decode.
+    And of each message its bag, and whether it is hashed.
     """
-    order = order_of(batch.log_times, batch.places)
-    if order is not None:
-        batch = batch.taken(order)
-    hashes = None
-    if kind.is_hashed:
-        buffer, ends = batch.buffer, batch.starts + batch.sizes
-        spans = zip(batch.starts.tolist(), ends.tolist(), strict=True)
-        hashes = np.array([zlib.crc32(buffer[begin:end]) for begin, end in spans], np.int64)
-    table = Table(
-        batch.channel,
-        batch.log_times,
-        batch.publish_times,
-        batch.places,
-        left_out={"": kind.reason},
-        payload_hashes=hashes,
-        definition=kind.definition,
+    batches = [batch for _, batch, _ in waiting]
+    counts = [batch.sizes.size for batch in batches]
+    batch = Batch(
+        batches[0].channel,
+        np.concatenate([batch.log_times for batch in batches]),
+        np.concatenate([batch.publish_times for batch in batches]),
+        np.concatenate([batch.places for batch in batches]),
+        buffer,
+        np.concatenate([batch.starts + begins[id(batch.buffer)] for batch in batches]),
+        np.concatenate([batch.sizes for batch in batches]),
     )
-    if kind.plan is None:
-        return table
-    try:
-        return _with_columns(table, walked(kind.plan, batch))
-    except NotWalkedError:
-        pass
-    try:
-        return joined([*_one_by_one(reader, kind.plan, batch, table, skip=skip)])
-    except UndecodableError as error:
-        return table.without_columns(f"some cannot be decoded: {error.reason}")
+    bags = np.repeat([bag for _, _, bag in waiting], counts)
+    is_hashed = np.repeat([kind.is_hashed for kind, _, _ in waiting], counts)
+    order = order_of(batch.log_times, bags, batch.places)
+    if order is None:
+        return batch, bags, is_hashed
+    return batch.taken(order), bags[order], is_hashed[order]
+
+
+def _joined_alike(parts: Sequence[Table]) -> list[Table]:
+    """Returns tables of one topic and definition joined.
+
+    Of each bag either all rows have columns, or none has.
+    """
+    if len({part.left_out.get("") for part in parts}) == 1:
+        return [joined(parts)]
+    reasons = {
+        number: part.left_out[""]
+        for part in reversed(parts)
+        if "" in part.left_out
+        for number in np.unique(part.bag_numbers).tolist()
+    }
+    alike: dict[str | None, list[Table]] = defaultdict(list)
+    for part in parts:
+        for number in np.unique(part.bag_numbers).tolist():
+            rows = part.rows(np.flatnonzero(part.bag_numbers == number))
+            reason = reasons.get(number)
+            alike[reason].append(rows if reason is None else rows.without_columns(reason))
+    return [*map(joined, alike.values())]
 
 
 def _with_columns(table: Table, level: LevelColumns) -> Table:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore
 from ros2_memory.columns.writing import PART_NS, ReadBag
 from ros2_memory.core.errors import BagError
@@ -174,20 +174,28 @@ class Filling:
     def fill(self, batch: Batch, timeline: Timeline) -> int:
         """Stores bags; returns how many. Others must wait, have changed, or are refused."""
         pending: list[ReadBag] = []
-        done = held = 0
-        for bag in sorted(batch.bags, key=in_time):
-            read = self._read(bag, hashed=self._is_shared(bag, timeline))
-            if isinstance(read, ReadBag):
-                pending.append(read)
-                held += sum(table.memory_bytes for table in read.tables)
-            else:
-                done += read
-            del read  # and its tables, before the next is read
-            self._large.release()
-            if held > _MOST_HELD:
-                done += self._put(pending, whole=batch.whole)
-                pending, held = [], 0
-        return done + self._put(pending, whole=batch.whole)
+        group, done = Group(self._reader), 0
+        try:
+            for bag in sorted(batch.bags, key=in_time):
+                read = self._read(bag, len(pending), hashed=self._is_shared(bag, timeline))
+                if isinstance(read, bool):
+                    done += read
+                else:
+                    pending.append(read[0])
+                    group.take(read[1])
+                del read  # and its tables, before the next is read
+                self._large.release()
+                if group.memory_bytes > _MOST_HELD:
+                    done += self._put(pending, group, batch, timeline)
+                    pending, group = [], Group(self._reader)
+            return done + self._put(pending, group, batch, timeline)
+        except Exception as error:
+            # The others may be whole.
+            log.exception("bag_not_stored", path=str(batch.bags[0].path), bags=len(batch.bags))
+            if len(batch.bags) > 1:
+                return self._fill_alone(batch, timeline)
+            self._refuse(batch.bags[0], type(error).__name__)
+            return done
 
     def whole_since(self) -> list[TimeWindow]:
         """Returns the times in which there are whole parts since the last call, the newest first.
@@ -256,8 +264,8 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _read(self, bag: BagFile, *, hashed: bool) -> ReadBag | bool:
-        """Returns a bag that was read, or whether it is stored: a long one is at once."""
+    def _read(self, bag: BagFile, number: int, *, hashed: bool) -> tuple[ReadBag, Group] | bool:
+        """Returns a bag with its messages, or whether it is stored: a long one is at once."""
         if not self._may_be_stored(bag):
             return False
         try:
@@ -265,32 +273,36 @@ class Filling:
                 return True
             to_store = ReadBag(self._key(bag), bag, hashed, partial(self._may_be_stored, bag))
             # A latched message may come again later, in another recording.
-            groups = decoded(
-                self._reader, bag.path, hashed=lambda channel: hashed or channel.latched
+            groups = undecoded(
+                self._reader,
+                bag.path,
+                hashed=lambda channel: hashed or channel.latched,
+                number=number,
             )
             begin = [*islice(groups, 2)]
             if len(begin) > 1 or bag.end - bag.start > LONG_NS:
                 return self._put_long(to_store, self._released_groups(begin, groups))
-            return to_store._replace(tables=begin[0] if begin else ())
+            return to_store, begin[0] if begin else Group(self._reader)
         except BagError as error:
             self._scanner.met_damage(bag, error)
             self._refuse(bag, error.reason)
-        except Exception as error:
-            # The next bag may be whole.
-            log.exception("bag_not_stored", path=str(bag.path))
-            self._refuse(bag, type(error).__name__)
         return False
 
-    def _put(self, pending: Sequence[ReadBag], *, whole: bool) -> int:
-        """Stores bags in parts together; each alone where the database refuses that."""
-        bags = [to_store.bag for to_store in pending]
+    def _fill_alone(self, batch: Batch, timeline: Timeline) -> int:
+        return sum(self.fill(Batch([bag], batch.whole), timeline) for bag in batch.bags)
+
+    def _put(
+        self, pending: Sequence[ReadBag], group: Group, batch: Batch, timeline: Timeline
+    ) -> int:
+        """Stores bags of a batch in parts together; each alone where the database refuses that."""
+        bags, whole = [to_store.bag for to_store in pending], batch.whole
         if not bags:
             return 0
         begun, refusals = time.perf_counter_ns(), self.store.refusals
-        written = self.store.put(pending, whole=whole)
+        written = self.store.put(pending, group.tables(), whole=whole)
         if self.store.refusals > refusals:
             if len(bags) > 1:
-                return sum(self._put([bag], whole=whole) for bag in pending)
+                return self._fill_alone(Batch(bags, whole), timeline)
             self._refuse(bags[0], self.store.refused_for or "")
         if written.parts and whole:
             begin = self._slot(bags[0])[1]
@@ -316,13 +328,14 @@ class Filling:
         return is_stored
 
     def _released_groups(
-        self, begin: list[list[Table]], groups: Iterator[list[Table]]
+        self, begin: list[Group], groups: Iterator[Group]
     ) -> Iterator[list[Table]]:
         """Yields groups of tables. Each is freed, and the turn released, before the next."""
         while True:
-            tables = begin.pop(0) if begin else next(groups, None)
-            if tables is None:
+            group = begin.pop(0) if begin else next(groups, None)
+            if group is None:
                 return
+            tables = group.tables()
             yield tables
             tables.clear()  # who asks for the next still has the list
             if not begin:

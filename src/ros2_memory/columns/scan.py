@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKey
+from ros2_memory.columns.table import UNHASHED
 from ros2_memory.columns.units import (
     BagUnit,
     GoneError,
@@ -27,7 +28,7 @@ from ros2_memory.columns.units import (
     copies_among,
     repeated_among,
 )
-from ros2_memory.columns.writing import DELAY, PUBLISH_TIME, UNHASHED
+from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns

@@ -462,14 +462,15 @@ class ColumnStore(Database):
             return True
         return self.write(write)
 
-    def put(self, bags: Sequence[ReadBag], *, whole: bool) -> Written:
+    def put(self, bags: Sequence[ReadBag], tables: Sequence[Table], *, whole: bool) -> Written:
         """Stores bags of one recording in the same parts, in place of what they were stored with.
 
         One that is in whole parts stays as it is: another program has stored it. One that changed
         meanwhile is left out.
 
         Args:
-            bags: with their tables.
+            bags: those of the tables, by their numbers there.
+            tables: with all of their messages.
             whole: whether their ten minutes are over, so that their parts stay as they are.
         """
         written = Written(0, {})
@@ -483,12 +484,16 @@ class ColumnStore(Database):
                 (self._definitions, json.dumps([bag.key.path for bag in bags])),
             )
             stored = {BagKey(*key): bool(hashed) for *key, hashed in rows}
-            missing = [
-                bag for bag in bags if bag.key not in stored or (bag.hashed and not stored[bag.key])
-            ]
-            new = [bag for bag in missing if bag.is_current()]
-            delete_bags(connection, [bag.key.path for bag in new])
-            parts = insert_bags(connection, new, self._definitions, self._layouts, whole=whole)
+            missing = {
+                number: bag
+                for number, bag in enumerate(bags)
+                if bag.key not in stored or (bag.hashed and not stored[bag.key])
+            }
+            new = {number: bag for number, bag in missing.items() if bag.is_current()}
+            delete_bags(connection, [bag.key.path for bag in new.values()])
+            parts = insert_bags(
+                connection, new, tables, self._definitions, self._layouts, whole=whole
+            )
             done = len(bags) - len(missing) + len(new)
             written = Written(done, {self.offset + row: part for row, part in parts.items()})
 

@@ -47,6 +47,8 @@ No casefolded text begins so."""
 SPACES: Final = {code: " " for code in range(128) if not chr(code).isalpha()}
 """For `str.translate`: what of ASCII is no letter becomes a space."""
 _LETTERS: Final = re.compile(r"[^\W\d_]+")
+UNHASHED: Final = -1
+"""In place of the hash of a payload that was not hashed."""
 MAX_RANGED_BYTES: Final = 4096
 """Of longer arrays the least and the greatest number are not looked for."""
 
@@ -213,9 +215,9 @@ class Elements:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Table:
-    """The messages of one topic under one type in a bag, or in a part of it.
+    """The messages of one topic under one type in a bag, in a part of it, or in some bags.
 
-    Ordered by log time, ties by place.
+    Ordered by log time, ties by bag and place.
 
     Attributes:
         channel: the first channel of this topic, type and definition.
@@ -226,8 +228,9 @@ class Table:
         elements: by the dot-path of the sequence.
         left_out: which fields have no column (or not in all rows), by dot-path, and why; "" stands
             for the whole message, whose times are all there is.
-        payload_hashes: CRC-32 of each payload, where it was asked for.
+        payload_hashes: CRC-32 of each payload, or `UNHASHED`; None where none was asked for.
         definition: the fields of the type; None where they are not known.
+        bags: of each row the number of its bag among those that were decoded together; None: 0.
     """
 
     channel: Channel
@@ -239,10 +242,16 @@ class Table:
     left_out: Mapping[str, str] = field(default_factory=dict)
     payload_hashes: IntArray | None = None
     definition: Definition | None = None
+    bags: IntArray | None = None
 
     def __len__(self) -> int:
         """Returns the number of messages."""
         return self.log_times.size
+
+    @property
+    def bag_numbers(self) -> IntArray:
+        """As `bags`, of each row."""
+        return np.zeros(len(self), np.int64) if self.bags is None else self.bags
 
     def error(self, path: str) -> float:
         """Returns the greatest absolute error of a column's values: 0.0, they are as decoded.
@@ -271,7 +280,7 @@ class Table:
 
     def rows(self, positions: IntArray) -> Table:
         """Returns some rows, in the order given."""
-        hashes = self.payload_hashes
+        hashes, bags = self.payload_hashes, self.bags
         return replace(
             self,
             log_times=self.log_times[positions],
@@ -280,11 +289,12 @@ class Table:
             columns={path: _taken(column, positions) for path, column in self.columns.items()},
             elements={path: inner.rows(positions) for path, inner in self.elements.items()},
             payload_hashes=None if hashes is None else hashes[positions],
+            bags=None if bags is None else bags[positions],
         )
 
     def sorted(self) -> Table:
-        """Returns the rows by log time, ties by place."""
-        order = order_of(self.log_times, self.places)
+        """Returns the rows by log time, ties by bag and place."""
+        order = order_of(self.log_times, self.bag_numbers, self.places)
         return self if order is None else self.rows(order)
 
     def without_columns(self, reason: str) -> Table:
@@ -294,16 +304,15 @@ class Table:
     @property
     def memory_bytes(self) -> int:
         """About how much memory it takes."""
-        return 24 * len(self) + _bytes(self.columns, self.elements)
+        return 32 * len(self) + _bytes(self.columns, self.elements)
 
 
-def order_of(log_times: IntArray, places: IntArray) -> IntArray | None:
-    """Returns the positions by log time, ties by place; None if that is the order already."""
-    is_later = log_times[1:] > log_times[:-1]
-    if is_later.all():
+def order_of(log_times: IntArray, bags: IntArray, places: IntArray) -> IntArray | None:
+    """Returns the positions by log time, ties by bag and place; None if that is the order."""
+    if (log_times[1:] > log_times[:-1]).all():
         return None
-    is_tied = (log_times[1:] == log_times[:-1]) & (places[1:] > places[:-1])
-    return None if (is_later | is_tied).all() else np.lexsort((places, log_times))
+    order = np.lexsort((places, bags, log_times))
+    return None if (order[1:] > order[:-1]).all() else order
 
 
 def joined(tables: Sequence[Table]) -> Table:
@@ -317,7 +326,7 @@ def joined(tables: Sequence[Table]) -> Table:
     first = tables[0]
     if len(tables) == 1:
         return first
-    hashes = [table.payload_hashes for table in tables if table.payload_hashes is not None]
+    is_hashed = any(table.payload_hashes is not None for table in tables)
     return Table(
         first.channel,
         np.concatenate([table.log_times for table in tables]),
@@ -325,9 +334,15 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate([table.places for table in tables]),
         *_joined_levels(tables),
         dict(ChainMap(*(dict(table.left_out) for table in tables))),
-        np.concatenate(hashes) if len(hashes) == len(tables) else None,
+        np.concatenate([*map(_hashes, tables)]) if is_hashed else None,
         first.definition,
+        np.concatenate([table.bag_numbers for table in tables]),
     ).sorted()
+
+
+def _hashes(table: Table) -> IntArray:
+    hashes = table.payload_hashes
+    return np.full(len(table), UNHASHED) if hashes is None else hashes
 
 
 def _taken(column: Column, positions: IntArray) -> Column:

@@ -21,7 +21,7 @@ import numpy as np
 from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.table import Table, Zone, joined
+from ros2_memory.columns.table import UNHASHED, Table, Zone, joined
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -49,8 +49,6 @@ ZONE_ALONE: Final = "zone"
 DROPPED: Final = "dropped"
 """The codec of a column of which only the zone is stored: the rest is beyond the bags' share."""
 ALWAYS: Final = frozenset({LOG_TIME, DELAY, PAYLOAD_HASH, BAG})
-UNHASHED: Final = -1
-"""In place of the hash of a payload that was not hashed."""
 
 
 @dataclass(frozen=True)
@@ -83,30 +81,6 @@ class PackedPart:
         return sum(map(len, self.first_of))
 
 
-def packed_part(layout: Layout, tables: Sequence[tuple[Table, IntArray]]) -> PackedPart:
-    """Returns the rows of some bags as one part.
-
-    Args:
-        layout: of the topic, type and definition that all these tables are of.
-        tables: each with the number of the bag of each row, of which it has one at least.
-    """
-    if len(tables) == 1:
-        return pack_rows(layout, *tables[0])
-    stops = np.cumsum([len(table) for table, _ in tables])
-    # The place of a row becomes its number among all rows: so its bag is known once sorted.
-    is_hashed = any(table.payload_hashes is not None for table, _ in tables)
-    numbered = [
-        replace(
-            table,
-            places=np.arange(stop - len(table), stop),
-            payload_hashes=_hashes(table) if is_hashed else None,
-        )
-        for (table, _), stop in zip(tables, stops.tolist(), strict=True)
-    ]
-    whole = joined(numbered)
-    return pack_rows(layout, whole, np.concatenate([bags for _, bags in tables])[whole.places])
-
-
 def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     """Returns the rows of a table of a layout, each with the number of its bag, as a part."""
     common: dict[str, IntArray] = {LOG_TIME: table.log_times, BAG: bags}
@@ -135,11 +109,6 @@ def pack_rows(layout: Layout, table: Table, bags: IntArray) -> PackedPart:
     )
 
 
-def _hashes(table: Table) -> IntArray:
-    hashes = table.payload_hashes
-    return np.full(len(table), UNHASHED) if hashes is None else hashes
-
-
 class ReadBag(NamedTuple):
     """A bag to be stored.
 
@@ -148,14 +117,12 @@ class ReadBag(NamedTuple):
         bag: the bag, for its times.
         hashed: whether tables have the hashes of all its payloads.
         is_current: whether the bag may be stored, asked once nobody else can write.
-        tables: with all of its messages, unless these follow.
     """
 
     key: BagKey
     bag: BagFile
     hashed: bool = False
     is_current: Callable[[], bool] = lambda: True
-    tables: Sequence[Table] = ()
 
 
 class LongBag:
@@ -190,7 +157,7 @@ class LongBag:
         """Inserts some of its messages, as parts of ten minutes each."""
         if not self._may_go_on(connection):
             return False
-        self._lacks_definitions |= lacks_definitions(tables)
+        self._lacks_definitions |= any(map(lacks_definitions, tables))
         parts: list[int] = []
         for table in tables:
             topic, layout = topic_of(connection, table, self._layouts)
@@ -295,9 +262,9 @@ def _in_parts(table: Table) -> Iterator[Table]:
         yield table.rows(rows)
 
 
-def lacks_definitions(tables: Sequence[Table]) -> bool:
-    """Returns whether some table has no columns: with other definitions it may have some."""
-    return any("" in table.left_out for table in tables)
+def lacks_definitions(table: Table) -> bool:
+    """Returns whether a table has no columns: with other definitions it may have some."""
+    return "" in table.left_out
 
 
 def _messages_of(bag: BagFile) -> int:
@@ -306,7 +273,7 @@ def _messages_of(bag: BagFile) -> int:
 
 def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: str) -> int:
     """Inserts a bag; returns its number."""
-    key, bag, hashed, *_ = to_store
+    key, bag, hashed, _ = to_store
     summary = _number_of(connection, "summary", topics=bag.summary.schema.to_json())
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
@@ -318,23 +285,43 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
 
 def insert_bags(
     connection: sqlite3.Connection,
-    bags: Sequence[ReadBag],
+    bags: Mapping[int, ReadBag],
+    tables: Sequence[Table],
     definitions: str,
     layouts: Layouts,
     *,
     whole: bool,
 ) -> dict[int, PackedPart]:
-    """Inserts bags of one recording, in one part for each topic; returns these by their ids."""
-    rows: dict[int, list[tuple[Table, IntArray]]] = defaultdict(list)
+    """Inserts bags of one recording, in one part for each topic; returns these by their ids.
+
+    Args:
+        connection: to the store.
+        bags: by their numbers in the tables.
+        tables: with all messages of these bags, and of others, which are left out.
+        definitions: as `ColumnStore` has them.
+        layouts: of tables before these.
+        whole: as for `ColumnStore.put`.
+    """
+    lacking = {
+        number
+        for table in filter(lacks_definitions, tables)
+        for number in np.unique(table.bag_numbers).tolist()
+    }
+    ids = np.zeros(max(bags, default=0) + 1, np.int64)
+    for number, bag in bags.items():
+        ids[number] = insert_bag(connection, bag, definitions if number in lacking else "")
+    of_topics: dict[int, list[Table]] = defaultdict(list)
     layout_of: dict[int, Layout] = {}
-    for bag in bags:
-        number = insert_bag(connection, bag, definitions if lacks_definitions(bag.tables) else "")
-        for table in bag.tables:
+    for table in tables:
+        is_stored = np.isin(table.bag_numbers, [*bags])
+        if is_stored.any():
             topic, layout_of[topic] = topic_of(connection, table, layouts)
-            rows[topic].append((table, np.full(len(table), number)))
+            rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
+            of_topics[topic].append(rows)
     parts: dict[int, PackedPart] = {}
-    for topic, of_topic in rows.items():
-        part = packed_part(layout_of[topic], of_topic)
+    for topic, of_topic in of_topics.items():
+        rows = joined(of_topic)
+        part = pack_rows(layout_of[topic], rows, ids[rows.bag_numbers])
         parts[_insert_part(connection, topic, part, whole=whole)] = part
     return parts
 

@@ -23,12 +23,12 @@ from ros2_memory.analysis.conditions import (
     leaves,
     positions,
 )
-from ros2_memory.columns.decode import _decoded_batch, _Kind
+from ros2_memory.columns.decode import Group, _Kind, _Undecoded
 from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import pack
 from ros2_memory.columns.plan import plan_of
 from ros2_memory.columns.stored import StoredTable, lazy_columns
-from ros2_memory.columns.table import Column, Table, Texts, joined
+from ros2_memory.columns.table import Column, Table, Texts
 from ros2_memory.storage.base import Batch, Channel, Record, Schema, batched
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import OTHER_ROBOTS, VISION_DEFINITIONS
@@ -178,9 +178,12 @@ def table_of(records: Sequence[Record], reader: McapReader) -> Drawn:
     """Messages of one channel in the order of time, as a table."""
     definition = reader.definition(records[0].channel)
     assert definition is not None
-    kind = _Kind(definition, plan_of(definition), "", is_hashed=False)
+    kind = _Kind(records[0].channel, definition, plan_of(definition), "", is_hashed=False)
     found: Iterator[Batch] = batched(enumerate(records))
-    table = joined([_decoded_batch(kind, batch, reader, skip=False) for batch in found])
+    group = Group(reader)
+    for batch in found:
+        group.add(_Undecoded(kind, batch, 0))
+    [table] = group.tables()
     return Drawn(table, [reader.decode(record) for record in records])
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import sqlite3
@@ -14,17 +15,18 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import decode, fill
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import Group, decoded, undecoded
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
+from ros2_memory.columns.walk import LevelColumns, walked
 from ros2_memory.columns.writing import ReadBag
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.storage.mcap import bulk
-from tests.support.bags import McapLayout, odom, text, write_mcap
+from tests.support.bags import McapLayout, Msg, odom, text, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, check_all, store_file, times
 from tests.support.mcap_surgery import raw_mcap
 from tests.support.screened_bags import ScreenedBags, mode, words
@@ -35,10 +37,12 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer
 
+    from ros2_memory.columns.plan import Plan
     from ros2_memory.columns.table import Table
-    from ros2_memory.storage.base import BagReader, Channel
+    from ros2_memory.storage.base import BagReader, Batch, Channel
 
 S = NS_PER_S
+STRING = "std_msgs/msg/String"
 T0 = 1_700_000_400 * S
 """The begin of ten minutes."""
 
@@ -84,6 +88,44 @@ def test_the_newest_bag_comes_first_and_parts_are_made_of_ten_minutes(tmp_path: 
     assert world.filling.waiting(timeline) == []
     assert (count(world, "part"), count(world, "part", "NOT whole")) == (4, 0)
     assert check_all(world) == 13 * 21
+
+
+def test_a_message_that_cannot_be_decoded_takes_the_columns_of_its_bag_alone(
+    tmp_path: Path,
+) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(4)]
+    broken = [text(T0 + 120 * S, "word"), Msg("/chatter", STRING, T0 + 121 * S, b"\x00\x01")]
+    write_mcap(paths[2], [odom(T0 + 120 * S, 1.0, 2.0), *broken])
+    world = World.of(tmp_path)
+    assert world.fill() == 4
+    bags_of = {}
+    with closing(sqlite3.connect(store_file(tmp_path))) as base:
+        for bags, has_columns in base.execute(
+            "SELECT bags, EXISTS (SELECT 1 FROM zone WHERE zone.part = part.id AND path = 'data')"
+            " FROM part JOIN topic ON topic.id = part.topic WHERE name = '/chatter'"
+        ):
+            bags_of[has_columns] = len(json.loads(bags))
+    assert bags_of == {1: 3, 0: 1}
+    check_all(world)
+
+
+def test_bags_that_cannot_be_stored_together_are_stored_alone_but_for_the_faulty(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(4):
+        write_bag(tmp_path, number)
+    world = World.of(tmp_path)
+
+    def failing(plan: Plan, batch: Batch) -> LevelColumns:
+        if (batch.log_times // (60 * S) == T0 // (60 * S) + 2).any():
+            raise ValueError("of a test")
+        return walked(plan, batch)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(decode, "walked", failing)
+        world.fill()
+    assert world.stored() == {f"rec/rec_{number}.mcap" for number in (0, 1, 3)}
+    check_all(world)
 
 
 def test_a_bag_whose_name_is_no_text_is_stored(tmp_path: Path) -> None:
@@ -199,16 +241,16 @@ def test_nothing_is_stored_while_messages_are_taken_out(
     erasing = tmp_path / ERASING_FILE
 
     def then_erasing(
-        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool]
-    ) -> Iterator[list[Table]]:
-        yield from decoded(reader, path, hashed=hashed)
+        reader: BagReader, path: Path, *, hashed: Callable[[Channel], bool], number: int
+    ) -> Iterator[Group]:
+        yield from undecoded(reader, path, hashed=hashed, number=number)
         erasing.write_text("{}")
 
-    monkeypatch.setattr(fill, "decoded", then_erasing)
+    monkeypatch.setattr(fill, "undecoded", then_erasing)
     assert world.fill() == 0
     assert count(world, "bag") == 0
     assert world.fill() == 0
-    monkeypatch.setattr(fill, "decoded", decoded)
+    monkeypatch.setattr(fill, "undecoded", undecoded)
     erasing.unlink()
     assert world.fill() == 1
 
@@ -422,8 +464,8 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
     world = World.of(tmp_path)
     halves: list[int] = []
 
-    def with_fault(reader: BagReader, path: Path, **options: object) -> Iterator[list[Table]]:
-        for nth, group in enumerate(decoded(reader, path)):
+    def with_fault(reader: BagReader, path: Path, **options: object) -> Iterator[Group]:
+        for nth, group in enumerate(undecoded(reader, path)):
             if nth == 3:
                 halves.append(count(world, "part"))
                 assert world.stored() == set()
@@ -433,7 +475,7 @@ def test_half_a_bag_is_never_used_and_its_rows_go(
                 (tmp_path / ERASING_FILE).write_text("{}")
             yield group
 
-    monkeypatch.setattr(fill, "decoded", with_fault)
+    monkeypatch.setattr(fill, "undecoded", with_fault)
     world.fill()
     assert halves[0] > 0
     assert (count(world, "part"), count(world, "part_column"), count(world, "bag")) == (0, 0, 0)
@@ -484,11 +526,11 @@ def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
     ]
     names: list[str] = []
 
-    def counting(reader: BagReader, path: Path, **options: object) -> Iterator[list[Table]]:
+    def counting(reader: BagReader, path: Path, **options: object) -> Iterator[Group]:
         names.append(path.name)
-        return decoded(reader, path, **options)  # type: ignore[arg-type]
+        return undecoded(reader, path, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(fill, "decoded", counting)
+    monkeypatch.setattr(fill, "undecoded", counting)
     for number, (handover, stored) in enumerate(steps):
         if handover is not None:
             write_handover(folder, handover)

@@ -13,7 +13,7 @@ from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import decompressed, unpack
 from ros2_memory.columns.stored import lazy_columns
 from ros2_memory.columns.table import Column, Elements, Table, Texts, column_bytes, joined
-from ros2_memory.columns.writing import packed_part
+from ros2_memory.columns.writing import pack_rows
 from ros2_memory.storage.base import Channel, Schema
 
 CHANNEL = Channel("/objects", "cdr", Schema("demo_msgs/msg/Objects"))
@@ -47,8 +47,8 @@ def table(rows: int = 40, first: int = 0) -> Table:
 def unpacked(*given: Table) -> Table:
     """The tables as they come back from a part."""
     layout = Layout.of(given[0], None)
-    numbered = [(one, np.full(len(one), number)) for number, one in enumerate(given)]
-    packed = packed_part(layout, numbered).columns
+    rows = joined([replace(one, bags=np.full(len(one), nth)) for nth, one in enumerate(given)])
+    packed = pack_rows(layout, rows, rows.bag_numbers).columns
 
     def load(path: str) -> Column:
         one = packed[path]

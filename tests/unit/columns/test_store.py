@@ -152,8 +152,8 @@ def test_columns_of_every_kind_come_back(tmp_path: Path) -> None:
     times = bag.start + np.arange(3)
     channel = Channel("/kinds", "cdr", Schema("a_msgs/msg/Kinds"))
     table = Table(channel, times, times, np.arange(3), numbers)
-    stored = [ReadBag(world.filling._key(bag), bag, tables=[table])]
-    assert world.store.put(stored, whole=True).bags == 1
+    stored = [ReadBag(world.filling._key(bag), bag)]
+    assert world.store.put(stored, [table], whole=True).bags == 1
     timeline = world.memory.index.snapshot().timeline
     scanner = Scanner(world.store, tmp_path)
     coverage = scanner.coverage(timeline)

@@ -94,7 +94,7 @@ def test_a_bag_that_cannot_be_stored_is_told_of_and_not_tried_for_ever(
         raise BagError("rec_0.mcap", "damaged in the middle")
 
     with monkeypatch.context() as patched:
-        patched.setattr(fill, "decoded", damaged)
+        patched.setattr(fill, "undecoded", damaged)
         assert fill_store(backfill) == Progress(1, 0, 0, 1)
     assert len(queries.list_recorded_topics(memory, Call())) == 1
 
