@@ -212,7 +212,7 @@ def _with_jumps(view: View, waypoints: Sequence[Waypoint], frame_id: str) -> tup
 def _unreachable(frame_id: str, own_frame: str) -> str:
     return (
         f"frame_id was {abbreviate(frame_id)}; no transform leads there from "
-        f"{own_frame or 'a pose without a frame'} at that time; list_frames has the recorded frames"
+        f"{own_frame or 'a pose without a frame'} at that time"
     )
 
 
