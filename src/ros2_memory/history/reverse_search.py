@@ -78,6 +78,7 @@ _MOST_FRAMES: Final = 3
 _TOGETHER_NS: Final[Ns] = NS_PER_S
 """Messages that may match and are no farther apart are read at once."""
 _MOST_TOGETHER: Final = 256
+_NO_TIMES: Final = np.empty(0, np.int64)
 
 
 def condition_of(
@@ -365,11 +366,11 @@ class RowCondition:
 
 
 class _TableCandidates(NamedTuple):
-    """A table's last log time (ns), its topic, and when messages of it may match."""
+    """A table's last log time (ns), its topic, and when messages of it may match, ascending."""
 
     last: Ns
     topic: str
-    times: list[Ns]
+    times: IntArray
 
 
 class CandidateRows:
@@ -387,7 +388,8 @@ class CandidateRows:
         self.has_looked = False
         newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
-        self._ready: list[tuple[Ns, str]] = []
+        # Of each table that is open: its newest time that is left, negative, and the older ones.
+        self._ready: list[tuple[Ns, str, int, Iterator[Ns]]] = []
         self._group: list[tuple[Ns, str]] = []
         self._view = view
         self._window = window
@@ -416,22 +418,28 @@ class CandidateRows:
     @property
     def reached(self) -> Ns:
         """The log time from which on all has been looked at, and what may match was searched."""
-        waiting = [-time + 1 for time, _ in self._ready] + [time + 1 for time, _ in self._group]
+        waiting = [-time + 1 for time, *_ in self._ready] + [time + 1 for time, _ in self._group]
         return max([*self._left.values(), *waiting], default=MIN_NS)
 
     def _times(self) -> Iterator[tuple[Ns, str]]:
         """Yields the log times of messages that may match, newest first, each once."""
         ready, newer = self._ready, (MAX_NS, "")
         tables = heapq.merge(*map(self._tables_of, self._left), key=lambda table: -table.last)
-        for table in chain(tables, [_TableCandidates(MIN_NS - 1, "", [])]):
+        for number, table in enumerate(
+            chain(tables, [_TableCandidates(MIN_NS - 1, "", _NO_TIMES)])
+        ):
             # What is left is no newer than the next table.
             while ready and -ready[0][0] > table.last:
-                negative, topic = heapq.heappop(ready)
+                negative, topic, nth, older = ready[0]
                 if (negative, topic) != newer:
                     yield -negative, topic
                 newer = negative, topic
-            for time in table.times:
-                heapq.heappush(ready, (-time, table.topic))
+                heapq.heappop(ready)
+                for time in islice(older, 1):
+                    heapq.heappush(ready, (-time, topic, nth, older))
+            times = map(int, table.times[::-1])
+            for time in islice(times, 1):
+                heapq.heappush(ready, (-time, table.topic, number, times))
 
     def _tables_of(self, topic: str) -> Iterator[_TableCandidates]:
         """Yields when messages of a topic may match, table by table, the newest first."""
@@ -450,7 +458,7 @@ class CandidateRows:
         ):
             times = self._candidates(rows)
             reached(rows.last)
-            yield _TableCandidates(rows.last, topic, times.tolist())
+            yield _TableCandidates(rows.last, topic, times)
         self._left[topic] = MIN_NS
 
     def _may_match(self, parts: PartZones) -> bool | Mask:
@@ -464,12 +472,12 @@ class CandidateRows:
         truth = self._test.truth(rows)
         if truth.is_none:
             self.ruled_out = True
-            return np.empty(0, np.int64)
+            return _NO_TIMES
         may = truth.perhaps
         if rows.index is not None:
             may = may[rows.index]
         self.ruled_out |= not may.all()
-        return rows.times[may]
+        return np.sort(rows.times[may])
 
 
 def note_summarised(view: View, topic: str, fields: Iterable[str], window: TimeWindow) -> None:
