@@ -345,7 +345,7 @@ class MemoryDays:
             elif self._is_latched(snapshot, topic):
                 chosen.latched.add(topic)
                 chosen.times[topic, kind].update(table.log_times.tolist())
-            elif len(table):
+            else:
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
                 chosen.times[topic, kind].update(
                     beside_pauses(shown.pauses, table.log_times).tolist()
