@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import pytest
 
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
@@ -38,7 +38,7 @@ def shared_samples(folder: str) -> list[tuple[Table, list[object]]]:
     found = []
     for path in sorted([*(BAGS / folder).rglob("*.mcap"), *(BAGS / folder).rglob("*.db3")]):
         try:
-            groups = decoded(reader, path, skip_undecodable=True)
+            groups = map(Group.tables, undecoded(reader, path, skip_undecodable=True))
             tables = {_key_of(table.channel): table for table in chain(*groups)}
         except BagError:
             continue

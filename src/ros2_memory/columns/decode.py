@@ -101,7 +101,7 @@ class _Kind(NamedTuple):
     is_hashed: bool
 
 
-def decoded(
+def undecoded(
     reader: BagReader,
     path: Path,
     window: TimeWindow = _EVERYTHING,
@@ -110,8 +110,9 @@ def decoded(
     hashed: Callable[[Channel], bool] = lambda _: False,
     columns: bool = True,
     skip_undecodable: bool = False,
-) -> Iterator[list[Table]]:
-    """Yields the messages of a bag as tables, in groups.
+    number: int = 0,
+) -> Iterator[Group]:
+    """Yields the messages of a bag in groups, for `Group.tables`.
 
     In one group there is one table for each topic, type and definition with messages; a bag whose
     messages and tables take less than `GROUP_BYTES` is one group. Tables of later groups may
@@ -129,39 +130,12 @@ def decoded(
             cannot be decoded.
         skip_undecodable: whether a message that cannot be decoded has no row. Else its topic has
             rows alone in this group: the bag has to be asked about each of them.
+        number: becomes that of the bag in the tables.
 
     Raises:
         BagVanishedError: the file is not there.
         BagError: as by `BagReader.batches`. The iterator continues behind it, with all that can be
             read.
-    """
-    groups = undecoded(
-        reader,
-        path,
-        window,
-        topics=topics,
-        hashed=hashed,
-        columns=columns,
-        skip_undecodable=skip_undecodable,
-    )
-    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
-    return map(Group.tables, groups)
-
-
-def undecoded(
-    reader: BagReader,
-    path: Path,
-    window: TimeWindow = _EVERYTHING,
-    *,
-    topics: Collection[str] | None = None,
-    hashed: Callable[[Channel], bool] = lambda _: False,
-    columns: bool = True,
-    skip_undecodable: bool = False,
-    number: int = 0,
-) -> Iterator[Group]:
-    """Yields the groups of `decoded`, which are decoded as far as they are large.
-
-    `number` becomes that of the bag in the tables.
     """
 
     def read() -> Iterator[Group | BagError]:
@@ -196,6 +170,7 @@ def undecoded(
         if group.has_messages:
             yield group
 
+    # Mapped outside of the generator: one that has raised could not go on behind lost messages.
     return map(unless_error, read())
 
 
@@ -283,7 +258,7 @@ class Group:
 
     Attributes:
         reader: of the bags.
-        skip_undecodable: as for `decoded`.
+        skip_undecodable: as for `undecoded`.
         memory_bytes: what the tables take that are decoded so far.
     """
 
@@ -305,11 +280,8 @@ class Group:
         """Returns whether a batch begins the next group; only the first of a buffer may."""
         if batch.buffer is self._buffer or not self.has_messages:
             return False
-        payload_bytes = self._bytes + len(batch.buffer)
-        # Tables may take more than the payloads, but hardly four times as much.
-        if payload_bytes <= GROUP_BYTES // 4 or payload_bytes > GROUP_BYTES:
-            return payload_bytes > GROUP_BYTES
-        return self.memory_bytes > GROUP_BYTES
+        # Tables may take more than the payloads.
+        return max(self._bytes + len(batch.buffer), self.memory_bytes) > GROUP_BYTES
 
     def add(self, undecoded: _Undecoded) -> None:
         """Adds a batch; decodes those before it that take too much memory with it."""
@@ -347,6 +319,7 @@ class Group:
             if last.memory_bytes <= room:
                 room -= last.memory_bytes
                 following._tables[key] = [last]
+                following.memory_bytes += last.memory_bytes
                 parts[:] = [table.rows(np.arange(begin))]
 
     def tables(self) -> list[Table]:
@@ -372,8 +345,9 @@ class Group:
             alike[key, plan, reason].append(undecoded)
         for (key, _, _), of_topic in alike.items():
             for table in self._decoded(of_topic, buffer, begins):
-                self.memory_bytes += table.memory_bytes
-                self._tables.setdefault(key, []).append(table)
+                if len(table):  # else no message could be decoded
+                    self.memory_bytes += table.memory_bytes
+                    self._tables.setdefault(key, []).append(table)
 
     def _decoded(
         self, waiting: Sequence[_Undecoded], buffer: bytes, begins: Mapping[int, int]

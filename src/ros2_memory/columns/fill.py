@@ -177,13 +177,7 @@ class Filling:
         group, done = Group(self._reader), 0
         try:
             for bag in sorted(batch.bags, key=in_time):
-                read = self._read(bag, len(pending), hashed=self._is_shared(bag, timeline))
-                if isinstance(read, bool):
-                    done += read
-                else:
-                    pending.append(read[0])
-                    group.take(read[1])
-                del read  # and its tables, before the next is read
+                done += self._add(bag, pending, group, hashed=self._is_shared(bag, timeline))
                 self._large.release()
                 if group.memory_bytes > _MOST_HELD:
                     done += self._put(pending, group, batch, timeline)
@@ -264,8 +258,11 @@ class Filling:
             return False
         return self.store.renew(self._key(bag), bag)
 
-    def _read(self, bag: BagFile, number: int, *, hashed: bool) -> tuple[ReadBag, Group] | bool:
-        """Returns a bag with its messages, or whether it is stored: a long one is at once."""
+    def _add(self, bag: BagFile, pending: list[ReadBag], group: Group, *, hashed: bool) -> bool:
+        """Adds a bag to those that are pending, and its messages to theirs; stores a long one.
+
+        Returns whether it is stored already.
+        """
         if not self._may_be_stored(bag):
             return False
         try:
@@ -277,15 +274,18 @@ class Filling:
                 self._reader,
                 bag.path,
                 hashed=lambda channel: hashed or channel.latched,
-                number=number,
+                number=len(pending),
             )
             begin = [*islice(groups, 2)]
             if len(begin) > 1 or bag.end - bag.start > LONG_NS:
                 return self._put_long(to_store, self._released_groups(begin, groups))
-            return to_store, begin[0] if begin else Group(self._reader)
         except BagError as error:
             self._scanner.met_damage(bag, error)
             self._refuse(bag, error.reason)
+            return False
+        pending.append(to_store)
+        for read in begin:
+            group.take(read)
         return False
 
     def _fill_alone(self, batch: Batch, timeline: Timeline) -> int:

@@ -58,7 +58,7 @@ from ros2_memory.columns.values import (
 from ros2_memory.messages.detections import looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask, Numeric, ZoneOf
@@ -96,11 +96,8 @@ class ColumnCondition:
             return unknown(values.rows)
         known = self._possible.get(table.number) if isinstance(table, StoredTable) else None
         whole = _possible(plan.whole, values) if known is None else known
-        if plan.counted is None:
+        if plan.counted is None or not whole:
             return _any_of(whole, values)
-        whole = [*whole]
-        if not whole:
-            return nowhere(values.rows)
         texts = tuple(
             t.leaf for t in plan.counted if isinstance(t, _LeafTest) and t.leaf.json_depth
         )
@@ -127,11 +124,8 @@ class ColumnCondition:
             possible.append(np.broadcast_to(may_pass, parts.numbers.size))
         if not possible:
             return False
-        sets, nth = np.unique(possible, axis=1, return_inverse=True)
-        tests = [[*compress(plan.whole, one)] for one in sets.T]
-        self._possible |= {
-            part: tests[at] for part, at in zip(parts.numbers.tolist(), nth.tolist(), strict=True)
-        }
+        tests = ([*compress(plan.whole, passes)] for passes in np.transpose(possible).tolist())
+        self._possible.update(zip(parts.numbers.tolist(), tests, strict=True))
         some: Mask = np.any(possible, axis=0)
         return some
 
@@ -155,12 +149,12 @@ class _Plan(NamedTuple):
         return cls(whole, _tests(condition, without_low(shape.value, condition.least_score)))
 
 
-def _possible(tests: Iterable[_Test], values: Values) -> Iterator[_Test]:
-    """Yields the tests that some row may pass, as known without reading a column."""
-    return (test for test in tests if test.may_match(values.zone))
+def _possible(tests: Sequence[_Test], values: Values) -> list[_Test]:
+    """Returns the tests that some row may pass, as known without reading a column."""
+    return [test for test in tests if test.may_match(values.zone)]
 
 
-def _any_of(tests: Iterable[_Test], values: Values) -> TruthValues:
+def _any_of(tests: Sequence[_Test], values: Values) -> TruthValues:
     """Returns which rows pass any of the tests."""
     surely, perhaps = nowhere(values.rows)
     for test in tests if values.rows else ():

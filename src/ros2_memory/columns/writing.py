@@ -21,7 +21,7 @@ import numpy as np
 from ros2_memory.columns.layout import Layout, columns_in
 from ros2_memory.columns.pack import Packed, compressed, pack
 from ros2_memory.columns.steps import EXACT
-from ros2_memory.columns.table import UNHASHED, Table, Zone, joined
+from ros2_memory.columns.table import UNHASHED, Table, Zone
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -297,7 +297,8 @@ def insert_bags(
     Args:
         connection: to the store.
         bags: by their numbers in the tables.
-        tables: with all messages of these bags, and of others, which are left out.
+        tables: with all messages of these bags, each of another topic or layout; and of others,
+            which are left out.
         definitions: as `ColumnStore` has them.
         layouts: of tables before these.
         whole: as for `ColumnStore.put`.
@@ -310,19 +311,14 @@ def insert_bags(
     ids = np.zeros(max(bags, default=0) + 1, np.int64)
     for number, bag in bags.items():
         ids[number] = insert_bag(connection, bag, definitions if number in lacking else "")
-    of_topics: dict[int, list[Table]] = defaultdict(list)
-    layout_of: dict[int, Layout] = {}
+    parts: dict[int, PackedPart] = {}
     for table in tables:
         is_stored = np.isin(table.bag_numbers, [*bags])
         if is_stored.any():
-            topic, layout_of[topic] = topic_of(connection, table, layouts)
+            topic, layout = topic_of(connection, table, layouts)
             rows = table if is_stored.all() else table.rows(np.flatnonzero(is_stored))
-            of_topics[topic].append(rows)
-    parts: dict[int, PackedPart] = {}
-    for topic, of_topic in of_topics.items():
-        rows = joined(of_topic)
-        part = pack_rows(layout_of[topic], rows, ids[rows.bag_numbers])
-        parts[_insert_part(connection, topic, part, whole=whole)] = part
+            part = pack_rows(layout, rows, ids[rows.bag_numbers])
+            parts[_insert_part(connection, topic, part, whole=whole)] = part
     return parts
 
 

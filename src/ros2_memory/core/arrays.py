@@ -131,7 +131,7 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     if most <= _KEYS_OF_ROW * len(keys):
         is_there = np.zeros(most, np.bool_)
         is_there[keys] = True
-        distinct, number = np.flatnonzero(is_there), (np.cumsum(is_there) - 1)[keys]
+        distinct, number = np.flatnonzero(is_there), np.cumsum(is_there)[keys] - 1
     else:
         distinct, number = np.unique(keys, return_inverse=True)
     return np.stack(np.unravel_index(distinct, sizes), axis=1) + np.array(lows), number

@@ -6,7 +6,7 @@ import time
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import is_thinned
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.scanner import DECODED_BYTES
 from ros2_memory.core.errors import (
@@ -225,7 +225,7 @@ class BagAccess:
         key = (bag.identity, topic, part, hashed, columns)
         is_lasting = is_settled(bag, self.memory.index.bag_dir, self.snapshot.scanned_at)
         remembered_tables = remembered.get(key) if is_lasting else None
-        read_now = decoded(
+        read_now = undecoded(
             self.memory.reader,
             bag.path,
             part,
@@ -233,7 +233,8 @@ class BagAccess:
             hashed=lambda channel: hashed or channel.latched,
             columns=columns,
         )
-        groups = read_now if remembered_tables is None else iter(remembered_tables)
+        read_groups = map(Group.tables, read_now)
+        groups = read_groups if remembered_tables is None else iter(remembered_tables)
         read: list[list[Table]] = []
         size = 0
         while True:

@@ -422,10 +422,10 @@ class Sessions:
         pairs = dict.fromkeys(self.pairs(view.static_topics), True)
         for topic in view.moving_topics:
             for found in self.pairs_back(topic, None):
+                pairs |= dict.fromkeys(found, False)
                 if reading.expired():
                     view.notes.add_lack("out of time: frames that only older bags have are missing")
                     break
-                pairs |= dict.fromkeys(found, False)
         edges = [
             FrameEdge(*pair, is_static)
             for pair, is_static in sorted(pairs.items())

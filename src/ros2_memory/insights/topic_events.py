@@ -24,7 +24,7 @@ from ros2_memory.analysis.topic_events import (
     events_of,
     joined_events,
 )
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.columns.stated import StatedColumns
@@ -137,8 +137,8 @@ def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, 
     """
     reader, columns = view.memory.reader, StatedColumns(view.extractor)
     stated_of_topics: dict[str, list[Stated]] = {}
-    for tables in decoded(reader, bag.path, topics=topics) if topics else ():
-        for nth, table in enumerate(tables):
+    for group in undecoded(reader, bag.path, topics=topics) if topics else ():
+        for nth, table in enumerate(group.tables()):
             rows = Rows(BagUnit(bag, table, nth), lambda: None)
             stated = _stated_in_rows(view, columns, rows)
             stated_of_topics.setdefault(table.channel.topic, []).append(stated)

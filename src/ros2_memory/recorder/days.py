@@ -35,7 +35,7 @@ from ros2_memory.bag_dir.state_files import (
     Superseded,
     Thinned,
 )
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.logging_setup import get_logger
@@ -345,7 +345,7 @@ class MemoryDays:
             elif self._is_latched(snapshot, topic):
                 chosen.latched.add(topic)
                 chosen.times[topic, kind].update(table.log_times.tolist())
-            elif len(table):
+            else:
                 thinned.setdefault((topic, kind), TopicThinning(detections)).add(table)
                 chosen.times[topic, kind].update(
                     beside_pauses(shown.pauses, table.log_times).tolist()
@@ -399,13 +399,13 @@ class MemoryDays:
         Raises:
             BagUnreachableError: the disk fails to read the bag, and may recover.
         """
-        groups = decoded(self._reader, path, skip_undecodable=True)
-        for tables in or_errors(groups):
-            if isinstance(tables, BagError):
-                self._raise_if_transient(path, tables)
-                _log.warning("memory_not_read", path=str(path), reason=tables.reason)
+        groups = undecoded(self._reader, path, skip_undecodable=True)
+        for group in or_errors(groups):
+            if isinstance(group, BagError):
+                self._raise_if_transient(path, group)
+                _log.warning("memory_not_read", path=str(path), reason=group.reason)
             else:
-                yield from tables
+                yield from group.tables()
 
     def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
         """Yields the messages of a bag that can be read; raises as `_tables` does."""

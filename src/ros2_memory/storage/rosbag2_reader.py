@@ -119,8 +119,9 @@ class Scratch:
                 if self._root is None or not self._root.exists():
                     _delete_abandoned()
                     self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
-                    descriptor = _lock(self._root)
-                    weakref.finalize(self, _delete_locked, self._root, descriptor)
+                    weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
+                    with suppress(OSError):  # where nothing can be locked, nobody else deletes it
+                        weakref.finalize(self, os.close, _lock(self._root))
                 return Path(tempfile.mkdtemp(dir=self._root))
         except OSError as error:
             raise _disk_full(error) from error
@@ -156,7 +157,9 @@ def _delete_abandoned() -> None:
     for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
         with suppress(OSError):  # of another user, or in use
             if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
-                _delete_locked(folder, _lock(folder))
+                descriptor = _lock(folder)
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)
 
 
 def _lock(folder: Path) -> int:
@@ -172,11 +175,6 @@ def _lock(folder: Path) -> int:
         os.close(descriptor)
         raise
     return descriptor
-
-
-def _delete_locked(folder: Path, descriptor: int) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-    os.close(descriptor)
 
 
 def _disk_full(error: OSError) -> UnreachableError:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.table import Table, joined
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -29,7 +29,7 @@ def tables_of(reader: BagReader, path: Path) -> list[Table]:
     Without the messages that cannot be decoded.
     """
     parts: dict[object, list[Table]] = {}
-    groups = decoded(reader, path, skip_undecodable=True)
+    groups = map(Group.tables, undecoded(reader, path, skip_undecodable=True))
     while True:
         try:
             group = next(groups)

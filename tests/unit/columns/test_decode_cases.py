@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import random
 import struct
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -10,8 +12,9 @@ import numpy as np
 import pytest
 
 from ros2_memory.columns import decode
-from ros2_memory.columns.decode import decoded
-from ros2_memory.columns.table import Table, Texts
+from ros2_memory.columns.decode import Group, undecoded
+from ros2_memory.columns.layout import columns_in
+from ros2_memory.columns.table import UNHASHED, Table, Texts
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap import bulk
@@ -41,9 +44,11 @@ from tests.unit.columns.decoded_bags import (
 from tests.unit.columns.drawn_types import DrawnField, DrawnTypes
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from mcap.writer import Writer
+
+    from ros2_memory.storage.base import Channel
 
 
 def path_message(ns: int, points: int) -> Msg:
@@ -65,7 +70,7 @@ def path_message(ns: int, points: int) -> Msg:
 
 
 def groups_of(path: Path) -> Iterator[list[Table]]:
-    return decoded(McapReader(), path)
+    return map(Group.tables, undecoded(McapReader(), path))
 
 
 def numbers(table: Table, path: str) -> list[object]:
@@ -247,9 +252,88 @@ def test_small_groups_hold_together_what_one_group_does(tmp_path: Path) -> None:
     assert {len(table) for table in tables} == {len(table) for table in whole}
 
 
+def test_a_group_without_a_message_that_can_be_decoded_has_no_table_of_the_topic(
+    tmp_path: Path,
+) -> None:
+    spoiled = [Msg(message.topic, message.type, message.log_time, b"") for message in chatter(40)]
+    path = write_mcap(tmp_path / "a.mcap", [*spoiled, *mixed(40)], McapLayout(chunk_size=1500))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(decode, "GROUP_BYTES", 2000)
+        patch.setattr(bulk, "BATCH_BYTES", 1000)
+        groups = [*undecoded(McapReader(), path, skip_undecodable=True)]
+    assert len(groups) > 5
+    assert sum(len(table) for group in groups for table in group.tables()) == len(mixed(40))
+
+
+def drawn_bag(path: Path, draw: random.Random) -> Path:
+    """Some messages of few times and odd payloads, in chunks of any size, some latched."""
+    payloads = [text(0, "ok").payload, text(0, "a long text").payload, b"", b"\0\3\0\0\2\0\0\0a\0"]
+    messages: list[Msg] = []
+    for _ in range(draw.randrange(25)):
+        time, nth = draw.randrange(6), draw.choice([0, 0, 0, 1, 1, 2, 3])
+        messages += draw.choice(
+            [
+                [Msg("/chatter", "std_msgs/msg/String", time, payloads[nth])],
+                [odom(time, draw.random(), 0.0), path_message(time, draw.choice([0, 5, 40]))],
+                [detections(time, ["cup", "person"][: draw.randrange(3)])],
+            ]
+        )
+    latched = frozenset(draw.sample(["/chatter", "/plan", "/odom"], draw.randrange(3)))
+    chunk_size = draw.choice([50, 600, 100_000])
+    return write_mcap(path, messages, McapLayout(chunk_size=chunk_size, latched=latched))
+
+
+def is_hashed(channel: Channel, *, every: bool) -> bool:
+    return every or channel.latched
+
+
+def rows_by_bag(tables: Iterable[Table], bag: int | None = None) -> dict[object, object]:
+    """By bag and topic the rows; those of all tables are of `bag`, if it is given."""
+    rows: dict[object, object] = {}
+    for table in tables:
+        for number in np.unique(table.bag_numbers).tolist():
+            part = table.rows(np.flatnonzero(table.bag_numbers == number))
+            hashes = np.full(len(part), UNHASHED)
+            hashes = hashes if part.payload_hashes is None else part.payload_hashes
+            times = [part.log_times, part.publish_times, part.places, hashes]
+            columns = {
+                path: column.values() if isinstance(column, Texts) else column.tolist()
+                for path, column in columns_in(part)
+            }
+            key = (number if bag is None else bag, part.channel.topic, part.channel.latched)
+            assert key not in rows
+            reason = part.left_out.get("")
+            rows[key] = reason, repr([column.tolist() for column in times]), repr(columns)
+    return rows
+
+
+def test_bags_that_are_decoded_together_have_the_rows_that_each_has_alone(tmp_path: Path) -> None:
+    reader = McapReader()
+    for seed in range(40):
+        draw = random.Random(seed)
+        paths = [
+            drawn_bag(tmp_path / f"{seed}_{n}.mcap", draw) for n in range(draw.randrange(1, 5))
+        ]
+        together = Group(reader, draw.random() < 0.4)
+        alone: dict[object, object] = {}
+        read = partial(undecoded, reader, skip_undecodable=together.skip_undecodable)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(decode, "_HELD_BYTES", draw.choice([1, 300, 2000, 4 << 20]))
+            for nth, path in enumerate(paths):
+                hashed = partial(is_hashed, every=draw.random() < 0.5)
+                for group in read(path, hashed=hashed, number=nth):
+                    together.take(group)
+                for group in read(path, hashed=hashed):
+                    alone |= rows_by_bag(group.tables(), nth)
+            tables = together.tables()
+        assert all(table.sorted() is table for table in tables)
+        assert rows_by_bag(tables) == alone, seed
+
+
 def test_only_the_window_and_the_topics_asked_for_are_decoded(tmp_path: Path) -> None:
     path, reader = write_mcap(tmp_path / "a.mcap", mixed(12)), McapReader()
-    [[table]] = decoded(reader, path, TimeWindow(20, 60), topics=["/chatter"])
+    [group] = undecoded(reader, path, TimeWindow(20, 60), topics=["/chatter"])
+    [table] = group.tables()
     assert table.channel.topic == "/chatter"
     assert table.log_times.tolist() == [22, 32, 42, 52]
 

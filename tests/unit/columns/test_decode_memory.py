@@ -24,7 +24,7 @@ MAX_MB: Final = 200
 SCRIPT: Final = """
 import sys
 from pathlib import Path
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import undecoded
 from ros2_memory.storage.mcap_reader import McapReader
 
 def most_kb():  # not getrusage, whose peak a child inherits
@@ -34,10 +34,9 @@ def most_kb():  # not getrusage, whose peak a child inherits
 before = most_kb()
 rows = groups = 0
 reader = McapReader()
-for group in decoded(reader, Path(sys.argv[1])):
+for group in undecoded(reader, Path(sys.argv[1])):
     groups += 1
-    rows += sum(map(len, group))
-    del group
+    rows += sum(map(len, group.tables()))
 print(rows, groups, most_kb() - before >> 10)
 """
 

@@ -15,7 +15,7 @@ import pytest
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns import decode, fill
-from ros2_memory.columns.decode import Group, decoded, undecoded
+from ros2_memory.columns.decode import Group, undecoded
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.forget import forget
 from ros2_memory.columns.stored import StoredTable
@@ -255,6 +255,25 @@ def test_nothing_is_stored_while_messages_are_taken_out(
     assert world.fill() == 1
 
 
+def test_a_bag_that_goes_while_its_ten_minutes_are_read_leaves_nothing_in_their_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    paths = [write_bag(tmp_path, number) for number in range(4)]
+    world = World.of(tmp_path)
+
+    def gone_meanwhile(reader: BagReader, path: Path, **options: object) -> Iterator[Group]:
+        if path == paths[3]:
+            paths[1].unlink()
+        return undecoded(reader, path, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(fill, "undecoded", gone_meanwhile)
+    assert world.fill() == 3
+    assert (count(world, "bag"), count(world, "part")) == (3, 2)
+    assert count(world, "zone", "words LIKE '%word 1%'") == 0
+    assert count(world, "zone", "words LIKE '%word 2%'") == 1
+    assert check_all(world) == 3 * 21
+
+
 def test_a_split_that_is_not_released_is_not_stored(tmp_path: Path) -> None:
     screened = ScreenedBags(tmp_path)
     recording = screened.begin(0)
@@ -487,7 +506,7 @@ def test_what_another_program_deletes_while_it_is_stored_stays_deleted(tmp_path:
     write_long_bag(tmp_path)
     one = World.of(tmp_path)
     [bag] = one.memory.index.snapshot().bags
-    groups = decoded(one.memory.reader, bag.path)
+    groups = map(Group.tables, undecoded(one.memory.reader, bag.path))
 
     def deleted_meanwhile() -> Iterator[list[Table]]:
         yield next(groups)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ros2_memory.analysis.intervals import SILENCE_NS, THINNED_NS
-from ros2_memory.columns.decode import decoded
+from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.detections import DetectionColumns
 from ros2_memory.recorder.thinning import (
     EXTREMES_NS,
@@ -37,8 +37,8 @@ def times_that_stay(
     thinned = TopicThinning(DetectionColumns(shipped_extractor()), numbers_ns)
     for nth, messages in enumerate(bags):
         path = write_mcap(folder / f"{nth}.mcap", messages)
-        for tables in decoded(reader, path):
-            for table in tables:
+        for group in undecoded(reader, path):
+            for table in group.tables():
                 thinned.add(table)
         path.unlink()
     return [time - T0 for time in thinned.times().tolist()]

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import errno
+import fcntl
 import gc
 import os
 import sqlite3
@@ -422,6 +424,21 @@ def test_what_a_killed_program_had_unpacked_is_deleted_by_the_next(
         assert not abandoned.exists()
         assert size_of(in_use) > 0
         living.communicate()
+    del reader
+    gc.collect()
+    assert [*scratch_root.iterdir()] == []
+
+
+def test_folders_that_cannot_be_locked_are_used_and_deleted_in_the_end(
+    tmp_path: Path, scratch_root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    reader = Rosbag2Reader()
+    assert reader.summarize(compressed(write_db3(tmp_path / "a.db3", chatter(3)))).count == 3
+    assert [*scratch_root.iterdir()] != []
     del reader
     gc.collect()
     assert [*scratch_root.iterdir()] == []
