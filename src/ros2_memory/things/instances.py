@@ -251,10 +251,11 @@ class Estimate:
         np.maximum.at(last, cell_of, self.looks.times(looks)[1])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
-        x, y, yaw = (
-            float((column[looks] * n).sum() / n.sum())
-            for column in (self.looks.x, self.looks.y, self.looks.yaw)
-        )
+        poses = np.stack((self.looks.x[looks], self.looks.y[looks], self.looks.yaw[looks]))
+        # Headings from that of the first on: 0 and 359.9 degrees are side by side.
+        x, y, yaw = poses.astype(np.float64)
+        yaw = yaw[0] + (yaw - yaw[0] + 1800) % 3600 - 1800
+        x, y, yaw = (float((column * n).sum() / n.sum()) for column in (x, y, yaw))
         return x / 1000, y / 1000, math.radians((yaw / 10 + 180) % 360 - 180)
 
     def side_by_side(self, rows: Ints) -> int:
