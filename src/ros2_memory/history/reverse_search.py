@@ -26,7 +26,7 @@ from ros2_memory.analysis.conditions import (
     refusal_for,
     summarising,
 )
-from ros2_memory.analysis.facts import FULL_CHARGE
+from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -126,8 +126,8 @@ def condition_of(
 def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     """Checks that a charge is not compared with percent where all messages state fractions.
 
-    As sensor_msgs/BatteryState asks for; some drivers publish percent. Nothing is refused where
-    there is no time to look at all messages.
+    As sensor_msgs/BatteryState asks for; some drivers publish percent, or no charge. Nothing is
+    refused where there is no time to look at all messages.
 
     Raises:
         InvalidArgumentsError: it is.
@@ -135,10 +135,15 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     test = condition.test
     if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
         return
-    percent = replace(condition, test=Beyond(FULL_CHARGE, above=True))
     brief = View(view.memory, view.call.within(READING_S))
     try:
-        are_fractions = ReverseSearch(brief, pattern, percent).newest(MAX_NS) is None
+        charged, percent = (
+            ReverseSearch(brief, pattern, replace(condition, test=Beyond(least, above=True)))
+            for least in (0, FULL_CHARGE)
+        )
+        newest = charged.newest(MAX_NS)
+        is_charge = newest is not None and charge_of(brief.value(newest)) is not None
+        are_fractions = is_charge and percent.newest(MAX_NS) is None
     except QueryTimeoutError:
         return
     if are_fractions:
