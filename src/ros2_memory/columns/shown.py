@@ -505,7 +505,7 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
     return node
 
 
-def at_field(root: Node, dot_path: str) -> list[Spot]:
+def at_field(root: Node, dot_path: str) -> Sequence[Spot]:
     """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` finds it.
 
     Raises:
@@ -516,14 +516,19 @@ def at_field(root: Node, dot_path: str) -> list[Spot]:
     lists = (fields[key] for key in ELEMENT_NAMES if key in fields and key != head)
     names = next((node.element for node in lists if isinstance(node, Listing)), None)
     if name and head in fields and isinstance(names, Leaf) and not _INDEX.fullmatch(name):
-        named = [
-            Spot(Narrowed(_at_name(array.level, names, name), array.element), limits)
-            for array, limits in opened(Spot(fields[head]))
-            if isinstance(array, Listing) and isinstance(array.element, Leaf)
-        ]
+        named, others = list[Spot](), list[Spot]()
+        for array, limits in opened(Spot(fields[head])):
+            if isinstance(array, Listing) and isinstance(array.element, Leaf):
+                element = Narrowed(_at_name(array.level, names, name), array.element)
+                named.append(Spot(element, limits))
+            else:  # such as the summary of a long one
+                others.append(Spot(array, limits))
         if named:
-            return named
-    spots = [Spot(root)]
+            return [*named, *_along(others, name)]
+    return _along([Spot(root)], dot_path)
+
+
+def _along(spots: Sequence[Spot], dot_path: str) -> Sequence[Spot]:
     for segment in dot_path.split("."):
         spots = [target for spot in spots for target in _step(spot, segment)]
     return spots
