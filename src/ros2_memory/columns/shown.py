@@ -122,8 +122,11 @@ def _at_place(level: Level, place: int) -> Limit:
     return Limit(level, find)
 
 
-def _at_name(level: Level, names: Leaf, name: str) -> Limit:
-    """Returns the limit to the element that has this name in the list of names beside it."""
+def _at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Limit:
+    """Returns the limit to the element that has this name in the list of names beside it.
+
+    Of an array of fixed length, whose elements are columns of their own: to rows where it is `nth`.
+    """
 
     def find(values: Values, positions: Ints) -> TruthValues:
         texts, owners = values.texts(names), values.elements(names.level).owners
@@ -131,6 +134,8 @@ def _at_name(level: Level, names: Leaf, name: str) -> Limit:
         found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
         places = np.full(values.rows, -1)
         places[owners[found]] = values.places(names.level, found, from_end=False)
+        if nth is not None:
+            return TruthValues.known(places[positions] == nth)
         at = values.places(level, positions, from_end=False)
         return TruthValues.known(at == places[values.elements(level).owners[positions]])
 
@@ -516,15 +521,18 @@ def at_field(root: Node, dot_path: str) -> Sequence[Spot]:
     lists = (fields[key] for key in ELEMENT_NAMES if key in fields and key != head)
     names = next((node.element for node in lists if isinstance(node, Listing)), None)
     if name and head in fields and isinstance(names, Leaf) and not _INDEX.fullmatch(name):
-        named, others = list[Spot](), list[Spot]()
+        found = list[Spot]()
         for array, limits in opened(Spot(fields[head])):
             if isinstance(array, Listing) and isinstance(array.element, Leaf):
                 element = Narrowed(_at_name(array.level, names, name), array.element)
-                named.append(Spot(element, limits))
+                found.append(Spot(element, limits))
+            elif isinstance(array, Items):
+                for nth, leaf in enumerate(array.items):
+                    element = Narrowed(_at_name(leaf.level, names, name, nth), leaf)
+                    found.append(Spot(element, limits))
             else:  # such as the summary of a long one
-                others.append(Spot(array, limits))
-        if named:
-            return [*named, *_along(others, name)]
+                found += _along([Spot(array, limits)], name)
+        return found
     return _along([Spot(root)], dot_path)
 
 

@@ -156,6 +156,28 @@ def test_the_size_of_a_long_array_is_found_beside_a_list_of_names(tmp_path: Path
             assert match["timestamp"] == T0 / NS_PER_S + nth
 
 
+@pytest.mark.parametrize("count", [3, MAX_NUMBERS, MAX_NUMBERS + 1])
+def test_a_joint_is_found_by_its_name_in_an_array_of_fixed_length(
+    tmp_path: Path, count: int
+) -> None:
+    kind, random, bent = f"acme_msgs/msg/Arm{count}", Random(count), list[int]()
+    typestore().register(get_types_from_msg(f"string[] names\nfloat64[{count}] positions\n", kind))
+    messages = []
+    for nth in range(20):
+        names = random.sample([f"joint_{number}" for number in range(count + 1)], count)
+        angles = {name: random.random() for name in names}
+        message = make(kind, names=names, positions=np.array([*angles.values()]))
+        messages.append(Msg("/arm", kind, T0 + nth * NS_PER_S, message))
+        bent += [nth] * (angles.get("joint_1", 0.0) > 0.5)
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    given = {"condition_type": "above", "value": 0.5, "field": "positions.joint_1"}
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        last = asked(memory, tmp_path, "find_last_match", topic="/arm", **given)
+        assert last["timestamp"] == T0 / NS_PER_S + bent[-1]
+        runs = asked(memory, tmp_path, "find_matches", topic="/arm", **given, limit=100)
+        assert sum(run["count"] for run in runs["sightings"]) == len(bent)
+
+
 @pytest.mark.parametrize("more", [0, 12], ids=["few joints", "many joints"])
 def test_a_joint_is_found_by_its_name_in_whatever_order_joints_are_named(
     tmp_path: Path, more: int
