@@ -19,7 +19,7 @@ import yaml
 
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import integer
-from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, split_number
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import COMPRESSED
 
@@ -158,13 +158,8 @@ def why_not_corrected(recording: Path, reader: BagReader) -> str | None:
 
 def is_named_by_rosbag2(recording: Path) -> bool:
     """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
-    prefix = f"{recording.name}_"
-    return all(
-        path.suffix == ".mcap"
-        and path.stem.startswith(prefix)
-        and path.stem.removeprefix(prefix).isdecimal()
-        for path in _bags(recording)
-    )
+    numbers = (split_number(recording.name, path.name) for path in _bags(recording))
+    return None not in numbers
 
 
 def _bags(recording: Path) -> list[Path]:

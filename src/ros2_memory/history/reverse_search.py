@@ -138,18 +138,15 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     brief = View(view.memory, view.call.within(READING_S))
     try:
         charged, percent = (
-            ReverseSearch(brief, pattern, replace(condition, test=Beyond(least, above=True)))
-            for least in (0, FULL_CHARGE)
+            ReverseSearch(brief, pattern, replace(condition, test=beyond)).newest(MAX_NS)
+            for beyond in (Beyond(0, above=True), Beyond(FULL_CHARGE, above=True))
         )
-        newest = charged.newest(MAX_NS)
-        is_charge = newest is not None and charge_of(brief.value(newest)) is not None
-        are_fractions = is_charge and percent.newest(MAX_NS) is None
     except QueryTimeoutError:
         return
-    if are_fractions:
-        as_fraction = f"{test.limit:g} % is {test.limit / 100:g}"
+    if charged is not None and charge_of(brief.value(charged)) is not None and percent is None:
         raise InvalidArgumentsError(
-            f"value: percentage is a fraction here, from 0 to 1: {as_fraction}"
+            "value: percentage is a fraction here, from 0 to 1: "
+            f"{test.limit:g} % is {test.limit / 100:g}"
         )
 
 

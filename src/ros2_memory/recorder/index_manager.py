@@ -141,12 +141,13 @@ class IndexManager:
         alone = copy(self)
         alone._lock, alone.published = threading.Lock(), None
         only = *self._new_table.keywords["only"], recording
-        alone._new_table = partial(self._new_table, known=self._bags, only=only)
+        alone._new_table = partial(
+            self._new_table,
+            known=lambda: {bag.file: bag for bag in self.snapshot().bags},
+            only=only,
+        )
         alone._table = alone._new_table()
         return alone
-
-    def _bags(self) -> dict[str, BagFile]:
-        return {bag.file: bag for bag in self.snapshot().bags}
 
     def known_bags(self, named: Collection[str], snapshot: Snapshot) -> KnownBags:
         """Returns what retention considers, within `undisturbed`, which gave the snapshot.

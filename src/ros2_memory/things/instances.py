@@ -251,11 +251,11 @@ class Estimate:
         np.maximum.at(last, cell_of, self.looks.times(looks)[1])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
-        poses = np.stack((self.looks.x[looks], self.looks.y[looks], self.looks.yaw[looks]))
+        columns = (self.looks.x, self.looks.y, self.looks.yaw)
+        poses = np.stack([column[looks] for column in columns], dtype=np.float64)
         # Headings from that of the first on: 0 and 359.9 degrees are side by side.
-        x, y, yaw = poses.astype(np.float64)
-        yaw = yaw[0] + (yaw - yaw[0] + 1800) % 3600 - 1800
-        x, y, yaw = (float((column * n).sum() / n.sum()) for column in (x, y, yaw))
+        poses[2] = poses[2, 0] + (poses[2] - poses[2, 0] + 1800) % 3600 - 1800
+        x, y, yaw = np.average(poses, axis=1, weights=n).tolist()
         return x / 1000, y / 1000, math.radians((yaw / 10 + 180) % 360 - 180)
 
     def side_by_side(self, rows: Ints) -> int:

@@ -416,10 +416,7 @@ def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
 
 def _are_in(ordered: Ints, keys: Ints) -> Flags:
     """Returns which keys are among some that are in order."""
-    if not len(ordered):
-        return np.zeros(len(keys), bool)
-    rows = np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)
-    are_in: Flags = ordered[rows] == keys
+    are_in: Flags = np.append(ordered, -1)[np.searchsorted(ordered, keys)] == keys
     return are_in
 
 
