@@ -178,7 +178,7 @@ def running_server(
     (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
         server = Child.start(
-            [sys.executable, "-m", "ros2_memory.server", "--page", "print"],
+            [sys.executable, "-P", "-m", "ros2_memory.server", "--page", "print"],
             server_environment(os.environ, bag_dir, port, cache),
             stderr=None if verbose else subprocess.STDOUT,
         )
