@@ -20,10 +20,9 @@ from ros2_memory.analysis.conditions import (
     Contains,
     Equals,
     NearPosition,
-    is_unknown_below,
-    lacks_name,
     parse_condition,
     refusal_for,
+    shows_field,
     summarising,
 )
 from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
@@ -188,10 +187,8 @@ def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...
     """Returns the note for "never" on a limit of scores that was not asked for, or is above 1."""
     if not condition.min_score or (min_score is not None and min_score <= 1):
         return ()
-    least = f"detections with a score below {condition.min_score:g} do not count here"
-    if min_score is not None:
-        return (f"{least}, and most scores are from 0 to 1",)
-    return (f"{least}, unless min_score is given",)
+    unless = "and most scores are from 0 to 1" if min_score else "unless min_score is given"
+    return (f"detections with a score below {condition.min_score:g} do not count here, {unless}",)
 
 
 def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
@@ -593,17 +590,12 @@ class ReverseSearch:
         if newest is None or value is None:
             return None
         field, test = self.condition.field or "", self.condition.test
-
-        def is_open(value: JsonValue) -> bool:
-            return is_unknown_below(value, field) or lacks_name(value, field)
-
-        if field and is_open(value):
+        if field and not shows_field(value, field):
             # An empty list does not show what its elements have, nor a part of the joints the rest.
             window = TimeWindow(MIN_NS, newest.time)
             older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            shows_field = (older for older in values if not is_open(older))
-            value = next(shows_field, value)
+            value = next((older for older in values if shows_field(older, field)), value)
         refusal = refusal_for(self.condition, value)
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:

@@ -84,10 +84,8 @@ class Cells:
 
     def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
         looks = self._looks = sights.looks
-        # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.slice, self.n, self.first, self.last, self.topic = (
-            np.ascontiguousarray(looks[:, column])
-            for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
+            looks[:, column] for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)

@@ -207,8 +207,7 @@ def vague_notes(
     estimate, spots = known.estimate, known.estimate.spots
     labels = {*also}
     for window in windows if estimate.poor.any() else ():
-        during = _during(window, spots, Spot.FIRST, Spot.LAST)
-        during = during[estimate.counts[during] > 0]
+        during = estimate.seen_in(np.arange(len(spots)), window)
         for label in np.unique(spots[during, Spot.LABEL]).tolist():
             key = known.labels.key(estimate.labels[label])
             if not keys or key in keys:
