@@ -174,7 +174,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     """
     channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
-    info = _information(content)
+    info = _mapping(_mapping(content, "it").get(_ROOT), _ROOT)
     kind = _STORAGES.get(str(info.get("storage_identifier")), "")
     kind += COMPRESSED if info.get("compression_mode") == "FILE" else ""
     if any(bag_kind(name) != kind for name in files):
@@ -346,10 +346,6 @@ def _parse(text: str) -> object:
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError("it is not YAML") from error
     return value
-
-
-def _information(content: object) -> dict[object, object]:
-    return _mapping(_mapping(content, "it").get(_ROOT), _ROOT)
 
 
 def _mapping(value: object, name: str) -> dict[object, object]:
