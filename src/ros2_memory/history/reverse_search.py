@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -231,8 +232,10 @@ def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str
     if "fix_status" not in mapped or not _IN_DEGREES.intersection(fields):
         return
     no_fix = Condition(Beyond(0, above=False), "fix_status")
-    newest = ReverseSearch(view, topic, no_fix).newest(window.stop)
-    if newest is not None and newest.time >= window.start:
+    newest = None
+    with suppress(QueryTimeoutError):
+        newest = ReverseSearch(view, topic, no_fix).newest(window.stop, window.start)
+    if newest is not None:
         view.notes.add(
             f"until {unix_text(newest.time)} some messages have no fix (fix_status -1): their "
             "latitude, longitude and altitude are not its position, but count here"
@@ -509,32 +512,32 @@ class ReverseSearch:
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
 
-    def newest(self, until: Ns) -> StoredMessage | None:
+    def newest(self, until: Ns, since: Ns = MIN_NS) -> StoredMessage | None:
         """Returns the newest match before a moment; notes report what could not be tested.
 
-        Reads the messages whose columns may match, until one does.
+        Reads the messages whose columns may match, until one does; none before `since`.
 
         Raises:
             InvalidArgumentsError: no value of the topics can meet the condition.
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
-        everything = TimeWindow(MIN_NS, until)
-        candidates = CandidateRows(self._view, self.topics, self.condition, everything)
+        window = TimeWindow(since, until)
+        candidates = CandidateRows(self._view, self.topics, self.condition, window)
         noted_before = self._view.notes.keys()
         try:
             for stored in candidates.messages():
                 if self.matches(stored):
-                    since = TimeWindow(stored.time, MAX_NS)
-                    self._view.notes.retract_outside(since, keep=noted_before)
+                    read = TimeWindow(stored.time, MAX_NS)
+                    self._view.notes.retract_outside(read, keep=noted_before)
                     self._view.stream.find_first_copy(stored)
-                    self.note_untested(since.intersect(everything))
+                    self.note_untested(read.intersect(window))
                     return stored
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
-        self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
+        self.close(window, is_found=False, ruled_out=candidates.ruled_out)
         return None
 
     def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:

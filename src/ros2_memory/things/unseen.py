@@ -164,8 +164,9 @@ def _found_in_singular(
     other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
     stored = None
     with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
-        stored = ReverseSearch(view, topic, replace(condition, test=other)).newest(window.stop)
-    if stored is None or stored.time < window.start:
+        search = ReverseSearch(view, topic, replace(condition, test=other))
+        stored = search.newest(window.stop, window.start)
+    if stored is None:
         return ()
     at = unix_text(stored.time)
     return (f"{abbreviate(text)} was not found, but {abbreviate(one)} was, last at {at}",)
