@@ -295,7 +295,7 @@ def _end_threads(code: int) -> int:
 
 def _helper(overrides: Sequence[str], *options: str) -> list[str]:
     """Returns the command line of the program that stores a backlog."""
-    program = [sys.executable, "-m", "ros2_memory.cli", "index"]
+    program = [sys.executable, "-P", "-m", "ros2_memory.cli", "index"]
     return [*program, "--for-server", str(os.getpid()), *options, "--", *overrides]
 
 

@@ -38,7 +38,11 @@ def scratch(tmp_path: Path) -> Path:
     return folder
 
 
-def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(scratch: Path) -> None:
+def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(
+    tmp_path: Path, scratch: Path
+) -> None:
+    # What lies in the folder where somebody tries it is no part of it.
+    (tmp_path / "mcp.py").write_text("raise SystemExit('another mcp')\n")
     done = subprocess.run(
         [*PROGRAM, "--once", "--port", "0"],
         capture_output=True,
@@ -46,6 +50,7 @@ def test_once_it_answers_every_question_rightly_and_leaves_nothing_behind(scratc
         timeout=PATIENCE_S,
         check=False,
         env=environment(scratch),
+        cwd=tmp_path,
     )
     assert (done.returncode, done.stderr) == (0, ""), done.stdout + done.stderr
     for question in QUESTIONS:

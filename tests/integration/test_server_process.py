@@ -114,6 +114,7 @@ def test_serve_and_a_path_need_nothing_else(bag_dir: Path, tmp_path: Path) -> No
     beside.mkdir()
     (beside / "places.yaml").write_text("places: {}\n")
     (beside / "config.yaml").write_text("server: {page: false}\n")
+    (tmp_path / "mcp.py").write_text("raise SystemExit('another mcp')\n")
     env = environment(tmp_path / "elsewhere", MCP_PORT="0", DISPLAY=":99", BROWSER="false")
     del env["MEMORY_BAG_DIR"]
     program = [sys.executable, "-m", "ros2_memory.cli", "serve", str(bag_dir)]

@@ -29,6 +29,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.memories import asked, each_way, memory_of, with_store
+from tests.support.noting_reader import NotingReader
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -281,6 +282,19 @@ def test_numbers_without_a_fix_are_told_where_they_count(tmp_path: Path) -> None
         assert "have no fix (fix_status -1)" in told[0]
     before = ask(tmp_path, False, "get_topic_in_range", end=T0_S + 3, **height)
     assert not any("no fix" in note for note in before.get("notes", ()))
+
+
+def test_numbers_without_a_fix_are_looked_for_in_the_window_alone(tmp_path: Path) -> None:
+    for n in range(9):
+        write_mcap(tmp_path / f"bag_{n}.mcap", [fix(T0 + n * S, 0.0, 0.0, 0)])
+    reader = NotingReader()
+    memory = memory_of(tmp_path, reader=reader)
+    memory.index.snapshot()
+    reader.asked.clear()
+    given = {"topic": "/fix", "fields": ["altitude"], "start": T0_S + 8, "end": T0_S + 9}
+    reply = asked(memory, tmp_path, "get_topic_in_range", **given)
+    assert "altitude" in str(reply)
+    assert not {*reader.names} & {f"bag_{n}.mcap" for n in range(5)}
 
 
 def test_the_axes_of_a_north_east_down_frame_are_told(tmp_path: Path) -> None:

@@ -601,7 +601,7 @@ def refusal_for(condition: Condition, value: JsonValue) -> str | None:
     """
     targets = [value]
     if condition.field is not None:
-        if is_unknown_below(value, condition.field):
+        if _is_unknown_below(value, condition.field):
             return None
         targets = at_field(value, condition.field)
         if not targets:
@@ -681,15 +681,17 @@ def _plain_text(test: Test) -> str | None:
     return needle if isinstance(needle, str) and _meaning(needle) is None else None
 
 
-def is_unknown_below(value: JsonValue, dot_path: str) -> bool:
+def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
     beginnings = chain.from_iterable(_along(value, dot_path)[:-1])
     return any(target is None or target == [] for target in beginnings)
 
 
-def lacks_name(value: JsonValue, dot_path: str) -> bool:
-    """Returns whether another value may have a named element that this one does not have."""
-    return bool(names_beside(value, dot_path)) and not at_field(value, dot_path)
+def shows_field(value: JsonValue, dot_path: str) -> bool:
+    """Returns whether others lack what this value lacks; not below an empty list, nor by a name."""
+    if _is_unknown_below(value, dot_path):
+        return False
+    return bool(at_field(value, dot_path)) or not names_beside(value, dot_path)
 
 
 def _has_unknown_part(value: JsonValue) -> bool:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from ros2_memory.core.arrays import Groups, distinct_rows, rows_of
 from ros2_memory.core.text import MAX_LABEL_CHARS, shortened
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, NS_PER_US
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -61,7 +61,6 @@ _MAX_COMPARED: Final = 128
 _MAX_AWAY_M: Final = 1e8
 """From the origin: UTM has ten thousand kilometres, and squares of more are beyond 63 bits."""
 _MAX_SCORE: Final = 1e6
-_NS_PER_US: Final = 1_000
 _TOGETHER_MESSAGES: Final = 3
 
 
@@ -451,4 +450,4 @@ def bin_of(thousandths: Ints) -> Ints:
 def _rounded(times: Ints) -> Ints:
     """Rounds log times (ns) up to 1 us: a message is never later than the time that is shown."""
     # The last microsecond is not whole: its end is no time.
-    return np.minimum(-(-times // _NS_PER_US), MAX_NS // _NS_PER_US) * _NS_PER_US
+    return np.minimum(-(-times // NS_PER_US), MAX_NS // NS_PER_US) * NS_PER_US

@@ -197,6 +197,15 @@ def bag_kind(name: str) -> str | None:
     return next(kind for kind in BAG_KINDS if lowered.endswith(kind))
 
 
+def bags_in(folder: Path) -> list[Path]:
+    """Returns the bag files in a directory.
+
+    Raises:
+        OSError: it cannot be listed.
+    """
+    return sorted(path for path in folder.iterdir() if bag_kind(path.name))
+
+
 def other_form(path: str) -> str:
     """Returns the name of the same bag compressed as a whole, or decompressed."""
     return path.removesuffix(COMPRESSED) if path.endswith(COMPRESSED) else path + COMPRESSED

@@ -19,7 +19,7 @@ import yaml
 
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import integer
-from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
+from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, bags_in, split_number
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import COMPRESSED
 
@@ -129,7 +129,7 @@ def correct(recording: Path, reader: BagReader) -> bool:
         ValueError: a file is incomplete, or metadata.yaml is of an unknown form; it is unchanged.
     """
     path = recording / METADATA_FILE
-    files = _bags(recording)
+    files = bags_in(recording)
     text = ""
     with suppress(FileNotFoundError):
         text = read_small_file(path)
@@ -158,17 +158,8 @@ def why_not_corrected(recording: Path, reader: BagReader) -> str | None:
 
 def is_named_by_rosbag2(recording: Path) -> bool:
     """Returns whether the bags of a recording are MCAP files with the names that rosbag2 gives."""
-    prefix = f"{recording.name}_"
-    return all(
-        path.suffix == ".mcap"
-        and path.stem.startswith(prefix)
-        and path.stem.removeprefix(prefix).isdecimal()
-        for path in _bags(recording)
-    )
-
-
-def _bags(recording: Path) -> list[Path]:
-    return [path for path in recording.iterdir() if bag_kind(path.name)]
+    numbers = (split_number(recording.name, path.name) for path in bags_in(recording))
+    return None not in numbers
 
 
 def describing(text: str, files: Mapping[str, Contents]) -> str:
@@ -183,7 +174,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     """
     channels = [channel for contents in files.values() for channel in contents.channels]
     content: object = _parse(text) if text else {_ROOT: _new_information(channels)}
-    info = _information(content)
+    info = _mapping(_mapping(content, "it").get(_ROOT), _ROOT)
     kind = _STORAGES.get(str(info.get("storage_identifier")), "")
     kind += COMPRESSED if info.get("compression_mode") == "FILE" else ""
     if any(bag_kind(name) != kind for name in files):
@@ -355,10 +346,6 @@ def _parse(text: str) -> object:
     except (yaml.YAMLError, RecursionError) as error:
         raise ValueError("it is not YAML") from error
     return value
-
-
-def _information(content: object) -> dict[object, object]:
-    return _mapping(_mapping(content, "it").get(_ROOT), _ROOT)
 
 
 def _mapping(value: object, name: str) -> dict[object, object]:

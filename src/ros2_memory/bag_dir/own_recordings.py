@@ -44,6 +44,7 @@ from ros2_memory.bag_dir.layout import (
     LIST_FILE,
     LOST_AND_FOUND,
     bag_kind,
+    bags_in,
     has_own_name,
     is_kept_apart,
     split_name,
@@ -580,15 +581,6 @@ def is_regular(path: Path) -> bool:
         OSError: it cannot be looked up.
     """
     return stat.S_ISREG(mode_of(path))
-
-
-def bags_in(folder: Path) -> list[Path]:
-    """Returns the bag files in a directory.
-
-    Raises:
-        OSError: it cannot be listed.
-    """
-    return sorted(path for path in folder.iterdir() if bag_kind(path.name))
 
 
 def _give_to_owner(path: Path, bag_dir: Path) -> None:

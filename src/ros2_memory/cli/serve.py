@@ -27,6 +27,6 @@ def serve(
         options = ["--page", "print" if no_open else "open"]
         if "MCP_TRANSPORT" not in os.environ:
             given.insert(0, "server.transport=sse")
-    program = [sys.executable, "-m", "ros2_memory.server", *options, *given]
+    program = [sys.executable, "-P", "-m", "ros2_memory.server", *options, *given]
     # In place of this process, whose signals and garbage collection are those of a short command.
     os.execv(sys.executable, program)  # noqa: S606 - there is nothing for a shell to do

@@ -362,7 +362,7 @@ def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
     modules = {"recorder": ["recorder"], "server": ["server", "--page", "print"]}
     try:
         for name, (module, *options) in modules.items():
-            argv = ["-m", f"ros2_memory.{module}", *options, *words, *_LOGGING]
+            argv = ["-P", "-m", f"ros2_memory.{module}", *options, *words, *_LOGGING]
             programs[name] = Child.start([sys.executable, *argv], os.environ, patience=_PATIENCE)
         died = _watch(programs, bag_dir)
     except KeyboardInterrupt:

@@ -122,8 +122,11 @@ def _at_place(level: Level, place: int) -> Limit:
     return Limit(level, find)
 
 
-def _at_name(level: Level, names: Leaf, name: str) -> Limit:
-    """Returns the limit to the element that has this name in the list of names beside it."""
+def _at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Limit:
+    """Returns the limit to the element that has this name in the list of names beside it.
+
+    Of an array of fixed length, whose elements are columns of their own: to rows where it is `nth`.
+    """
 
     def find(values: Values, positions: Ints) -> TruthValues:
         texts, owners = values.texts(names), values.elements(names.level).owners
@@ -131,6 +134,8 @@ def _at_name(level: Level, names: Leaf, name: str) -> Limit:
         found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
         places = np.full(values.rows, -1)
         places[owners[found]] = values.places(names.level, found, from_end=False)
+        if nth is not None:
+            return TruthValues.known(places[positions] == nth)
         at = values.places(level, positions, from_end=False)
         return TruthValues.known(at == places[values.elements(level).owners[positions]])
 
@@ -505,7 +510,7 @@ def descend(node: Node, path: Sequence[str]) -> Node | None:
     return node
 
 
-def at_field(root: Node, dot_path: str) -> list[Spot]:
+def at_field(root: Node, dot_path: str) -> Sequence[Spot]:
     """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` finds it.
 
     Raises:
@@ -516,14 +521,22 @@ def at_field(root: Node, dot_path: str) -> list[Spot]:
     lists = (fields[key] for key in ELEMENT_NAMES if key in fields and key != head)
     names = next((node.element for node in lists if isinstance(node, Listing)), None)
     if name and head in fields and isinstance(names, Leaf) and not _INDEX.fullmatch(name):
-        named = [
-            Spot(Narrowed(_at_name(array.level, names, name), array.element), limits)
-            for array, limits in opened(Spot(fields[head]))
-            if isinstance(array, Listing) and isinstance(array.element, Leaf)
-        ]
-        if named:
-            return named
-    spots = [Spot(root)]
+        found = list[Spot]()
+        for array, limits in opened(Spot(fields[head])):
+            if isinstance(array, Listing) and isinstance(array.element, Leaf):
+                element = Narrowed(_at_name(array.level, names, name), array.element)
+                found.append(Spot(element, limits))
+            elif isinstance(array, Items):
+                for nth, leaf in enumerate(array.items):
+                    element = Narrowed(_at_name(leaf.level, names, name, nth), leaf)
+                    found.append(Spot(element, limits))
+            else:  # such as the summary of a long one
+                found += _along([Spot(array, limits)], name)
+        return found
+    return _along([Spot(root)], dot_path)
+
+
+def _along(spots: Sequence[Spot], dot_path: str) -> Sequence[Spot]:
     for segment in dot_path.split("."):
         spots = [target for spot in spots for target in _step(spot, segment)]
     return spots

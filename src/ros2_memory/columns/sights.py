@@ -31,6 +31,7 @@ from ros2_memory.analysis.sights import (
 )
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed
 from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +41,7 @@ if TYPE_CHECKING:
     Bytes = NDArray[np.uint8]
 
 _HEAD: Final = Struct(f"<Bq{len(TABLES) + 1}I")
-_NS_PER_US: Final = 1_000
-_SLICE_US: Final = SLICE_NS // _NS_PER_US
+_SLICE_US: Final = SLICE_NS // NS_PER_US
 _SIGN: Final = 63
 _SPOTS, _LOOKS, _HITS, _SCORES, _BESIDE, _UNPLACED, _FIXES = range(len(TABLES))
 _NAMED: Final = (
@@ -77,8 +77,8 @@ def packed(sights: Sights) -> bytes:
         if times is not None:
             if times.last is not None:
                 columns[times.last] -= columns[times.first]
-                columns[times.last] //= _NS_PER_US
-            columns[times.first] //= _NS_PER_US
+                columns[times.last] //= NS_PER_US
+            columns[times.first] //= NS_PER_US
             columns[times.first] -= columns[0] * _SLICE_US
             columns[0] -= begin
         steps = np.diff(columns, axis=1, prepend=0)
@@ -165,9 +165,9 @@ def _unpacked(
     for at, times in _IN_SLICES.items():
         table = tables[at]
         table[0] += starts[part_of[at]]
-        table[times.first] = (table[times.first] + table[0] * _SLICE_US) * _NS_PER_US
+        table[times.first] = (table[times.first] + table[0] * _SLICE_US) * NS_PER_US
         if times.last is not None:
-            table[times.last] = table[times.last] * _NS_PER_US + table[times.first]
+            table[times.last] = table[times.last] * NS_PER_US + table[times.first]
     for at in (_HITS, _SCORES, _BESIDE):
         tables[at][0] += (np.cumsum(sizes[_SPOTS]) - sizes[_SPOTS])[part_of[at]]
     look = tables[_HITS][Hit.LOOK]
@@ -189,7 +189,9 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
     """Returns the columns of a table; `planes` of parts are by column, and by byte of a number."""
     width = max((block.shape[1] for block in planes), default=4)
     wide = [np.zeros((len(TABLES[at]), width, 0), np.uint8)]
-    wide += [block if block.shape[1] == width else _widened(block) for block in planes]
+    for block in planes:
+        has_width = block.shape[1] == width
+        wide.append(block if has_width else np.concatenate((block, np.zeros_like(block)), axis=1))
     stacked = np.ascontiguousarray(np.concatenate(wide, axis=2).transpose(0, 2, 1))
     coded = stacked.view(f"<u{width}")[:, :, 0]
     steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
@@ -200,11 +202,6 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
         np.cumsum(of_column, out=column)
         np.subtract(column, np.repeat(column[firsts] - of_column[firsts], sizes), out=column)
     return columns
-
-
-def _widened(planes: Bytes) -> Bytes:
-    """Returns planes of numbers of 4 bytes as those of 8."""
-    return np.concatenate((planes, np.zeros_like(planes)), axis=1)
 
 
 def _ordered(table: Ints, keys: int) -> tuple[Ints, Ints]:

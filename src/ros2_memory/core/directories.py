@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 LINK_NOT_FOLLOWED: Final = "it lies behind a symbolic link, which is not followed"
 
@@ -113,7 +113,9 @@ def is_folder(path: Path) -> bool:
     return stat.S_ISDIR(mode_of(path))
 
 
-def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
+def walk(
+    root: Path, on_error: Callable[[OSError], object] = lambda _: None
+) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
     """Yields a directory and each below it, with their entries; skips what cannot be listed.
 
     The root may be a link; none below it is followed.
@@ -121,10 +123,13 @@ def walk(root: Path) -> Iterator[tuple[str, list[os.DirEntry[str]]]]:
     waiting = [os.fspath(root)]
     while waiting:
         path = waiting.pop()
-        with suppress(OSError):
+        try:
             with os.scandir(path) as listing:
                 entries = list(listing)
             waiting.extend(entry.path for entry in entries if entry.is_dir(follow_symlinks=False))
+        except OSError as error:
+            on_error(error)
+        else:
             yield path, entries
 
 

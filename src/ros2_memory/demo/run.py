@@ -118,7 +118,6 @@ _UP_WITHIN_S: Final = 300.0
 _SAID_AFTER_S: Final = 5.0
 _LOOKED_AT_S: Final = 0.5
 _LOG_LINES_SHOWN: Final = 8
-_ANOTHER_PORT: Final = "choose another with --port, or --port 0 for any"
 
 
 def free_port(wanted: int) -> int:
@@ -136,7 +135,8 @@ def free_port(wanted: int) -> int:
     except OSError as error:
         in_use = error.errno == errno.EADDRINUSE
         why = "is in use by another program" if in_use else f"cannot be opened ({error})"
-        raise ConfigError(f"port {wanted} on {HOST} {why}; {_ANOTHER_PORT}") from error
+        another = "choose another with --port, or --port 0 for any"
+        raise ConfigError(f"port {wanted} on {HOST} {why}; {another}") from error
 
 
 def server_environment(
@@ -178,7 +178,7 @@ def running_server(
     (bag_dir / PLACES_NAME).write_text(yaml.safe_dump({"places": places}, sort_keys=False))
     with TemporaryDirectory(prefix="ros2-memory-demo-cache-", ignore_cleanup_errors=True) as cache:
         server = Child.start(
-            [sys.executable, "-m", "ros2_memory.server", "--page", "print"],
+            [sys.executable, "-P", "-m", "ros2_memory.server", "--page", "print"],
             server_environment(os.environ, bag_dir, port, cache),
             stderr=None if verbose else subprocess.STDOUT,
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import heapq
 import re
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -20,13 +21,12 @@ from ros2_memory.analysis.conditions import (
     Contains,
     Equals,
     NearPosition,
-    is_unknown_below,
-    lacks_name,
     parse_condition,
     refusal_for,
+    shows_field,
     summarising,
 )
-from ros2_memory.analysis.facts import FULL_CHARGE
+from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
 from ros2_memory.columns.shown import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
@@ -127,8 +127,8 @@ def condition_of(
 def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     """Checks that a charge is not compared with percent where all messages state fractions.
 
-    As sensor_msgs/BatteryState asks for; some drivers publish percent. Nothing is refused where
-    there is no time to look at all messages.
+    As sensor_msgs/BatteryState asks for; some drivers publish percent, or no charge. Nothing is
+    refused where there is no time to look at all messages.
 
     Raises:
         InvalidArgumentsError: it is.
@@ -136,16 +136,18 @@ def _require_fraction(view: View, pattern: str, condition: Condition) -> None:
     test = condition.test
     if condition.field != "percentage" or not isinstance(test, Beyond) or test.limit <= FULL_CHARGE:
         return
-    percent = replace(condition, test=Beyond(FULL_CHARGE, above=True))
     brief = View(view.memory, view.call.within(READING_S))
     try:
-        are_fractions = ReverseSearch(brief, pattern, percent).newest(MAX_NS) is None
+        charged, percent = (
+            ReverseSearch(brief, pattern, replace(condition, test=beyond)).newest(MAX_NS)
+            for beyond in (Beyond(0, above=True), Beyond(FULL_CHARGE, above=True))
+        )
     except QueryTimeoutError:
         return
-    if are_fractions:
-        as_fraction = f"{test.limit:g} % is {test.limit / 100:g}"
+    if charged is not None and charge_of(brief.value(charged)) is not None and percent is None:
         raise InvalidArgumentsError(
-            f"value: percentage is a fraction here, from 0 to 1: {as_fraction}"
+            "value: percentage is a fraction here, from 0 to 1: "
+            f"{test.limit:g} % is {test.limit / 100:g}"
         )
 
 
@@ -187,10 +189,8 @@ def score_limit(condition: Condition, min_score: float | None) -> tuple[str, ...
     """Returns the note for "never" on a limit of scores that was not asked for, or is above 1."""
     if not condition.min_score or (min_score is not None and min_score <= 1):
         return ()
-    least = f"detections with a score below {condition.min_score:g} do not count here"
-    if min_score is not None:
-        return (f"{least}, and most scores are from 0 to 1",)
-    return (f"{least}, unless min_score is given",)
+    unless = "and most scores are from 0 to 1" if min_score else "unless min_score is given"
+    return (f"detections with a score below {condition.min_score:g} do not count here, {unless}",)
 
 
 def named_numbers(view: View, topics: Sequence[str], condition: Condition) -> tuple[str, ...]:
@@ -233,8 +233,10 @@ def note_no_fix(view: View, topic: str, window: TimeWindow, fields: Sequence[str
     if "fix_status" not in mapped or not _IN_DEGREES.intersection(fields):
         return
     no_fix = Condition(Beyond(0, above=False), "fix_status")
-    newest = ReverseSearch(view, topic, no_fix).newest(window.stop)
-    if newest is not None and newest.time >= window.start:
+    newest = None
+    with suppress(QueryTimeoutError):
+        newest = ReverseSearch(view, topic, no_fix).newest(window.stop, window.start)
+    if newest is not None:
         view.notes.add(
             f"until {unix_text(newest.time)} some messages have no fix (fix_status -1): their "
             "latitude, longitude and altitude are not its position, but count here"
@@ -518,32 +520,32 @@ class ReverseSearch:
         self._failures: dict[tuple[str, str], tuple[UndecodableError, Ns]] = {}
         self._has_decoded = False
 
-    def newest(self, until: Ns) -> StoredMessage | None:
+    def newest(self, until: Ns, since: Ns = MIN_NS) -> StoredMessage | None:
         """Returns the newest match before a moment; notes report what could not be tested.
 
-        Reads the messages whose columns may match, until one does.
+        Reads the messages whose columns may match, until one does; none before `since`.
 
         Raises:
             InvalidArgumentsError: no value of the topics can meet the condition.
             NoDataError: no message could be decoded.
             QueryTimeoutError: the call's time is over; reports how far back was searched.
         """
-        everything = TimeWindow(MIN_NS, until)
-        candidates = CandidateRows(self._view, self.topics, self.condition, everything)
+        window = TimeWindow(since, until)
+        candidates = CandidateRows(self._view, self.topics, self.condition, window)
         noted_before = self._view.notes.keys()
         try:
             for stored in candidates.messages():
                 if self.matches(stored):
-                    since = TimeWindow(stored.time, MAX_NS)
-                    self._view.notes.retract_outside(since, keep=noted_before)
+                    read = TimeWindow(stored.time, MAX_NS)
+                    self._view.notes.retract_outside(read, keep=noted_before)
                     self._view.stream.find_first_copy(stored)
-                    self.note_untested(since.intersect(everything))
+                    self.note_untested(read.intersect(window))
                     return stored
         except QueryTimeoutError as error:
             if not candidates.has_looked:
                 raise
             raise out_of_time(self._view, candidates.reached) from error
-        self.close(everything, is_found=False, ruled_out=candidates.ruled_out)
+        self.close(window, is_found=False, ruled_out=candidates.ruled_out)
         return None
 
     def close(self, window: TimeWindow, *, is_found: bool, ruled_out: bool) -> None:
@@ -599,17 +601,12 @@ class ReverseSearch:
         if newest is None or value is None:
             return None
         field, test = self.condition.field or "", self.condition.test
-
-        def is_open(value: JsonValue) -> bool:
-            return is_unknown_below(value, field) or lacks_name(value, field)
-
-        if field and is_open(value):
+        if field and not shows_field(value, field):
             # An empty list does not show what its elements have, nor a part of the joints the rest.
             window = TimeWindow(MIN_NS, newest.time)
             older = self._view.stream.messages([topic], window, newest_first=True)
             values = map(self._view.value, islice(older, _MOST_EMPTY))
-            shows_field = (older for older in values if not is_open(older))
-            value = next(shows_field, value)
+            value = next((older for older in values if shows_field(older, field)), value)
         refusal = refusal_for(self.condition, value)
         word = test.folded if isinstance(test, Contains | Equals) else None
         if refusal is None or word is None:

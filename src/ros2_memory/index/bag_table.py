@@ -23,7 +23,7 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Mapping
+    from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
@@ -95,7 +95,7 @@ class BagTable:
         reader: BagReader,
         *,
         known: Callable[[], Mapping[str, BagFile]] | None,
-        only: str | None = None,
+        only: Sequence[str] = (),
         packs: bool = False,
         setting: str = BAG_DIR_SETTING,
     ) -> None:

@@ -45,15 +45,13 @@ _OVERLAPS: Final[Key[tuple[Overlapping, ...]]] = Key()
 """Of a timeline: its pairs, but for their handovers."""
 
 
-def paths_named(root: str, name: str) -> re.Pattern[str]:
+def paths_named(path: str) -> re.Pattern[str]:
     """Returns what the paths of a recording match.
 
-    Args:
-        root: the bag directory.
-        name: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
-            and its like).
+    `path` is that of a folder, a bag, or the bags of one series (`run` for `run_0.mcap` and its
+    like).
     """
-    return re.compile(re.escape(f"{root.rstrip('/')}/{name.strip('/')}") + _OF_NAME)
+    return re.compile(re.escape(path) + _OF_NAME)
 
 
 def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:

@@ -25,7 +25,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
 
 
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
@@ -179,7 +179,7 @@ class Tree:
     Args:
         root: the directory.
         only: a path below it, of a folder, a bag, or the bags of one series (`run` for `run_0.mcap`
-            and its like): nothing else is found then.
+            and its like): nothing else is found then. Of several, what all of them name.
         setting: the one that names the root, for sentences.
 
     Attributes:
@@ -187,13 +187,13 @@ class Tree:
     """
 
     def __init__(
-        self, root: Path, only: str | None = None, *, setting: str = BAG_DIR_SETTING
+        self, root: Path, only: Sequence[str] = (), *, setting: str = BAG_DIR_SETTING
     ) -> None:
         self._root = str(root)
         self._setting = setting
         self._only = only
-        self._only_path = None if only is None else f"{self._root.rstrip('/')}/{only.strip('/')}"
-        self._named = None if only is None else paths_named(self._root, only)
+        paths = (f"{self._root.rstrip('/')}/{name.strip('/')}" for name in only)
+        self._named = [(path, paths_named(path).fullmatch) for path in paths]
         self._folders: dict[str, _Folder] = {}
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
@@ -219,7 +219,7 @@ class Tree:
             and self._only
             and not any(folder.files or folder.odd for folder in folders)
         ):
-            problem = f"no bag is named {self._only} (data.recording)"
+            problem = f"no bag is named {self._only[-1]} (data.recording)"
         if problem is not None:
             self._folders = {}
             result = ScanResult(problem=problem)
@@ -343,10 +343,9 @@ class Tree:
         folder.find_sidecar(path)
         with os.scandir(path) as entries:
             for entry in entries:
-                if (
-                    self._named is None
-                    or self._named.fullmatch(entry.path)
-                    or (self._only_path or "").startswith(f"{entry.path}/")
+                if all(
+                    is_inside(entry.path) or path.startswith(f"{entry.path}/")
+                    for path, is_inside in self._named
                 ):
                     folder.enter(entry, stamps)
         return folder

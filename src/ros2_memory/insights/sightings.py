@@ -135,8 +135,7 @@ def find_matches(
     note_robots_on(view, topics, searched)
     note_unread(view, searched, nothing=total == 0, search=True)
     if total == 0:
-        silences = describe_silences(view, topics, searched)
-        view.notes.add(*silences)
+        view.notes.add(*describe_silences(view, topics, searched))
     view.notes.add(*compared_frames(view, topics, condition), *scope.compared_frames)
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()

@@ -95,7 +95,13 @@ class IndexManager:
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
         self._new_table = partial(
-            BagTable, bag_dir, reader, known=known, only=only, packs=packs, setting=setting
+            BagTable,
+            bag_dir,
+            reader,
+            known=known,
+            packs=packs,
+            setting=setting,
+            only=() if only is None else (only,),
         )
         self._table = self._new_table()
 
@@ -131,15 +137,17 @@ class IndexManager:
             yield self._scan(patrolling=patrolling)
 
     def alone(self, recording: str) -> IndexManager:
-        """Returns the index of one recording; it reads no bag that this one has read."""
+        """Returns the index of one recording of these; it reads no bag that this one has read."""
         alone = copy(self)
         alone._lock, alone.published = threading.Lock(), None
-        alone._new_table = partial(self._new_table, known=self._bags, only=recording)
+        only = *self._new_table.keywords["only"], recording
+        alone._new_table = partial(
+            self._new_table,
+            known=lambda: {bag.file: bag for bag in self.snapshot().bags},
+            only=only,
+        )
         alone._table = alone._new_table()
         return alone
-
-    def _bags(self) -> dict[str, BagFile]:
-        return {bag.file: bag for bag in self.snapshot().bags}
 
     def known_bags(self, named: Collection[str], snapshot: Snapshot) -> KnownBags:
         """Returns what retention considers, within `undisturbed`, which gave the snapshot.

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
+    LOST_AND_FOUND,
     METADATA_FILE,
     MOMENT_FILE,
     MOMENTS_FOLDER,
@@ -53,13 +54,13 @@ class Cleared:
             if status.st_dev == device:
                 self.bytes += remove_bag(root, bag, (device, status.st_ino))
                 self.files += 1
-        except FileNotFoundError:
-            return
         except OSError as error:
             self.add_fault(bag, error)
 
-    def add_fault(self, path: Path, error: OSError) -> None:
-        """Adds a sentence, or only counts it once there are `MOST_FAULTS`."""
+    def add_fault(self, path: Path | str, error: OSError) -> None:
+        """Adds a sentence, or only counts it once there are `MOST_FAULTS`; not of what has gone."""
+        if isinstance(error, FileNotFoundError):
+            return
         if len(self.faults) < MOST_FAULTS:
             self.faults.append(f"{path} cannot be deleted: {error.strerror or error}")
         else:
@@ -81,12 +82,18 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
     except OSError as error:
         cleared.add_fault(root, error)
         return cleared
-    moments, touched = root / MOMENTS_FOLDER, list[Path]()
-    for path, entries in directories.walk(root):
-        name = path[len(str(root)) + 1 :]
-        if "/." in f"/{name}":
+    touched: list[tuple[Path, bool]] = []
+    begin = len(str(root)) + 1
+
+    def fail(error: OSError) -> None:
+        if not _is_left_alone(error.filename[begin:]):
+            cleared.add_fault(error.filename, error)
+
+    for path, entries in directories.walk(root, fail):
+        if _is_left_alone(path[begin:]):
             continue
-        folder, holds = Path(path), own.judge(name, known_identity(path)) if own else bool
+        folder = Path(path)
+        holds = own.judge(path[begin:], known_identity(path)) if own else bool
         bags = [
             folder / entry.name
             for entry in entries
@@ -94,23 +101,31 @@ def clear_bags(bag_dir: Path, own: OwnRecordings | None = None) -> Cleared:
         ]
         for bag in bags:
             cleared.delete(root, bag, device)
-        if bags or moments in (folder, folder.parent):
-            touched.append(folder)
-    for folder in reversed(touched):  # the deepest first
+        touched.append((folder, bool(bags)))
+    for folder, had_bags in reversed(touched):  # the deepest first
         with suppress(OSError):
-            if folder.parent == moments:
-                _delete_moment_file(root, folder)
-            remove_emptied(root, folder)
+            _remove_emptied(root, folder, had_bags=had_bags)
     for name in OWN_FILES:
         with suppress(OSError):
             (root / name).unlink()
     return cleared
 
 
-def _delete_moment_file(root: Path, moment: Path) -> None:
-    with directories.opened(root, moment) as folder:
-        if os.listdir(folder) == [MOMENT_FILE]:  # noqa: PTH208 - a descriptor has no path
-            os.unlink(MOMENT_FILE, dir_fd=folder)
+def _is_left_alone(name: str) -> bool:
+    return "/." in f"/{name}" or name == LOST_AND_FOUND
+
+
+def _remove_emptied(root: Path, folder: Path, *, had_bags: bool) -> None:
+    """Deletes a folder that had bags, or is of moments, if nothing else is left in it."""
+    moments = root / MOMENTS_FOLDER
+    if folder.parent == moments:
+        with directories.opened(root, folder) as moment:
+            if os.listdir(moment) == [MOMENT_FILE]:  # noqa: PTH208 - a descriptor has no path
+                os.unlink(MOMENT_FILE, dir_fd=moment)
+    if had_bags:
+        remove_emptied(root, folder)
+    elif moments in (folder, folder.parent):
+        folder.rmdir()
 
 
 def refuse_homes(bag_dir: Path) -> None:

@@ -233,8 +233,8 @@ class Eraser:
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
         files = [self._bag_dir / name for name in erasure.files]
-        folders = {path.parent for path in files}
-        notes = [*metadata_corrected(self._bag_dir, folders, self._reader)]
+        recordings = {path.parent for path in files}
+        notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
         try:
             self._delete_left_over(files)
             self._forget_silences(erasure)

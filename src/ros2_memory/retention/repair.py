@@ -223,23 +223,21 @@ def metadata_corrected(
     Where a recorder is still to write it, that counts what has gone, too.
     """
     for recording in sorted(recordings):
-        listing = recording / METADATA_FILE
-        name = os.path.relpath(listing, bag_dir)
-        if not listing.exists():
-            if os.path.dirname(name) in read_heartbeat(bag_dir).recordings:  # noqa: PTH120
+        folder = os.path.relpath(recording, bag_dir)
+        name = f"{folder}/{METADATA_FILE}"
+        if not (recording / METADATA_FILE).exists():
+            if folder in read_heartbeat(bag_dir).recordings:
                 yield f"{name} will count what was deleted, too: the recorder writes it at the end"
             continue
         try:
             with directories.opened(bag_dir, recording):
-                is_changed = correct(recording, reader)
+                if correct(recording, reader):
+                    yield f"{name} describes what is left"
         except (BagError, OSError, ValueError) as error:
             yield (
                 f"{name} still describes what was deleted ({error}); rosbag2 opens the folder "
                 f"after `ros2 bag reindex {recording}`"
             )
-        else:
-            if is_changed:
-                yield f"{name} describes what is left"
 
 
 def open_files() -> frozenset[tuple[int, int]]:

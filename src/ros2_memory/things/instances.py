@@ -251,10 +251,11 @@ class Estimate:
         np.maximum.at(last, cell_of, self.looks.times(looks)[1])
         is_in_best = cell_of == np.lexsort((last, messages))[-1]
         looks, n = looks[is_in_best], n[is_in_best]
-        x, y, yaw = (
-            float((column[looks] * n).sum() / n.sum())
-            for column in (self.looks.x, self.looks.y, self.looks.yaw)
-        )
+        columns = (self.looks.x, self.looks.y, self.looks.yaw)
+        poses = np.stack([column[looks] for column in columns], dtype=np.float64)
+        # Headings from that of the first on: 0 and 359.9 degrees are side by side.
+        poses[2] = poses[2, 0] + (poses[2] - poses[2, 0] + 1800) % 3600 - 1800
+        x, y, yaw = np.average(poses, axis=1, weights=n).tolist()
         return x / 1000, y / 1000, math.radians((yaw / 10 + 180) % 360 - 180)
 
     def side_by_side(self, rows: Ints) -> int:
@@ -614,12 +615,16 @@ class _Hosts:
         self._beside = Tally.of(observed.sights.beside, len(observed.sights.spots))
         distinct = [*dict.fromkeys(keys)]
         self._key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
-        self._key = np.array([distinct.index(group.key) for group, _ in stays], np.int64)
-        self._epoch = np.array([group.epoch for group, _ in stays], np.int64)
-        rows = [(stay.count, stay.first, stay.last, stay.weak) for stay in self._stays]
-        self._count, self._first, self._last, self._weak = np.array(rows, np.int64).reshape(-1, 4).T
-        slices = [(stay.stay.first_slice, stay.stay.last_slice + 1) for stay in self._stays]
-        self._slices = np.array(slices, np.int64).reshape(-1, 2).T
+        rows = [
+            (
+                *(distinct.index(group.key), group.epoch, stay.count, stay.first, stay.last),
+                *(stay.weak, stay.stay.first_slice, stay.stay.last_slice + 1),
+            )
+            for group, stay in stays
+        ]
+        columns = np.array(rows, np.int64).reshape(-1, 8).T
+        self._key, self._epoch, self._count, self._first, self._last, self._weak = columns[:6]
+        self._slices = columns[6:]
         places = [(stay.x, stay.y, stay.z) for stay in self._stays]
         self._places = np.array(places, np.float64).reshape(-1, 3).T
         self._order = np.argsort(self._places[0], kind="stable")

@@ -84,10 +84,8 @@ class Cells:
 
     def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
         looks = self._looks = sights.looks
-        # Looks of single places are picked thousands of times: from whole columns that is faster.
         self.slice, self.n, self.first, self.last, self.topic = (
-            np.ascontiguousarray(looks[:, column])
-            for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
+            looks[:, column] for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
         )
         self.x = looks[:, Look.X].astype(np.float64)
         self.y = looks[:, Look.Y].astype(np.float64)
@@ -416,10 +414,7 @@ def _totals(keys: Ints, n: Ints) -> tuple[Ints, Ints]:
 
 def _are_in(ordered: Ints, keys: Ints) -> Flags:
     """Returns which keys are among some that are in order."""
-    if not len(ordered):
-        return np.zeros(len(keys), bool)
-    rows = np.minimum(np.searchsorted(ordered, keys), len(ordered) - 1)
-    are_in: Flags = ordered[rows] == keys
+    are_in: Flags = np.append(ordered, -1)[np.searchsorted(ordered, keys)] == keys
     return are_in
 
 

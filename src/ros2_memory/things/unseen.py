@@ -164,8 +164,9 @@ def _found_in_singular(
     other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
     stored = None
     with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
-        stored = ReverseSearch(view, topic, replace(condition, test=other)).newest(window.stop)
-    if stored is None or stored.time < window.start:
+        search = ReverseSearch(view, topic, replace(condition, test=other))
+        stored = search.newest(window.stop, window.start)
+    if stored is None:
         return ()
     at = unix_text(stored.time)
     return (f"{abbreviate(text)} was not found, but {abbreviate(one)} was, last at {at}",)
@@ -207,8 +208,7 @@ def vague_notes(
     estimate, spots = known.estimate, known.estimate.spots
     labels = {*also}
     for window in windows if estimate.poor.any() else ():
-        during = _during(window, spots, Spot.FIRST, Spot.LAST)
-        during = during[estimate.counts[during] > 0]
+        during = estimate.seen_in(np.arange(len(spots)), window)
         for label in np.unique(spots[during, Spot.LABEL]).tolist():
             key = known.labels.key(estimate.labels[label])
             if not keys or key in keys:

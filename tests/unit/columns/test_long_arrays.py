@@ -8,11 +8,21 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pytest
+from rosbags.typesys import get_types_from_msg
 
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.table import MAX_NUMBERS
 from ros2_memory.core.timebase import NS_PER_S
-from tests.support.bags import Msg, header, make, point, quaternion, stamp, write_mcap
+from tests.support.bags import (
+    Msg,
+    header,
+    make,
+    point,
+    quaternion,
+    stamp,
+    typestore,
+    write_mcap,
+)
 from tests.support.column_worlds import World
 from tests.support.memories import asked, each_way, memory_of, with_store
 
@@ -130,6 +140,42 @@ def test_what_a_summarised_array_holds_is_not_compared_with_its_size(
             assert "data is long it is only summarised" in found()["notes"][0]
     if number == 100:
         assert found(field="data.bytes")["value"] is not None
+
+
+def test_the_size_of_a_long_array_is_found_beside_a_list_of_names(tmp_path: Path) -> None:
+    kind = "acme_msgs/msg/NamedBytes"
+    typestore().register(get_types_from_msg("string[] names\nuint8[] data\n", kind))
+    for nth, size in enumerate((3, 500, 2)):
+        at, data = T0 + nth * NS_PER_S, np.full(size, 7, np.uint8)
+        message = Msg("/named", kind, at, make(kind, names=["left", "right"], data=data))
+        write_mcap(tmp_path / "rec" / f"rec_{nth}.mcap", [message])
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        for field, value, nth in (("data.bytes", 100, 1), ("data.right", 6, 2)):
+            given = {"condition_type": "above", "value": value, "field": field}
+            match = asked(memory, tmp_path, "find_last_match", topic="/named", **given)
+            assert match["timestamp"] == T0 / NS_PER_S + nth
+
+
+@pytest.mark.parametrize("count", [3, MAX_NUMBERS, MAX_NUMBERS + 1])
+def test_a_joint_is_found_by_its_name_in_an_array_of_fixed_length(
+    tmp_path: Path, count: int
+) -> None:
+    kind, random, bent = f"acme_msgs/msg/Arm{count}", Random(count), list[int]()
+    typestore().register(get_types_from_msg(f"string[] names\nfloat64[{count}] positions\n", kind))
+    messages = []
+    for nth in range(20):
+        names = random.sample([f"joint_{number}" for number in range(count + 1)], count)
+        angles = {name: random.random() for name in names}
+        message = make(kind, names=names, positions=np.array([*angles.values()]))
+        messages.append(Msg("/arm", kind, T0 + nth * NS_PER_S, message))
+        bent += [nth] * (angles.get("joint_1", 0.0) > 0.5)
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", messages)
+    given = {"condition_type": "above", "value": 0.5, "field": "positions.joint_1"}
+    for memory in (memory_of(tmp_path), with_store(memory_of(tmp_path), tmp_path)):
+        last = asked(memory, tmp_path, "find_last_match", topic="/arm", **given)
+        assert last["timestamp"] == T0 / NS_PER_S + bent[-1]
+        runs = asked(memory, tmp_path, "find_matches", topic="/arm", **given, limit=100)
+        assert sum(run["count"] for run in runs["sightings"]) == len(bent)
 
 
 @pytest.mark.parametrize("more", [0, 12], ids=["few joints", "many joints"])

@@ -110,6 +110,16 @@ def test_percent_of_a_battery_that_states_fractions_is_refused(tmp_path: Path) -
     assert found.sample.time == T0
 
 
+@pytest.mark.parametrize("unknown", [math.nan, -1.0])
+def test_percent_of_a_battery_that_states_no_charge_is_not_refused_as_if_it_stated_fractions(
+    tmp_path: Path, unknown: float
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [battery(T0, unknown)])
+    question = (memory_of(tmp_path), Call(), "/battery_state")
+    found = queries.find_last_match(*question, "above", 20, field="percentage").found
+    assert found is None
+
+
 def test_percent_of_a_battery_that_states_percent_is_compared(tmp_path: Path) -> None:
     write_mcap(tmp_path / "bag.mcap", [battery(T0, 90.0), battery(T0 + NS_PER_S, 1.0)])
     question = (memory_of(tmp_path), Call(), "/battery_state")

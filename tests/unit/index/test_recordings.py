@@ -63,6 +63,21 @@ def test_the_index_of_one_recording_finds_what_a_scan_of_it_finds(
     assert comparable(part.refresh()) == comparable(index_of(tmp_path, name).refresh())
 
 
+def test_the_index_of_one_recording_has_no_other_than_that_which_it_is_made_of(
+    tmp_path: Path,
+) -> None:
+    for bag in ("deep/b/0", "deep/c/0", "a/0", "run_0", "run_1"):
+        write(tmp_path, bag)
+
+    def found(only: str, name: str) -> list[str]:
+        bags = index_of(tmp_path, only).alone(name).refresh().bags
+        return [str(bag.path.relative_to(tmp_path)) for bag in bags]
+
+    assert found("deep", "deep/b") == found("deep/b", "deep") == ["deep/b/0.mcap"]
+    assert found("run_0.mcap", "run") == found("run", "run_0") == ["run_0.mcap"]
+    assert found("deep", "a") == found("deep/b", "deep/c") == found("run", "a") == []
+
+
 def test_every_recording_is_found_by_its_name(tmp_path: Path) -> None:
     for n, bag in enumerate(["a/0", "a/1", "run_0", "run_1", "loose", "deep/b/x", "deep/b/y"]):
         write(tmp_path, bag, at_s=n)

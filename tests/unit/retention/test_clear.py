@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import errno
+import os
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.retention.clear import clear_bags, remove_if_empty
 
@@ -41,6 +44,30 @@ def test_bags_of_every_kind_go_with_what_lies_beside_them(tmp_path: Path) -> Non
     wiped = clear_bags(tmp_path)
     assert left(tmp_path) == ["deep"]
     assert (wiped.files, wiped.bytes, wiped.faults) == (5, 25, [])
+
+
+def test_a_directory_that_cannot_be_listed_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    make(tmp_path, "rec_1/rec_1_0.mcap", "rec_2/rec_2_0.mcap", "lost+found/x", ".trash/x")
+    scandir = os.scandir
+
+    def failing(path: str | int) -> object:
+        if Path(str(path)).name in {"rec_1", "lost+found", ".trash"}:
+            raise OSError(errno.EIO, "Input/output error", path)
+        return scandir(path)
+
+    monkeypatch.setattr(os, "scandir", failing)
+    wiped = clear_bags(tmp_path)
+    assert wiped.faults == [f"{tmp_path / 'rec_1'} cannot be deleted: Input/output error"]
+    assert wiped.files == 1
+
+
+def test_what_lies_beside_a_moment_of_somebody_else_stays(tmp_path: Path) -> None:
+    names = "moments/m/moment.json", "moments/m/metadata.yaml", "moments/m/rec_1/rec_1_0.mcap"
+    make(tmp_path, *names)
+    assert clear_bags(tmp_path, OwnRecordings(tmp_path)).files == 0
+    assert {*names} <= {*left(tmp_path)}
 
 
 def test_what_it_does_not_know_stays_and_so_does_its_directory(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from ros2_memory.analysis.sights import Sights
@@ -54,6 +56,16 @@ def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_alwa
     empty = bag_of(*[(HERE, [])] * 12, start=100)
     [mug] = estimate(whole([*rarely, empty]), LABELS).instances
     assert mug.missed_by is None
+
+
+@pytest.mark.parametrize("middle_deg", [0.0, 1.5, 180.5, 83.5])
+def test_seen_from_has_the_mean_heading_also_across_the_full_circle(middle_deg: float) -> None:
+    poses = [(0.0, 0.0, math.radians(middle_deg + off_deg)) for off_deg in (-3, 3)] * 20
+    found = estimate(whole([bag_of(*((pose, seen_at(2, 0)) for pose in poses))]), LABELS)
+    [mug] = found.instances
+    robot = found.seen_from(mug.stays[0].spots)
+    assert robot is not None
+    assert math.remainder(robot[2] - math.radians(middle_deg), math.tau) == pytest.approx(0)
 
 
 def test_a_name_that_is_rarely_given_to_a_thing_is_its_other_name() -> None:

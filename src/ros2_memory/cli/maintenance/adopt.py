@@ -8,9 +8,9 @@ from typing import Annotated
 
 import typer
 
-from ros2_memory.bag_dir.layout import bag_kind, is_kept_apart
+from ros2_memory.bag_dir.layout import bag_kind, bags_in, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
-from ros2_memory.bag_dir.own_recordings import OwnRecordings, bags_in, folders_with_bags, is_regular
+from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
 from ros2_memory.cli.output import print_json, print_line
 from ros2_memory.core.directories import identity_of

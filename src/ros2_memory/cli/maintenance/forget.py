@@ -402,7 +402,8 @@ class _Forget:
             open_recordings = {
                 self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings
             }
-            for recording in {bag.recording for bag in deleted} - open_recordings:
+            recordings = {bag.recording for bag in deleted}
+            for recording in recordings - open_recordings:
                 try:
                     remove_emptied(self._bag_dir, recording)
                 except OSError as error:
@@ -411,7 +412,6 @@ class _Forget:
                 self._forget_derived(map(self._name, deleted))
             except BagError as error:
                 kept.append(error.reason)
-            recordings = {bag.recording for bag in deleted}
             notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
         also = ""
         if carried is not None:
