@@ -52,7 +52,7 @@ class BagAccess:
         self.memory = memory
         self.call = call
         with call.stages.timed("index"):
-            self.snapshot = memory.index.snapshot(reach)
+            self.snapshot = memory.snapshot(reach)
         call.saw(self.snapshot)
         self.notes = Notes()
         self._deadline = call.deadline
