@@ -376,35 +376,24 @@ def find_last_match(
     With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
     of a score below `min_score` do not count.
     """
-    now = memory.clock.now()
-    until = _search_end(before_s)
+    now, until = memory.clock.now(), _search_end(before_s)
 
-    def newest(view: View) -> results.Match:
-        condition = condition_of(
-            view, topic, condition_type, value, field=field, min_score=min_score
-        )
-        search = ReverseSearch(view, topic, condition)
-        if before_s is not None:
-            require_recorded(view, TimeWindow(MIN_NS, until))
-        stored = search.newest(until)
-        if stored is None:
-            notes = _notes_on_never(view, topic, search, until, min_score)
-            return results.Match(None, notes=notes)
-        note_robots_near(view, stored)
-        note_unread(view, _searched_window(view, stored, until, now), search=True)
+    def found(view: View, match: StoredMessage) -> results.Match:
+        note_robots_near(view, match)
+        note_unread(view, _searched_window(view, match, until, now), search=True)
         # What the view shows may be some days of long ago.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
-        is_future = stored.time > counted_from + FUTURE_NS
+        is_future = match.time > counted_from + FUTURE_NS
         if is_future:
-            after = seconds(stored.time - counted_from)
+            after = seconds(match.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-        value_found = _as_value(view, stored, fields, None if is_future else counted_from)
+        value_found = _as_value(view, match, fields, None if is_future else counted_from)
         return results.Match(value_found, notes=view.notes.sentences())
 
     reach = min(now, until)
-    view = View(memory, call, reach)
-    return _going_back(view, reach, newest, lambda match: match.found is not None)
+    sought = _Sought(topic, condition_type, value, field, min_score, until)
+    return _last_match(View(memory, call, reach), reach, sought, found)
 
 
 def value_when(
@@ -419,27 +408,17 @@ def value_when(
     fields: Sequence[str] = (),
     before_s: float | None = None,
     min_score: float | None = None,
-) -> results.ValueWhen:
+) -> results.ValueWhen | results.Match:
     """Returns a topic's value at or before the last time that another topic met a condition.
 
-    With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
-    of a score below `min_score` do not count.
+    Else that there was no match. With `before_s` (Unix seconds) the condition is looked for up to
+    and including then. Detections of a score below `min_score` do not count.
     """
     now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
 
-    def newest(view: View) -> results.ValueWhen:
-        condition = condition_of(
-            view, condition_topic, condition_type, value, field=field, min_score=min_score
-        )
-        search = ReverseSearch(view, condition_topic, condition)
-        if before_s is not None:
-            require_recorded(view, TimeWindow(MIN_NS, until))
-        match = search.newest(until)
-        if match is None:
-            notes = _notes_on_never(view, condition_topic, search, until, min_score)
-            return results.ValueWhen(None, notes=notes)
+    def found(view: View, match: StoredMessage) -> results.ValueWhen:
         note_unread(view, _searched_window(view, match, until, now), search=True)
         note_robots_near(view, match)
         matched = _as_value(view, match, (), None)
@@ -457,7 +436,8 @@ def value_when(
         held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
         return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
 
-    return _going_back(view, now, newest, lambda value: value.matched is not None)
+    sought = _Sought(condition_topic, condition_type, value, field, min_score, until)
+    return _last_match(view, now, sought, found)
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -626,10 +606,21 @@ def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> T
     return TimeWindow(stored.time, max(stop, stored.time + 1))
 
 
-def _going_back(
-    view: View, reach: Ns, newest: Callable[[View], A], is_found: Callable[[A], bool]
-) -> A:
-    """Returns what a search finds in a view that reaches to a time, or in what is older.
+class _Sought(NamedTuple):
+    """The condition of a search, and the log time before which its last match is looked for."""
+
+    topic: str
+    condition_type: str
+    value: JsonValue
+    field: str | None
+    min_score: float | None
+    until: Ns
+
+
+def _last_match(
+    view: View, reach: Ns, sought: _Sought, found: Callable[[View, StoredMessage], A]
+) -> A | results.Match:
+    """Returns what `found` makes of the last match in a view that reaches to a time, or older.
 
     An index of years shows some days at a time. Where these have nothing, those before them are
     searched, for some seconds in all; the index reports what it has not shown.
@@ -638,25 +629,29 @@ def _going_back(
         NoDataError: none of the days has anything that could be searched.
         QueryTimeoutError: the call's time is over; reports how far back was searched.
     """
+    topic, condition_type, value, field, min_score, until = sought
     reading = view.call.partial_after(READING_S)
-    missed: A | NoDataError | None = None
+    missed: results.Match | NoDataError | None = None
+    notes: tuple[str, ...] = ()
     while True:
         try:
-            answer: A = newest(view)
+            condition = condition_of(
+                view, topic, condition_type, value, field=field, min_score=min_score
+            )
+            search = ReverseSearch(view, topic, condition)
+            if until < MAX_NS:
+                require_recorded(view, TimeWindow(MIN_NS, until))
+            match = search.newest(until)
+            if match is not None:
+                return found(view, match)
+            notes += _notes_on_never(view, topic, search, until, min_score)
+            missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
         except NoDataError as error:
             missed = missed or error
         except QueryTimeoutError as error:
             if missed is None or error.searched_back_to is not None:
                 raise
             raise out_of_time(view, reach + 1) from error
-        else:
-            if is_found(answer):
-                return answer
-            earlier_notes: tuple[str, ...]
-            earlier_notes = (
-                () if missed is None or isinstance(missed, NoDataError) else missed.notes
-            )
-            missed = replace(answer, notes=tuple(dict.fromkeys((*earlier_notes, *answer.notes))))
         older = view.snapshot.older
         if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
             if isinstance(missed, NoDataError):

@@ -118,8 +118,8 @@ class Memory:
 
     `scanner` scans topics, from its store where that has the bags; every answer is the same without
     the store. `large` is the turn to hold much of a bag, which the reader takes. `memo` has what
-    was found out about the bags and stays true. With a snapshot that is `fixed`, several answers are
-    of one and the same memory.
+    was found out about the bags and stays true. `fixed` is the snapshot that answers, where it is
+    to be one and the same for several.
     """
 
     index: SnapshotSource
