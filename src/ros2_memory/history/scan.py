@@ -22,6 +22,7 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.history.context import READING_S
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
@@ -181,6 +182,30 @@ def remembered(
         if key is not None and before == (trouble(), view.notes.added):
             fragments.put(key, fragment)
     return fragment
+
+
+def in_time(
+    view: View, timed: Iterable[tuple[Ns, V]], budget_s: float = READING_S
+) -> tuple[list[V], Ns | None]:
+    """Returns what is yielded, the newest first, while there is time; and since when that is all.
+
+    None where it is. `timed`: each with a log time that nothing of it is earlier than.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before the first.
+    """
+    reading, found, since = view.call.partial_after(budget_s), list[V](), MAX_NS
+    try:
+        for at, one in timed:
+            if found and reading.expired():
+                return found, since
+            found.append(one)
+            since = at
+    except QueryTimeoutError:
+        if not found:
+            raise
+        return found, since
+    return found, None
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:
