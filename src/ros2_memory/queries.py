@@ -163,20 +163,28 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    chosen = _show_each(view, picked, fields)
+    shown, failures = _show_each(view, picked, fields)
+    chosen = len(shown) + failures.total()
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    samples, types = _samples(view, chosen, window)
+    if not shown:
+        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+        raise with_notes(view, window, undecodable)
+    for sample in shown:
+        view.notes.add(*sample.notes)
+    view.notes.add(*(f"{count} samples left out: {why}" for why, count in failures.items()))
+    types = [*dict.fromkeys(sample.type_name for sample in shown)]
     if len(types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
-    if len(chosen) < total:
-        view.notes.add(f"{len(chosen)} of {total} samples, evenly spaced over the window")
-    note_unread(view, window, gaps=len(chosen) < total)
+    if chosen < total:
+        view.notes.add(f"{chosen} of {total} samples, evenly spaced over the window")
+    note_unread(view, window, gaps=chosen < total)
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
     note_no_fix(view, name, window, fields)
+    samples = tuple(Sample(sample.time, sample.value) for sample in shown)
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
@@ -802,64 +810,41 @@ def _as_value(
 
 
 class _Shown(NamedTuple):
-    """A message as a reply shows it; or without it, why it cannot be decoded."""
+    """A message as a reply shows it, and what is to be noted on it."""
 
     time: Ns
     type_name: str
-    shown: Extracted | None
-    failure: str = ""
+    value: JsonValue
+    notes: tuple[str, ...]
 
 
-def _show_each(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
-    """Returns messages as a reply shows them. None is in memory when the next one is read.
+def _show_each(
+    view: View, picked: Iterable[StoredMessage], fields: Sequence[str]
+) -> tuple[list[_Shown], Counter[str]]:
+    """Returns messages as a reply shows them, and how often which reason kept one from decoding.
 
-    Those without one of the fields, as of another type, are left out with a note.
+    None is in memory when the next one is read. Those without one of the fields, as of another
+    type, are left out with a note.
 
     Raises:
         InvalidArgumentsError: none has them.
     """
     shown: list[_Shown] = []
-    lacking: Counter[str] = Counter()
+    failures, lacking = Counter[str](), Counter[str]()
     for message in picked:
-        type_name = message.type
         try:
-            shown.append(_Shown(message.time, type_name, _decode_shown(view, message, fields)[1]))
+            _, extracted = _decode_shown(view, message, fields)
+            shown.append(_Shown(message.time, message.type, extracted.value, extracted.notes))
         except NoDataError as error:
-            shown.append(_Shown(message.time, type_name, None, error.detail))
+            failures[error.detail] += 1
         except InvalidArgumentsError as error:
             lacking[str(error)] += 1
         del message
     for detail, count in lacking.items():
-        if all(message.shown is None for message in shown):
+        if not shown:
             raise InvalidArgumentsError(detail)
         view.notes.add(f"{count} samples left out: {detail}")
-    return shown
-
-
-def _samples(
-    view: View, chosen: Sequence[_Shown], window: TimeWindow
-) -> tuple[tuple[Sample, ...], list[str]]:
-    """Returns the samples that can be decoded, and their types in order of appearance.
-
-    Raises:
-        NoDataError: none can be decoded.
-    """
-    samples: list[Sample] = []
-    types: dict[str, None] = {}
-    failures: Counter[str] = Counter()
-    for time, type_name, shown, failure in chosen:
-        if shown is None:
-            failures[failure] += 1
-            continue
-        samples.append(Sample(time, shown.value))
-        types[type_name] = None
-        view.notes.add(*shown.notes)
-    if failures and not samples:
-        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
-        raise with_notes(view, window, undecodable)
-    for detail, count in failures.items():
-        view.notes.add(f"{count} samples left out: {detail}")
-    return tuple(samples), list(types)
+    return shown, failures
 
 
 def _age(stored: StoredMessage, now: Ns | None) -> Ns | None:
