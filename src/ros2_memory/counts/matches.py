@@ -259,7 +259,7 @@ def _events_in_order(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    parts, since = in_time(view, events_back(view, topic, window))
+    parts, since = in_time(view, events_back(view, topic, window), READING_S)
     return parts[::-1], since
 
 

@@ -32,6 +32,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
     describe_lack,
@@ -93,7 +94,8 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice
     """
     failures: list[UndecodableError] = []
     timed = slices_of_path(view, topic, window, failures)
-    slices, since = in_time(view, (at for at in timed if at[1].poses or at[1].invalid))
+    drawn = ((at, part) for at, part in timed if part.poses or part.invalid)
+    slices, since = in_time(view, drawn, READING_S)
     if failures and not slices:
         raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:

@@ -22,7 +22,6 @@ from ros2_memory.core.errors import QueryTimeoutError
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.context import READING_S
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
@@ -185,7 +184,7 @@ def remembered(
 
 
 def in_time(
-    view: View, timed: Iterable[tuple[Ns, V]], budget_s: float = READING_S
+    view: View, timed: Iterable[tuple[Ns, V]], budget_s: float
 ) -> tuple[list[V], Ns | None]:
     """Returns what is yielded, the newest first, while there is time; and since when that is all.
 
