@@ -133,6 +133,7 @@ class BagAccess:
             return self.memory.reader.decode(stored.record)
         except UndecodableError as error:
             if failures is not None:
+                self.notes.added += 1
                 # A new one, since the one that was raised keeps the message by its traceback.
                 failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None

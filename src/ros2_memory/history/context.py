@@ -404,8 +404,9 @@ class Notes:
 
     Attributes:
         complete: False once something that bears on the answer could not be read.
-        added: how many notes on files were added, again or not. What was computed while it stays
-            the same was read whole; `keys` would not show that a file failed twice.
+        added: how many notes on files were added, again or not, and how many messages were left
+            out that cannot be decoded. What was computed while it stays the same was read whole;
+            `keys` would not show that a file failed twice.
     """
 
     def __init__(self) -> None:

@@ -180,7 +180,7 @@ def slices_by_poses(
                 before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
                 yield (
                     pose_slice.start,
-                    remembered(view, kind, key, load, reader.trouble, also_before=before),
+                    remembered(view, kind, key, load, also_before=before),
                 )
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
@@ -196,9 +196,7 @@ def slices_by_poses(
         left_out = repr(near)
         return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
 
-    yield from joined_back(
-        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
-    )
+    yield from joined_back(view, opened, kind, made_in, key_of, beside=beside)
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,7 +229,6 @@ class TrackReader:
                 TRACKS,
                 partial(self._tracks_in, opened, moving, window),
                 partial(self._stretch_key, opened, moving, window),
-                trouble=lambda: len(self._failures),
             )
 
     def _tracks_in(
@@ -317,7 +316,7 @@ class TrackReader:
             recording = relative(str(rows.recording), str(self._view.bag_dir))
             return partial_track(*placed)._replace(recording=recording)
 
-        return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
+        return remembered(self._view, TRACKS, key, make)
 
     def _rows_key(
         self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]
