@@ -163,20 +163,28 @@ def topic_range(
     view, window = open_span(memory, call, span)
     name = resolve_topic(view, topic)
     total, picked = pick(view, name, window, max_samples)
-    chosen = _show_each(view, picked, fields)
+    shown, failures = _show_each(view, picked, fields)
+    chosen = len(shown) + failures.total()
     if not chosen:
         raise no_data_between(view, (name,), window)
     note_unrecorded(view, window)
-    samples, types = _samples(view, chosen, window)
+    if not shown:
+        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
+        raise with_notes(view, window, undecodable)
+    for sample in shown:
+        view.notes.add(*sample.notes)
+    view.notes.add(*(f"{count} samples left out: {why}" for why, count in failures.items()))
+    types = [*dict.fromkeys(sample.type_name for sample in shown)]
     if len(types) > 1:
         view.notes.add(f"the topic was recorded under several types: {', '.join(types)}")
-    if len(chosen) < total:
-        view.notes.add(f"{len(chosen)} of {total} samples, evenly spaced over the window")
-    note_unread(view, window, gaps=len(chosen) < total)
+    if chosen < total:
+        view.notes.add(f"{chosen} of {total} samples, evenly spaced over the window")
+    note_unread(view, window, gaps=chosen < total)
     note_edges(view, window)
     note_robots(view, name, window)
     extremes = extremes_of(view, name, window, fields) if fields else ()
     note_no_fix(view, name, window, fields)
+    samples = tuple(Sample(sample.time, sample.value) for sample in shown)
     return results.TopicRange(
         name, types[-1], total, samples, extremes, (*fields,), notes=view.notes.sentences()
     )
@@ -376,35 +384,24 @@ def find_last_match(
     With `before_s` (Unix seconds) only messages up to and including then are searched. Detections
     of a score below `min_score` do not count.
     """
-    now = memory.clock.now()
-    until = _search_end(before_s)
+    now, until = memory.clock.now(), _search_end(before_s)
 
-    def newest(view: View) -> results.Match:
-        condition = condition_of(
-            view, topic, condition_type, value, field=field, min_score=min_score
-        )
-        search = ReverseSearch(view, topic, condition)
-        if before_s is not None:
-            require_recorded(view, TimeWindow(MIN_NS, until))
-        stored = search.newest(until)
-        if stored is None:
-            notes = _notes_on_never(view, topic, search, until, min_score)
-            return results.Match(None, notes=notes)
-        note_robots_near(view, stored)
-        note_unread(view, _searched_window(view, stored, until, now), search=True)
+    def found(view: View, match: StoredMessage) -> results.Match:
+        note_robots_near(view, match)
+        note_unread(view, _searched_window(view, match, until, now), search=True)
         # What the view shows may be some days of long ago.
         newest_known = memory.index.published or view.snapshot
         counted_from = memory.now(now, newest_known.latest, call)
-        is_future = stored.time > counted_from + FUTURE_NS
+        is_future = match.time > counted_from + FUTURE_NS
         if is_future:
-            after = seconds(stored.time - counted_from)
+            after = seconds(match.time - counted_from)
             view.notes.add(f"dated {after} after now: when it was is unknown")
-        value_found = _as_value(view, stored, fields, None if is_future else counted_from)
+        value_found = _as_value(view, match, fields, None if is_future else counted_from)
         return results.Match(value_found, notes=view.notes.sentences())
 
     reach = min(now, until)
-    view = View(memory, call, reach)
-    return _going_back(view, reach, newest, lambda match: match.found is not None)
+    sought = _Sought(topic, condition_type, value, field, min_score, until)
+    return _last_match(View(memory, call, reach), reach, sought, found)
 
 
 def value_when(
@@ -419,27 +416,17 @@ def value_when(
     fields: Sequence[str] = (),
     before_s: float | None = None,
     min_score: float | None = None,
-) -> results.ValueWhen:
+) -> results.ValueWhen | results.Match:
     """Returns a topic's value at or before the last time that another topic met a condition.
 
-    With `before_s` (Unix seconds) the condition is looked for up to and including then. Detections
-    of a score below `min_score` do not count.
+    Else that there was no match. With `before_s` (Unix seconds) the condition is looked for up to
+    and including then. Detections of a score below `min_score` do not count.
     """
     now, until = memory.clock.now(), _search_end(before_s)
     view = View(memory, call, now)
     name = resolve_topic(view, value_topic)
 
-    def newest(view: View) -> results.ValueWhen:
-        condition = condition_of(
-            view, condition_topic, condition_type, value, field=field, min_score=min_score
-        )
-        search = ReverseSearch(view, condition_topic, condition)
-        if before_s is not None:
-            require_recorded(view, TimeWindow(MIN_NS, until))
-        match = search.newest(until)
-        if match is None:
-            notes = _notes_on_never(view, condition_topic, search, until, min_score)
-            return results.ValueWhen(None, notes=notes)
+    def found(view: View, match: StoredMessage) -> results.ValueWhen:
         note_unread(view, _searched_window(view, match, until, now), search=True)
         note_robots_near(view, match)
         matched = _as_value(view, match, (), None)
@@ -457,7 +444,8 @@ def value_when(
         held_value = _with_latched_age(view, _as_value(view, held, fields, None), held, match.time)
         return results.ValueWhen(matched, held_value, notes=view.notes.sentences())
 
-    return _going_back(view, now, newest, lambda value: value.matched is not None)
+    sought = _Sought(condition_topic, condition_type, value, field, min_score, until)
+    return _last_match(view, now, sought, found)
 
 
 def list_recorded_topics(memory: Memory, call: Call) -> tuple[results.TopicRow, ...]:
@@ -626,10 +614,21 @@ def _searched_window(view: View, stored: StoredMessage, until: Ns, now: Ns) -> T
     return TimeWindow(stored.time, max(stop, stored.time + 1))
 
 
-def _going_back(
-    view: View, reach: Ns, newest: Callable[[View], A], is_found: Callable[[A], bool]
-) -> A:
-    """Returns what a search finds in a view that reaches to a time, or in what is older.
+class _Sought(NamedTuple):
+    """The condition of a search, and the log time before which its last match is looked for."""
+
+    topic: str
+    condition_type: str
+    value: JsonValue
+    field: str | None
+    min_score: float | None
+    until: Ns
+
+
+def _last_match(
+    view: View, reach: Ns, sought: _Sought, found: Callable[[View, StoredMessage], A]
+) -> A | results.Match:
+    """Returns what `found` makes of the last match in a view that reaches to a time, or older.
 
     An index of years shows some days at a time. Where these have nothing, those before them are
     searched, for some seconds in all; the index reports what it has not shown.
@@ -638,25 +637,29 @@ def _going_back(
         NoDataError: none of the days has anything that could be searched.
         QueryTimeoutError: the call's time is over; reports how far back was searched.
     """
+    topic, condition_type, value, field, min_score, until = sought
     reading = view.call.partial_after(READING_S)
-    missed: A | NoDataError | None = None
+    missed: results.Match | NoDataError | None = None
+    notes: tuple[str, ...] = ()
     while True:
         try:
-            answer: A = newest(view)
+            condition = condition_of(
+                view, topic, condition_type, value, field=field, min_score=min_score
+            )
+            search = ReverseSearch(view, topic, condition)
+            if until < MAX_NS:
+                require_recorded(view, TimeWindow(MIN_NS, until))
+            match = search.newest(until)
+            if match is not None:
+                return found(view, match)
+            notes += _notes_on_never(view, topic, search, until, min_score)
+            missed = results.Match(None, notes=tuple(dict.fromkeys(notes)))
         except NoDataError as error:
             missed = missed or error
         except QueryTimeoutError as error:
             if missed is None or error.searched_back_to is not None:
                 raise
             raise out_of_time(view, reach + 1) from error
-        else:
-            if is_found(answer):
-                return answer
-            earlier_notes: tuple[str, ...]
-            earlier_notes = (
-                () if missed is None or isinstance(missed, NoDataError) else missed.notes
-            )
-            missed = replace(answer, notes=tuple(dict.fromkeys((*earlier_notes, *answer.notes))))
         older = view.snapshot.older
         if older is None or older >= reach or reading.expired() or view.call.deadline.expired():
             if isinstance(missed, NoDataError):
@@ -807,64 +810,41 @@ def _as_value(
 
 
 class _Shown(NamedTuple):
-    """A message as a reply shows it; or without it, why it cannot be decoded."""
+    """A message as a reply shows it, and what is to be noted on it."""
 
     time: Ns
     type_name: str
-    shown: Extracted | None
-    failure: str = ""
+    value: JsonValue
+    notes: tuple[str, ...]
 
 
-def _show_each(view: View, picked: Iterable[StoredMessage], fields: Sequence[str]) -> list[_Shown]:
-    """Returns messages as a reply shows them. None is in memory when the next one is read.
+def _show_each(
+    view: View, picked: Iterable[StoredMessage], fields: Sequence[str]
+) -> tuple[list[_Shown], Counter[str]]:
+    """Returns messages as a reply shows them, and how often which reason kept one from decoding.
 
-    Those without one of the fields, as of another type, are left out with a note.
+    None is in memory when the next one is read. Those without one of the fields, as of another
+    type, are left out with a note.
 
     Raises:
         InvalidArgumentsError: none has them.
     """
     shown: list[_Shown] = []
-    lacking: Counter[str] = Counter()
+    failures, lacking = Counter[str](), Counter[str]()
     for message in picked:
-        type_name = message.type
         try:
-            shown.append(_Shown(message.time, type_name, _decode_shown(view, message, fields)[1]))
+            _, extracted = _decode_shown(view, message, fields)
+            shown.append(_Shown(message.time, message.type, extracted.value, extracted.notes))
         except NoDataError as error:
-            shown.append(_Shown(message.time, type_name, None, error.detail))
+            failures[error.detail] += 1
         except InvalidArgumentsError as error:
             lacking[str(error)] += 1
         del message
     for detail, count in lacking.items():
-        if all(message.shown is None for message in shown):
+        if not shown:
             raise InvalidArgumentsError(detail)
         view.notes.add(f"{count} samples left out: {detail}")
-    return shown
-
-
-def _samples(
-    view: View, chosen: Sequence[_Shown], window: TimeWindow
-) -> tuple[tuple[Sample, ...], list[str]]:
-    """Returns the samples that can be decoded, and their types in order of appearance.
-
-    Raises:
-        NoDataError: none can be decoded.
-    """
-    samples: list[Sample] = []
-    types: dict[str, None] = {}
-    failures: Counter[str] = Counter()
-    for time, type_name, shown, failure in chosen:
-        if shown is None:
-            failures[failure] += 1
-            continue
-        samples.append(Sample(time, shown.value))
-        types[type_name] = None
-        view.notes.add(*shown.notes)
-    if failures and not samples:
-        undecodable = NoDataError(NoDataReason.UNDECODABLE, next(iter(failures)))
-        raise with_notes(view, window, undecodable)
-    for detail, count in failures.items():
-        view.notes.add(f"{count} samples left out: {detail}")
-    return tuple(samples), list(types)
+    return shown, failures
 
 
 def _age(stored: StoredMessage, now: Ns | None) -> Ns | None:

@@ -19,6 +19,7 @@ from ros2_memory import queries
 from ros2_memory.core.timebase import unix_from_ns, unix_rounded_up
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.results import ValueWhen
 from tests.support.closed_form import (
     CAMERA,
     LASER,
@@ -212,6 +213,7 @@ def test_the_battery_when_the_bumper_was_pressed(memory: Memory) -> None:
         value=True,
         fields=["percentage"],
     )
+    assert isinstance(answer, ValueWhen)
     assert answer.value is not None
     value: Any = answer.value.sample.value
     assert value["percentage"] == pytest.approx(0.775, abs=1e-4)

@@ -29,6 +29,14 @@ class Steps(NamedTuple):
     to_x: Floats
     to_y: Floats
 
+    def nearest_to(self, x: float, y: float) -> tuple[Floats, Floats]:
+        """Returns at which share of each step it is nearest to a point, and how far from it."""
+        along_x, along_y = self.to_x - self.x, self.to_y - self.y
+        size = along_x * along_x + along_y * along_y
+        share = (x - self.x) * along_x + (y - self.y) * along_y
+        share = (share / np.where(size > 0, size, 1.0)).clip(0.0, 1.0)
+        return share, np.hypot(self.x + share * along_x - x, self.y + share * along_y - y)
+
 
 class ClippedSteps(NamedTuple):
     """Parts of steps: which step, and from which share of it to which (0 to 1)."""

@@ -451,8 +451,8 @@ class BinnedWindow:
     def _time_in_window(self, spans: Sequence[tuple[Ns, Ns]]) -> Ns:
         """Returns how much time (ns) of half-open spans passed in the window."""
         start, stop = self._counted_bounds
-        inside = [(max(begin, start), min(end, stop)) for begin, end in spans]
-        return sum(self.elapsed.between(begin, end) for begin, end in inside if begin < end)
+        inside = ((max(begin, start), min(end, stop)) for begin, end in spans)
+        return self.elapsed.among(span for span in inside if span[0] < span[1])
 
     @property
     def _counted_bounds(self) -> tuple[Ns, Ns]:

@@ -59,7 +59,7 @@ from ros2_memory.history.held_values import Held, HeldValues, held_at, held_unti
 from ros2_memory.history.no_data import matching_topics, no_data_between, require_recorded
 from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
-from ros2_memory.history.scan import blocks, scan
+from ros2_memory.history.scan import blocks, in_time, scan
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
 from ros2_memory.insights.sightings import read_sightings
 from ros2_memory.insights.topic_events import events_back
@@ -259,20 +259,8 @@ def _events_in_order(
     Raises:
         QueryTimeoutError: the call's time runs out before any result.
     """
-    reading = view.call.partial_after(READING_S)
-    parts: list[TopicEvents] = []
-
-    def end_in_time(_: Ns) -> None:
-        if reading.expired() and parts:
-            raise QueryTimeoutError("the rest is left out")
-
-    try:
-        parts.extend(events_back(view, topic, window, reached=end_in_time))
-    except QueryTimeoutError:
-        if not parts:
-            raise
-        return parts[::-1], parts[-1].first
-    return parts[::-1], None
+    parts, since = in_time(view, events_back(view, topic, window), READING_S)
+    return parts[::-1], since
 
 
 def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> None:

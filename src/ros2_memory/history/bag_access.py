@@ -52,7 +52,7 @@ class BagAccess:
         self.memory = memory
         self.call = call
         with call.stages.timed("index"):
-            self.snapshot = memory.index.snapshot(reach)
+            self.snapshot = memory.snapshot(reach)
         call.saw(self.snapshot)
         self.notes = Notes()
         self._deadline = call.deadline
@@ -133,6 +133,7 @@ class BagAccess:
             return self.memory.reader.decode(stored.record)
         except UndecodableError as error:
             if failures is not None:
+                self.notes.added += 1
                 # A new one, since the one that was raised keeps the message by its traceback.
                 failures.append(UndecodableError(error.topic, error.type_name, error.reason))
             return None

@@ -118,7 +118,8 @@ class Memory:
 
     `scanner` scans topics, from its store where that has the bags; every answer is the same without
     the store. `large` is the turn to hold much of a bag, which the reader takes. `memo` has what
-    was found out about the bags and stays true.
+    was found out about the bags and stays true. `fixed` is the snapshot that answers, where it is
+    to be one and the same for several.
     """
 
     index: SnapshotSource
@@ -129,6 +130,11 @@ class Memory:
     scanner: Scanner
     large: LargeReads = field(default_factory=LargeReads)
     memo: Memo = field(default_factory=Memo)
+    fixed: Snapshot | None = None
+
+    def snapshot(self, reach: Ns | None = None) -> Snapshot:
+        """Returns what the index has, to a log time `reach` if there is data; or what is fixed."""
+        return self.fixed or self.index.snapshot(reach)
 
     def foreign(self, snapshot: Snapshot) -> Foreign | None:
         """Returns the bags that retention neither deletes nor counts: not made by the recorder.
@@ -398,8 +404,9 @@ class Notes:
 
     Attributes:
         complete: False once something that bears on the answer could not be read.
-        added: how many notes on files were added, again or not. What was computed while it stays
-            the same was read whole; `keys` would not show that a file failed twice.
+        added: how many notes on files were added, again or not, and how many messages were left
+            out that cannot be decoded. What was computed while it stays the same was read whole;
+            `keys` would not show that a file failed twice.
     """
 
     def __init__(self) -> None:

@@ -459,9 +459,8 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
         return None
     misdated = (fault.bag for fault in snapshot.dating.faults if fault.misleads)
     if not any(bag.reaches_into(asked) for bag in misdated):
-        around = view.gap_around(asked)
-        if around is not None:
-            return around
+        for gap in view.gaps(asked, around=True):
+            return gap
     segments = snapshot.timeline.segments_in(asked)
     bags = (bag for segment in segments for bag in segment.bags if not is_carried(bag.file))
     if any(bag.reaches_into(asked) for bag in bags):

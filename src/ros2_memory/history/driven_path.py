@@ -26,13 +26,12 @@ from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
-    QueryTimeoutError,
     UndecodableError,
 )
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import Pose, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.no_data import (
@@ -43,7 +42,7 @@ from ros2_memory.history.no_data import (
 )
 from ros2_memory.history.poses import PoseReader, PoseRows, poses_of
 from ros2_memory.history.robots import parallel_or_twice
-from ros2_memory.history.scan import blocks, joined_back, open_scan, remembered
+from ros2_memory.history.scan import blocks, in_time, joined_back, open_scan, remembered
 from ros2_memory.history.sessions import decoded_transforms
 from ros2_memory.history.transforms import (
     frames_of,
@@ -93,25 +92,10 @@ def path_by_poses(view: View, topic: str, window: TimeWindow) -> tuple[PathSlice
         NoDataError: no message can be decoded.
         QueryTimeoutError: the call's time runs out before any result.
     """
-    reading = view.call.partial_after(READING_S)
     failures: list[UndecodableError] = []
-    slices: list[PathSlice] = []
-    start = MAX_NS
-    since: Ns | None = None
-
-    def reached(_: Ns) -> None:
-        if reading.expired() and slices:
-            raise QueryTimeoutError("the rest is left out")
-
-    try:
-        for at, part in slices_of_path(view, topic, window, failures, reached):
-            start = at
-            if part.poses or part.invalid:
-                slices.append(part)
-    except QueryTimeoutError:
-        if not slices:
-            raise
-        since = start
+    timed = slices_of_path(view, topic, window, failures)
+    drawn = ((at, part) for at, part in timed if part.poses or part.invalid)
+    slices, since = in_time(view, drawn, READING_S)
     if failures and not slices:
         raise with_notes(view, window, undecodable(failures[0])) from failures[0]
     if failures:
@@ -126,7 +110,6 @@ def slices_of_path(
     topic: str,
     window: TimeWindow,
     failures: list[UndecodableError],
-    reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, PathSlice]]:
     """Yields the path in a window in slices, the newest first; see `slices_by_poses`."""
     fastest = view.limits.max_plausible_speed_mps
@@ -138,7 +121,6 @@ def slices_of_path(
         lambda piece: path_slice(piece.poses, fastest),
         failures=failures,
         settings=str(fastest),
-        reached=reached,
     )
 
 
@@ -152,7 +134,6 @@ def slices_by_poses(
     failures: list[UndecodableError],
     beside: Ns = 0,
     settings: str = "",
-    reached: Callable[[Ns], None] = lambda _: None,
 ) -> Iterator[tuple[Ns, T]]:
     """Yields what `make` returns of the robot's poses, slice by slice of the clock, newest first.
 
@@ -169,7 +150,6 @@ def slices_by_poses(
         failures: as for `pose_rows`.
         beside: poses so far before and after a slice (ns) are with it, too.
         settings: what it depends on besides the poses.
-        reached: as for `scan`.
 
     Raises:
         InvalidArgumentsError: while it is iterated, messages carry no position.
@@ -183,7 +163,7 @@ def slices_by_poses(
                 yield pose_slice.start, make(pose_slice)
         return
     twice = () if view.call.stored else parallel_or_twice(view, topic, window)
-    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    opened = open_scan(view, topic, window, stored=view.call.stored)
     reader = PoseReader(view, failures, twice)
 
     def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
@@ -200,7 +180,7 @@ def slices_by_poses(
                 before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
                 yield (
                     pose_slice.start,
-                    remembered(view, kind, key, load, reader.trouble, also_before=before),
+                    remembered(view, kind, key, load, also_before=before),
                 )
 
     def key_of(stretch: Stretch) -> FragmentKey | None:
@@ -216,9 +196,7 @@ def slices_by_poses(
         left_out = repr(near)
         return stretch.key(f"{settings} {sha256(left_out.encode()).hexdigest()}")
 
-    yield from joined_back(
-        view, opened, kind, made_in, key_of, beside=beside, trouble=reader.trouble
-    )
+    yield from joined_back(view, opened, kind, made_in, key_of, beside=beside)
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,7 +26,7 @@ from ros2_memory.history.scan import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.core.timebase import Ns
@@ -147,10 +147,6 @@ class PoseReader:
         is_whole = len(parts) == len(rows) and not any(map(self._held_by_others, rows))
         first, last = min(some.first for some in rows), max(some.last for some in rows)
         return PoseRows(first, last, partial(self._joined, rows), parts if is_whole else None)
-
-    def trouble(self) -> Hashable:
-        """Returns how many failures and notes there are: more once something could not be read."""
-        return len(self._failures), self._view.notes.added
 
     def _joined(self, rows: Sequence[Rows]) -> Poses:
         counting = map(self._without_others, rows)

@@ -25,7 +25,7 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.messages.to_json import evenly
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
@@ -115,7 +115,6 @@ def joined_back(
     key_of: Callable[[Stretch], FragmentKey | None] = Stretch.key,
     *,
     beside: Ns = 0,
-    trouble: Callable[[], Hashable] = lambda: None,
 ) -> Iterator[tuple[Ns, T]]:
     """Yields what `make` returns of the rows of a scan, the newest first, each with a time.
 
@@ -130,7 +129,6 @@ def joined_back(
             without parts the call may leave out what is not `stored`.
         key_of: returns under which key that of a stretch is remembered; None: under none.
         beside: how far before and after a stretch (ns) rows are part of it, too.
-        trouble: differs from before where something could not be read since.
     """
     for stretch in opened.stretches(beside):
         view.note_thinned(TimeWindow(stretch.window.start, stretch.last + 1))
@@ -142,7 +140,7 @@ def joined_back(
         results: list[tuple[Ns, T]] = []
         join = partial(_joined, kind, make(stretch), results)
         try:
-            joined = remembered(view, joining(kind), key, join, trouble)
+            joined = remembered(view, joining(kind), key, join)
         except QueryTimeoutError:
             # What there was time for is an answer, too, with a note.
             yield from results
@@ -164,7 +162,6 @@ def remembered(
     kind: FragmentKind[T],
     key: FragmentKey | None,
     make: Callable[[], T],
-    trouble: Callable[[], Hashable] = lambda: None,
     *,
     also_before: Ns = 0,
 ) -> T:
@@ -176,11 +173,35 @@ def remembered(
     fragments = view.memory.scanner.fragments(kind)
     fragment = None if key is None else fragments.get(key, also_before)
     if fragment is None:
-        before = trouble(), view.notes.added
+        before = view.notes.added
         fragment = make()
-        if key is not None and before == (trouble(), view.notes.added):
+        if key is not None and view.notes.added == before:
             fragments.put(key, fragment)
     return fragment
+
+
+def in_time(
+    view: View, timed: Iterable[tuple[Ns, V]], budget_s: float
+) -> tuple[list[V], Ns | None]:
+    """Returns what is yielded, the newest first, while there is time; and since when that is all.
+
+    None where it is. `timed`: each with a log time that nothing of it is earlier than.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before the first.
+    """
+    reading, found, since = view.call.partial_after(budget_s), list[V](), MAX_NS
+    try:
+        for at, one in timed:
+            if found and reading.expired():
+                return found, since
+            found.append(one)
+            since = at
+    except QueryTimeoutError:
+        if not found:
+            raise
+        return found, since
+    return found, None
 
 
 def blocks(scanned: Iterable[Rows], *, newest_first: bool) -> Iterator[list[Rows]]:

@@ -122,19 +122,16 @@ class View:
         if not part.empty and overlaps_any(self.timeline.thinned_times, part.start, part.stop - 1):
             self.call.used_thinned = True
 
-    def gaps(self, window: TimeWindow) -> Sequence[tuple[Ns, Ns]]:
-        """Returns the gaps of the snapshot that a window overlaps, without steps of the clock."""
-        first, last = window.asked()
-        gaps = self.snapshot.gaps
-        touched = [(start, end) for start, end in gaps if start < last and first < end]
-        return without_steps(self, touched) if touched else touched
+    def gaps(self, window: TimeWindow, *, around: bool = False) -> Sequence[tuple[Ns, Ns]]:
+        """Returns the gaps of the snapshot that a window overlaps, without steps of the clock.
 
-    def gap_around(self, window: TimeWindow) -> tuple[Ns, Ns] | None:
-        """Returns the one of `gaps` that all of a window lies in; None where there is none."""
-        # A window with an open start lies in none, so that these need not be looked for.
-        gaps = self.snapshot.gaps if window.start > MIN_NS else ()
-        around = [gap for gap in gaps if gap[0] < window.start and window.stop <= gap[1]]
-        return next(iter(without_steps(self, around)), None) if around else None
+        Or only the one that is `around` all of it.
+        """
+        first, last = window.asked()
+        bounds = (window.start, window.stop - 1) if around else (last, first)
+        gaps = self.snapshot.gaps
+        touched = [(start, end) for start, end in gaps if start < bounds[0] and bounds[1] < end]
+        return without_steps(self, touched) if touched else touched
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns what is recorded of a topic under each of its types, each message counted once.

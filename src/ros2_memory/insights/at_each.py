@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import date, datetime, time, timedelta
-from functools import wraps
-from typing import TYPE_CHECKING, Concatenate, Final, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
@@ -24,78 +23,36 @@ from ros2_memory.history.view import AtTime, TimeRange, ns_argument, search_wind
 from ros2_memory.results import AtEach, InEach, InWindow, MomentAnswer, NothingAt, OneAnswer
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
+    from collections.abc import Callable, Sequence
 
-    from ros2_memory.bag_dir.heartbeat import Heartbeat
-    from ros2_memory.history.context import Call, Memory, SnapshotSource
-    from ros2_memory.index.snapshot import Snapshot
-
-P = ParamSpec("P")
-A = TypeVar("A", bound=MomentAnswer)
-
+    from ros2_memory.history.context import Call, Memory
 
 MOST_WINDOWS: Final = 31
 """Days whose hours one call asks about."""
 
 
 def at_each(
-    query: Callable[Concatenate[Memory, Call, P], A],
-) -> Callable[Concatenate[Memory, Call, P], A | AtEach]:
-    """Returns a query that answers `moment.each` one by one, all from one snapshot of the index.
+    memory: Memory, moments: Sequence[AtTime], ask: Callable[[Memory, AtTime], MomentAnswer]
+) -> AtEach:
+    """Returns the answers for several moments, all from one snapshot of the index.
 
     Where there is nothing at one of the moments, `NothingAt` takes its place. Where there is
     nothing at any, for one and the same reason, that is raised as for a single moment.
     """
-
-    @wraps(query)
-    def answer(memory: Memory, call: Call, /, *args: P.args, **kwargs: P.kwargs) -> A | AtEach:
-        moment = kwargs["moment"]
-        if not isinstance(moment, AtTime) or not moment.each:
-            return query(memory, call, *args, **kwargs)
-        reach = max(ns_argument("timestamps", single.end_s) for single in moment.each)
-        fixed = replace(memory, index=OneSnapshot(memory.index, memory.index.snapshot(reach)))
-        answers: list[MomentAnswer | NothingAt] = []
-        failures: list[NoDataError] = []
-        for single in moment.each:
-            kwargs["moment"] = single
-            try:
-                answers.append(query(fixed, call, *args, **kwargs))
-            except NoDataError as error:
-                at = ns_argument("timestamps", single.at_s or 0.0)
-                answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
-                failures.append(error)
-        if len(failures) == len(answers) and len({failure.detail for failure in failures}) == 1:
-            raise failures[0]
-        return AtEach(tuple(answers))
-
-    return answer
-
-
-class OneSnapshot:
-    """An index that stays as it was: several answers are then of one and the same memory."""
-
-    def __init__(self, index: SnapshotSource, snapshot: Snapshot) -> None:
-        self.bag_dir = index.bag_dir
-        self.published: Snapshot | None = snapshot
-        self._index = index
-        self._snapshot = snapshot
-
-    def snapshot(self, reach: Ns | None = None) -> Snapshot:  # noqa: ARG002 - of the protocol
-        """Returns the snapshot that the index had."""
-        return self._snapshot
-
-    def refresh(self) -> Snapshot:
-        """Returns the same; nothing is read again."""
-        return self._snapshot
-
-    def heartbeat(self) -> Heartbeat | None:
-        """Returns the heartbeat of now."""
-        return self._index.heartbeat()
-
-    def joined_with(self, recording: Path) -> tuple[str, ...]:
-        """Returns the recordings that are joined with one now."""
-        return self._index.joined_with(recording)
+    reach = max(ns_argument("timestamps", moment.end_s) for moment in moments)
+    fixed = replace(memory, fixed=memory.snapshot(reach))
+    answers: list[MomentAnswer | NothingAt] = []
+    failures: list[NoDataError] = []
+    for moment in moments:
+        try:
+            answers.append(ask(fixed, moment))
+        except NoDataError as error:
+            at = ns_argument("timestamps", moment.at_s or 0.0)
+            answers.append(NothingAt(at, error.reason, error.detail, notes=error.notes))
+            failures.append(error)
+    if len(failures) == len(answers) and len({failure.detail for failure in failures}) == 1:
+        raise failures[0]
+    return AtEach(tuple(answers))
 
 
 def in_each(
@@ -118,12 +75,12 @@ def in_each(
     if span.around_s is not None:
         raise InvalidArgumentsError("between cannot be combined with around: one moment is asked")
     wall = memory.clock.now()
-    snapshot = memory.index.snapshot(min(search_window(span, wall).stop, wall))
+    snapshot = memory.snapshot(min(search_window(span, wall).stop, wall))
     whole = search_window(span, memory.now(wall, snapshot.latest, call))
     first, last = recorded_reach(snapshot, whole) or (0, -1)
     windows = hours_of_days(whole.intersect(TimeWindow(first, last + 1)), *between)
     begins = {window.start for window in windows}
-    fixed_memory = replace(memory, index=OneSnapshot(memory.index, snapshot))
+    fixed_memory = replace(memory, fixed=snapshot)
     answers: list[InWindow] = []
     notes: tuple[str, ...] = ()
     for window in windows:

@@ -43,7 +43,7 @@ from ros2_memory.history.scan import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
@@ -72,32 +72,19 @@ def events_in(view: View, topic: str, window: TimeWindow) -> TopicEvents | None:
     Raises:
         QueryTimeoutError: the call's time is over.
     """
-    return joined_events([*events_back(view, topic, window)][::-1])
+    return joined_events([events for _, events in events_back(view, topic, window)][::-1])
 
 
-def events_back(
-    view: View,
-    topic: str,
-    window: TimeWindow,
-    *,
-    reached: Callable[[Ns], None] = lambda _: None,
-) -> Iterator[TopicEvents]:
+def events_back(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns, TopicEvents]]:
     """Yields the events in times that do not overlap, the newest first.
 
-    `reached` is called before each table, as by `scan`.
+    Each with a log time (ns) before which none of its events is.
 
     Raises:
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
-    return (events for _, events in _timed_events_back(view, topic, window, reached))
-
-
-def _timed_events_back(
-    view: View, topic: str, window: TimeWindow, reached: Callable[[Ns], None] = lambda _: None
-) -> Iterator[tuple[Ns, TopicEvents]]:
-    """Yields as `events_back`, each with a log time (ns) before which none of its events is."""
     columns = StatedColumns(view.extractor)
-    opened = open_scan(view, topic, window, stored=view.call.stored, reached=reached)
+    opened = open_scan(view, topic, window, stored=view.call.stored)
 
     def make(stretch: Stretch) -> Iterator[tuple[Ns, TopicEvents]]:
         rows = opened.rows(newest_first=True, among=stretch.window)
@@ -120,7 +107,7 @@ def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterat
         QueryTimeoutError: while it is iterated, when the deadline has passed.
     """
     # The parts that lie across a bound of the window are made, too.
-    of_topics = [_timed_events_back(view, topic, window.widened(PART_NS)) for topic in topics]
+    of_topics = [events_back(view, topic, window.widened(PART_NS)) for topic in topics]
     yield from merge(*((at for at, _ in timed) for timed in of_topics), reverse=True)
 
 

@@ -47,7 +47,7 @@ from ros2_memory.core.memo import Key
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.regions import ClippedSteps, Region, Steps, clipped
 from ros2_memory.core.text import Reason
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Note
 from ros2_memory.history.driven_path import (
     Body,
@@ -57,7 +57,7 @@ from ros2_memory.history.driven_path import (
 )
 from ros2_memory.history.poses import PoseReader
 from ros2_memory.history.robots import recordings_apart
-from ros2_memory.history.scan import joined_back, open_scan, remembered, scan
+from ros2_memory.history.scan import in_time, joined_back, open_scan, remembered, scan
 from ros2_memory.history.transforms import (
     edges_of_rows,
     frames_over,
@@ -172,21 +172,17 @@ class TrackReader:
             return known[key]
         # Whole slices, so that no vertex depends on the window; and what may reach into it.
         around = window.widened(SILENCE_NS).aligned(TRACK_SLICE_NS)
-        found: list[tuple[Ns, PartialTrack]] = []
-        since: Ns | None = None
         try:
-            found.extend(self._tracks_back(around, view.call.partial_after(_READING_S)))
+            tracks, since = in_time(view, self._tracks_back(around), _READING_S)
         except QueryTimeoutError as error:
-            if not found:
-                raise QueryTimeoutError(
-                    f"the question needs more time; {view.bags.filling_progress()}"
-                    "ask about a shorter window"
-                ) from error
-            since = found[-1][0]
+            raise QueryTimeoutError(
+                f"the question needs more time; {view.bags.filling_progress()}"
+                "ask about a shorter window"
+            ) from error
         if self._failures:
             note_left_out(view, self._failures[0])
-        left_out = sum(track.left_out for _, track in found)
-        track, others = self._joined([track for _, track in found], around)
+        left_out = sum(track.left_out for track in tracks)
+        track, others = self._joined(tracks, around)
         known[key] = KnownTrack(track, since, left_out, others)
         return known[key]
 
@@ -216,11 +212,9 @@ class TrackReader:
             InvalidArgumentsError: messages of the topic of poses carry no position.
             QueryTimeoutError: the call's time runs out.
         """
-        return (at for at, _ in self._tracks_back(window.widened(2 * PART_NS), Deadline.never()))
+        return (at for at, _ in self._tracks_back(window.widened(2 * PART_NS)))
 
-    def _tracks_back(
-        self, window: TimeWindow, reading: Deadline
-    ) -> Iterator[tuple[Ns, PartialTrack]]:
+    def _tracks_back(self, window: TimeWindow) -> Iterator[tuple[Ns, PartialTrack]]:
         """Yields partial tracks, the newest first, each with a time that it is not earlier than."""
         # Whole parts, also those that the window cuts: their tracks are stored.
         whole = window.aligned(PART_NS)
@@ -233,9 +227,8 @@ class TrackReader:
                 self._view,
                 opened,
                 TRACKS,
-                partial(self._tracks_in, opened, moving, window, reading),
+                partial(self._tracks_in, opened, moving, window),
                 partial(self._stretch_key, opened, moving, window),
-                trouble=lambda: len(self._failures),
             )
 
     def _tracks_in(
@@ -243,7 +236,6 @@ class TrackReader:
         opened: Scan,
         scans: Sequence[Scan],
         window: TimeWindow,
-        reading: Deadline,
         stretch: Stretch,
     ) -> Iterator[tuple[Ns, PartialTrack]]:
         """Yields the track table by table, of those that begin in a stretch, the newest first."""
@@ -256,14 +248,14 @@ class TrackReader:
             if key is None and stretch.parts is None and self._view.call.stored:
                 continue
             if window.covers(rows.first, rows.last):
-                yield rows.first, self._track_by(rows, key, lent_spans, reading)
+                yield rows.first, self._track_by(rows, key, lent_spans)
                 continue
             stored = None if key is None else self._view.memory.scanner.fragments(TRACKS).get(key)
             if stored is not None and not stored.left_out:
                 yield rows.first, stored.some(_positions_in(stored.times, window))
             elif (inside := _positions_in(rows.times, window)).size:
                 lent_spans = self._lent_spans(rows, window)
-                yield rows.first, self._track_by(rows.some(inside), None, lent_spans, reading)
+                yield rows.first, self._track_by(rows.some(inside), None, lent_spans)
 
     def _stretch_key(
         self, opened: Scan, scans: Sequence[Scan], window: TimeWindow, stretch: Stretch
@@ -316,18 +308,15 @@ class TrackReader:
         rows: Rows,
         key: FragmentKey | None,
         lent_spans: Sequence[_LentSpan],
-        reading: Deadline,
     ) -> PartialTrack:
         """Returns the track by some rows: what is stored of it, else made now."""
 
         def make() -> PartialTrack:
-            if reading.expired():
-                raise QueryTimeoutError("to place poses takes too long")
             placed = self._poses_of(rows, lent_spans)
             recording = relative(str(rows.recording), str(self._view.bag_dir))
             return partial_track(*placed)._replace(recording=recording)
 
-        return remembered(self._view, TRACKS, key, make, lambda: len(self._failures))
+        return remembered(self._view, TRACKS, key, make)
 
     def _rows_key(
         self, rows: Rows, lent_spans: Sequence[_LentSpan], scans: Sequence[Scan]

@@ -13,6 +13,7 @@ import numpy as np
 from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import RobotTrack, jumps
 from ros2_memory.core.arrays import Groups, distinct_rows
+from ros2_memory.core.regions import Steps
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -154,17 +155,8 @@ def _thinned(points: Floats, times: Times) -> tuple[Floats, Times]:
 
 def _distances_to(points: Floats, steps: _Steps) -> list[float]:
     """Returns how far (m) each of some points is from the nearest step."""
-    along, begin = steps.end - steps.begin, steps.begin
-    (along_x, along_y), (begin_x, begin_y) = along.T.copy(), begin.T.copy()
-    size = along_x * along_x + along_y * along_y
-    whole = np.where(size > 0, size, 1.0)
-    distances = []
-    for x, y in points.tolist():
-        share = (x - begin_x) * along_x + (y - begin_y) * along_y
-        share = np.clip(share / whole, 0.0, 1.0)
-        away_x, away_y = begin_x + share * along_x - x, begin_y + share * along_y - y
-        distances.append(float(np.hypot(away_x, away_y).min()))
-    return distances
+    lines = Steps(*steps.begin.T.copy(), *steps.end.T.copy())
+    return [float(lines.nearest_to(x, y)[1].min()) for x, y in points.tolist()]
 
 
 def placed_standstills(

@@ -22,7 +22,7 @@ from ros2_memory.analysis.intervals import FLICKER_NS
 from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS, RobotTrack
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.regions import Circle, Region
+from ros2_memory.core.regions import Circle, Region, Steps
 from ros2_memory.core.spans import Spans, united
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, MIN_NS, NS_PER_S, Ns, ns_from_unix
 from ros2_memory.history.clock_steps import elapsed_in
@@ -428,11 +428,8 @@ class ConfirmedStays:
             np.interp(inner - since, times - since, column[first : last + 1])
             for column in (track.x, track.y)
         )
-        dx, dy = np.diff(x), np.diff(y)
-        size = dx * dx + dy * dy
-        along = (circle.x - x[:-1]) * dx + (circle.y - y[:-1]) * dy
-        along = (along / np.where(size > 0, size, 1.0)).clip(0.0, 1.0)
-        off = np.hypot(x[:-1] + along * dx - circle.x, y[:-1] + along * dy - circle.y)
+        line = Steps(x[:-1], y[:-1], x[1:], y[1:])
+        along, off = line.nearest_to(circle.x, circle.y)
         nearest = int(off.argmin())
         lasted = int(inner[nearest + 1] - inner[nearest])
         at = int(inner[nearest] + round(float(along[nearest]) * lasted))

@@ -237,7 +237,7 @@ class Match(AnswerWithNotes):
 class ValueWhen(AnswerWithNotes):
     """A match on one topic, and the value of another at that time; None if it had none yet."""
 
-    matched: TopicValue | None
+    matched: TopicValue
     value: TopicValue | None = None
 
     @property

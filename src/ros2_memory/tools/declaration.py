@@ -14,8 +14,8 @@ from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
-from ros2_memory.history.view import TimeRange
-from ros2_memory.insights.at_each import in_each
+from ros2_memory.history.view import AtTime, TimeRange
+from ros2_memory.insights.at_each import at_each, in_each
 from ros2_memory.tools.arguments import (
     FORMS_OF_TIME,
     REGION_KINDS,
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.results import Answer, OneAnswer
+    from ros2_memory.results import Answer, MomentAnswer, OneAnswer
 
 
 _MAX_UNKNOWN_NAMED: Final = 5
@@ -381,16 +381,22 @@ class ToolDeclaration:
         arguments = dict(signature.parse(given))
         between = cast("tuple[time, time] | None", arguments.pop("between", None))
         query, chosen = self._bound(arguments)
-        if between is None:
-            return lambda memory, call: query(memory, call, **chosen)
 
         def asked(memory: Memory, call: Call) -> Answer:
-            def ask(fixed: Memory, own: TimeRange) -> OneAnswer:
+            def at(fixed: Memory, own: AtTime) -> MomentAnswer:
+                return cast("MomentAnswer", query(fixed, call, **{**chosen, "moment": own}))
+
+            def over(fixed: Memory, own: TimeRange) -> OneAnswer:
                 parts = {"span": own, "start_s": own.start_s, "end_s": own.end_s, "last_s": None}
                 bounds = {name: value for name, value in parts.items() if name in chosen}
                 return cast("OneAnswer", query(fixed, call, **{**chosen, **bounds}))
 
-            return in_each(memory, call, _span_of(chosen), between, ask)
+            moment = chosen.get("moment")
+            if isinstance(moment, AtTime) and moment.each:
+                return at_each(memory, moment.each, at)
+            if between is not None:
+                return in_each(memory, call, _span_of(chosen), between, over)
+            return query(memory, call, **chosen)
 
         return asked
 

@@ -205,10 +205,8 @@ def as_json(answer: results.OneAnswer, bag_dir: Path) -> JsonValue:
     match answer:
         case tuple():
             reply = [shown(row, Scope()) for row in answer]
-        case results.Match(found=None, notes=()) | results.ValueWhen(matched=None, notes=()):
+        case results.Match(found=None, notes=()):
             pass
-        case results.ValueWhen(matched=None):
-            reply = render(results.Match(None, notes=answer.notes), bag_dir)
         case results.AtEach():
             reply = _at_each(answer, bag_dir)
         case results.InEach():
@@ -227,7 +225,7 @@ def _with_all_notes(answer: results.OneAnswer) -> results.OneAnswer:
     match answer:
         case results.Match(found=found) if found is not None:
             return replace(answer, notes=tuple(dict.fromkeys((*found.notes, *answer.notes))))
-        case results.ValueWhen(matched=matched, value=value) if matched is not None:
+        case results.ValueWhen(matched=matched, value=value):
             value_notes = () if value is None else value.notes
             return replace(
                 answer, notes=tuple(dict.fromkeys((*matched.notes, *value_notes, *answer.notes)))

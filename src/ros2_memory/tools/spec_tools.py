@@ -14,7 +14,6 @@ from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.text import match_topics
 from ros2_memory.counts.numbers import count_range
 from ros2_memory.counts.robot import count_path
-from ros2_memory.insights.at_each import at_each
 from ros2_memory.insights.episodes import topic_changes
 from ros2_memory.places.driven_inside import driven_inside
 from ros2_memory.tools.arguments import (
@@ -129,7 +128,7 @@ DECLARATIONS = (
         "(default {tolerance}, too little for slow topics; latched: any age). "
         "Reply: {{topic, type, timestamp, value}}.",
         TopicAtArguments,
-        at_each(queries.topic_value),
+        queries.topic_value,
     ),
     ToolDeclaration(
         (
@@ -152,7 +151,7 @@ DECLARATIONS = (
         "(counter-clockwise from x), timestamp, topic, frame_id, in, also_in (room)}}; "
         "NavSatFix: latitude, longitude, altitude; x, y, z null.",
         PositionArguments,
-        at_each(queries.position),
+        queries.position,
     ),
     ToolDeclaration(
         _at_and_ago("velocity", "Velocity"),
@@ -160,7 +159,7 @@ DECLARATIONS = (
         "angular: {{x, y, z}} (rad/s), timestamp, topic, frame_id}}. In the robot's own frame "
         "x is forward, positive angular z turns left.",
         MotionArguments,
-        at_each(queries.velocity),
+        queries.velocity,
     ),
     ToolDeclaration(
         _at_and_ago("transform", "Transform"),
@@ -168,7 +167,7 @@ DECLARATIONS = (
         "interpolated. Reply: {{translation (m), rotation (quaternion), yaw_deg, timestamp, "
         "parent, child, clock}}.",
         TransformArguments,
-        at_each(queries.transform),
+        queries.transform,
     ),
     ToolDeclaration(
         (ToolName("list_frames", "Frames"),),

@@ -30,6 +30,7 @@ from ros2_memory.insights.recap import recap
 from ros2_memory.insights.sightings import find_matches
 from ros2_memory.places.visits import visits
 from ros2_memory.queries import frames, value_when
+from ros2_memory.results import ValueWhen
 from tests.support.bags import (
     Msg,
     boolean,
@@ -427,6 +428,7 @@ def test_a_value_is_of_the_recording_of_the_match(tmp_path: Path) -> None:
     reply = value_when(
         memory, Call(), "/odom", "/bumper", condition_type="equals", value=True, fields=[]
     )
+    assert isinstance(reply, ValueWhen)
     assert reply.value is not None
     assert reply.value.sample.time == T0 + 49 * S // 5 + S // 10
     assert [note for note in reply.notes if "/bumper" in note and note.endswith(": r1, r2")]
@@ -438,6 +440,7 @@ def test_a_value_of_another_recording_than_the_match_is_noted(tmp_path: Path) ->
     record(tmp_path / "r2", drive(T0, 20))
     memory = memory_of(tmp_path)
     reply = value_when(memory, Call(), "/odom", "/bumper", condition_type="equals", value=True)
+    assert isinstance(reply, ValueWhen)
     assert reply.value is not None
     assert [note for note in reply.notes if "of recording r1" in note and "of r2" in note]
 

@@ -366,7 +366,7 @@ def test_where_places_are_known_in_part_matches_there_have_no_total(
     ask: Callable[..., Any],
 ) -> None:
     where = {"x": 0.5, "y": 0.0, "radius_m": 2.0}
-    reply = ask("find_matches", 2, **BUMPS, where=where, limit=100, **SPAN)
+    reply = ask("find_matches", 1, **BUMPS, where=where, limit=100, **SPAN)
     assert reply["at_least"] == len(reply["sightings"]) == 2
     assert reply["unknown_s"] > 0
     assert "total" not in reply
