@@ -11,7 +11,6 @@ import math
 import sys
 from bisect import bisect_right
 from collections import defaultdict
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -23,21 +22,14 @@ from ros2_memory.columns.table import Table
 from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError, UndecodableError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.counts.bins import MOST_CELLS, BinnedWindow, By
 from ros2_memory.counts.matches import count_values
 from ros2_memory.history.context import READING_S
 from ros2_memory.history.no_data import no_data_between, resolve_topic
 from ros2_memory.history.reverse_search import note_no_fix, note_summarised
 from ros2_memory.history.robots import note_robots
-from ros2_memory.history.scan import (
-    blocks,
-    count_messages,
-    decoded_rows,
-    messages_of,
-    of_columns,
-    scan,
-)
+from ros2_memory.history.scan import count_messages, decoded_rows, messages_of, of_columns, scan
 from ros2_memory.history.view import TimeRange, View, open_span
 
 if TYPE_CHECKING:
@@ -149,6 +141,8 @@ class PieceNumbers:
         self.failures: list[UndecodableError] = []
         self._read = 0
         self._reading = view.call.partial_after(READING_S)
+        self._reached_to: Ns = MAX_NS
+        self._pending: list[Rows] = []
         self._parts: defaultdict[tuple[int, int], list[Part]] = defaultdict(list)
         self._exact_extremes: dict[tuple[int, int, Extreme], Extreme] = {}
         self._columns: dict[tuple[Definition, str, str], str | None] = {}
@@ -160,18 +154,18 @@ class PieceNumbers:
             QueryTimeoutError: the call's time runs out before any result.
             TooManyError: too many messages would have to be read.
         """
-        scanned, reached = scan(self._view, self._topic, window, newest_first=True), MAX_NS
         try:
-            for together in blocks(scanned, newest_first=True):
-                if self._reading.expired() and self._parts:
-                    raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
-                for rows in together:
-                    self._add(rows)
-                reached = min(rows.first for rows in together)
+            for rows in scan(
+                self._view, self._topic, window, newest_first=True, reached=self._add_newer_than
+            ):
+                self._pending.append(rows)
         except QueryTimeoutError:
             if not self._parts:
                 raise
-            self.since = reached
+            self.since = self._reached_to + 1
+        for rows in self._pending:
+            self._add(rows, MIN_NS if self.since is None else self.since)
+        self._pending.clear()
         note_summarised(self._view, self._topic, self._fields, window)
 
     def parts(self, field: int, piece: int) -> Sequence[Part]:
@@ -197,11 +191,21 @@ class PieceNumbers:
                 least = min(least, self._exact_extreme(field, sign, extreme))
         return (least.low * sign, least.first) if candidates else None
 
-    def _add_totals(self, rows: Rows) -> bool:
+    def _add_newer_than(self, at: Ns) -> None:
+        """Adds what no table that is left overlaps; ends the scan where the time is over."""
+        complete = [rows for rows in self._pending if rows.span[0] > at]
+        self._pending = [rows for rows in self._pending if rows.span[0] <= at]
+        for rows in complete:
+            self._add(rows, MIN_NS)
+        self._reached_to = at
+        if self._reading.expired() and self._parts:
+            raise QueryTimeoutError("the rest is left out")
+
+    def _add_totals(self, rows: Rows, since: Ns) -> bool:
         """Adds the numbers of a part, if all are of one piece and its outline tells them."""
         piece = bisect_right(self._edges, rows.first)
         is_cut = piece != bisect_right(self._edges, rows.last)
-        if rows.index is not None or is_cut:
+        if rows.index is not None or is_cut or rows.first < since:
             return False
         outlines = [self._outlined(rows, field) for field in range(len(self._fields))]
         stated = [part for part in outlines if part is not None]
@@ -229,15 +233,15 @@ class PieceNumbers:
         greatest = Extreme(-zone.high, -zone.high, *totals.greatest)
         return Part(rows.first, rows.last, totals.size, totals.total * SUM_SCALE, least, greatest)
 
-    def _add(self, rows: Rows) -> None:
-        """Adds the numbers of a table."""
-        if self._add_totals(rows):
+    def _add(self, rows: Rows, since: Ns) -> None:
+        """Adds the numbers of a table from a log time on."""
+        if self._add_totals(rows, since):
             return
         stored = of_columns(self._view, rows, self._numbers_of_fields)
         if stored is None:
-            self._add_from_messages(rows)
+            self._add_from_messages(rows, since)
         for part_of_rows, numbers_of_fields in stored or ():
-            self._add_to_pieces(part_of_rows, numbers_of_fields)
+            self._add_to_pieces(part_of_rows, numbers_of_fields, self._pieces(part_of_rows, since))
 
     def _numbers_of_fields(self, rows: Rows) -> tuple[Rows, list[FieldNumbers]] | None:
         """Returns rows with the numbers of all fields in them; None where columns lack some."""
@@ -253,13 +257,14 @@ class PieceNumbers:
         self,
         rows: Rows,
         numbers_of_fields: Sequence[FieldNumbers],
+        pieces: Iterable[tuple[int, int, int]],
     ) -> None:
-        """Adds the numbers of each field in some rows to their pieces."""
+        """Adds the numbers of each field in some rows to pieces, which are as `_pieces` yields."""
         outlines = [
             self._outlined(rows, field) if rows.index is None else None
             for field in range(len(numbers_of_fields))
         ]
-        for piece, start, stop in self._pieces(rows):
+        for piece, start, stop in pieces:
             is_whole = stop - start == len(rows)
             first, last = rows.span if is_whole else rows.times[[start, stop - 1]].tolist()
             for field, (numbers_of_field, outline) in enumerate(
@@ -270,19 +275,21 @@ class PieceNumbers:
                     part = _part_of(rows, numbers_of_field, (begin, end), (first, last), outline)
                     self._parts[field, piece].append(part)
 
-    def _pieces(self, rows: Rows) -> Iterator[tuple[int, int, int]]:
+    def _pieces(self, rows: Rows, since: Ns) -> Iterator[tuple[int, int, int]]:
         """Yields the number of each piece of some rows, with its first row and the one after it."""
         first, last = rows.span
         begin, end = (bisect_right(self._edges, at) for at in (first, last))
-        if begin == end:
+        if begin == end and since <= first:
             yield begin, 0, len(rows)
             return
-        bounds = [0, *np.searchsorted(rows.times, self._edges[begin:end]).tolist(), len(rows)]
-        for piece, (start, stop) in enumerate(pairwise(bounds), begin):
-            if start < stop:
-                yield piece, start, stop
+        edges = np.append(since, self._edges[begin:end])
+        least, *bounds = np.searchsorted(rows.times, edges).tolist()
+        starts, stops = [0, *bounds], [*bounds, len(rows)]
+        for piece, (start, stop) in enumerate(zip(starts, stops, strict=True), begin):
+            if max(start, least) < stop:
+                yield piece, max(start, least), stop
 
-    def _add_from_messages(self, rows: Rows) -> None:
+    def _add_from_messages(self, rows: Rows, since: Ns) -> None:
         """Does as `_add`, by the messages: columns do not hold all fields."""
         self._read += len(rows)
         if self._most_read is not None and self._read > self._most_read:
@@ -303,7 +310,7 @@ class PieceNumbers:
                 table = Table(rows.table.channel, times, times, times)
                 read = Rows(BagUnit(bag, table, 0), lambda: None)
                 numbers_of_fields = [*map(_numbers_of_samples, samples)]
-                self._add_to_pieces(read, numbers_of_fields)
+                self._add_to_pieces(read, numbers_of_fields, self._pieces(read, since))
 
     def _exact_extreme(self, field: int, sign: int, extreme: Extreme) -> Extreme:
         """Returns an extreme with its number and message known; by the bags where it is open."""

@@ -122,8 +122,8 @@ def test_what_there_is_no_time_to_count_is_no_number_and_no_row(
     assert cells(part, "first") == [messages[900].log_time] * 2
     assert cells(part, "percentage.min_at") == cells(part, "first")
     assert cells(part, "percentage.max") == cells(whole, "percentage.max")[-2:]
-    assert cells(part, "recorded_s") == [1790 * S] * 2
-    assert part.notes[0].startswith(f"only what is after {messages[900].log_time / S:.0f}.")
+    assert cells(part, "recorded_s") == [1790 * S + 9 * S + 999_999_999] * 2
+    assert part.notes[0].startswith(f"only what is after {messages[899].log_time / S:.0f}.")
     assert not any(note.startswith("no rows") for note in part.notes)
 
 
