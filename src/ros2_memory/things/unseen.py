@@ -157,19 +157,20 @@ def _found_in_singular(
     A search takes a text as it stands, and `find_things` a label in either form.
     """
     test = condition.test
-    text = test.folded if isinstance(test, Contains | Equals) else None
-    one = singular(_ARTICLE.sub("", plain(text or "")))
-    if text is None or one == plain(text):
+    if not isinstance(test, Contains | Equals) or test.folded is None:
         return ()
-    other = replace(test, needle=one) if isinstance(test, Contains) else Equals(one)
-    stored = None
-    with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
-        search = ReverseSearch(view, topic, replace(condition, test=other))
-        stored = search.newest(window.stop, window.start)
-    if stored is None:
-        return ()
-    at = unix_text(stored.time)
-    return (f"{abbreviate(text)} was not found, but {abbreviate(one)} was, last at {at}",)
+    bare = _ARTICLE.sub("", plain(test.folded))
+    for word in dict.fromkeys((bare, singular(bare))):
+        if word == plain(test.folded):
+            continue
+        other = replace(test, needle=word) if isinstance(test, Contains) else Equals(word)
+        with suppress(QueryTimeoutError, InvalidArgumentsError):  # no level is named so
+            search = ReverseSearch(view, topic, replace(condition, test=other))
+            stored = search.newest(window.stop, window.start)
+            if stored is not None:
+                said = f"{abbreviate(test.folded)} was not found, but {abbreviate(word)} was"
+                return (f"{said}, last at {unix_text(stored.time)}",)
+    return ()
 
 
 def notes_on(view: View, known: KnownThings, asked: Asked) -> Iterator[str]:

@@ -147,6 +147,13 @@ def test_never_of_a_plural_says_that_the_singular_was_found(tmp_path: Path) -> N
     assert queries.find_last_match(*never).notes == ()
 
 
+def test_never_with_an_article_names_the_word_that_was_found(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bag.mcap", [detections(BEGIN, ["scissors"])])
+    note = f'"the scissors" was not found, but "scissors" was, last at {BEGIN / S:.6f}'
+    found = find_matches(memory_of(tmp_path), Call(), OBJECTS, "contains", "the scissors")
+    assert found.notes == (note,)
+
+
 def test_never_of_a_plural_while_something_holds_claims_nothing_of_other_times(
     tmp_path: Path,
 ) -> None:
