@@ -443,7 +443,7 @@ def _thousandths(scores: Floats) -> Ints:
 
 
 def bin_of(thousandths: Ints) -> Ints:
-    """Returns the bins of scores; -1 of what has none."""
+    """Returns the bin of each score; -1 where there is no score."""
     return np.minimum(thousandths * SCORE_BINS // 1000, SCORE_BINS - 1)
 
 

@@ -58,7 +58,7 @@ class Cleared:
             self.add_fault(bag, error)
 
     def add_fault(self, path: Path | str, error: OSError) -> None:
-        """Adds a sentence, or only counts it once there are `MOST_FAULTS`; not of what has gone."""
+        """Reports a file that cannot be deleted; beyond `MOST_FAULTS` only how many there are."""
         if isinstance(error, FileNotFoundError):
             return
         if len(self.faults) < MOST_FAULTS:

@@ -175,16 +175,26 @@ class Tally(NamedTuple):
 
 @dataclass(slots=True)
 class Estimate:
-    """The things in sights, sorted by label and place, and of the sights what answers need."""
+    """The things in sights, sorted by label and place, and the columns of sights for answers.
+
+    Attributes:
+        topics: of the detectors.
+        labels: as detectors write them.
+        spots: one row for each slice, label and place; see `Spot` for its columns.
+        unplaced: the detections without a place.
+        scores: of each spot, how many detections that count have a score in each bin.
+        hits: of each spot, how often it was seen in each of `looks`.
+        looks: of the detectors.
+        instances: the things that stay where they are for a while.
+        movers: those that do not.
+    """
 
     topics: tuple[str, ...]
     labels: tuple[str, ...]
     spots: Columns
     unplaced: Ints
     scores: Tally
-    """Of the detections that count."""
     hits: Tally
-    """Likewise."""
     looks: Looks
     instances: list[Instance]
     movers: list[Mover]
