@@ -8,7 +8,6 @@ messages themselves where the indexes of a file are missing or wrong (see `mcap.
 
 from __future__ import annotations
 
-import struct
 from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -52,15 +51,12 @@ from ros2_memory.storage.mcap.bulk import (
     read_groups,
 )
 from ros2_memory.storage.mcap.chunk import (
-    NO_MESSAGES,
-    NOT_THERE,
     Chunk,
     Column,
     Pairs,
     declarations_of,
     in_file_order,
     index_groups,
-    joined,
     pairs_in,
     require_indexed,
     walk_chunk,
@@ -69,7 +65,6 @@ from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     DoubtError,
     McapIndex,
-    chunk_columns,
     chunk_data,
     index_from_summary,
 )
@@ -78,29 +73,24 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
     BodyStream,
-    Declarations,
     closing_of,
     file_records,
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
-from ros2_memory.storage.zstd_bag import FRAME_MAGIC, Uncompressed, uncompressed_payload
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, uncompressed_payload
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
-
-    from ros2_memory.storage.base import IntArray
 
 
 _LARGE_BYTES: Final = 8 << 20
 _REASONS_BYTES: Final = 1 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
-_COMPARED: Final = -1
-"""In place of a channel: all indexes of a chunk were found right."""
-_YES: Final = NO_MESSAGES
 _NEXT_BUT_ONE: Final = 2
+_EVERYTHING: Final = TimeWindow.everything()
 
 
 class _ContradictedError(UnreadableError):
@@ -132,11 +122,10 @@ class McapBags:
         max_chunk_mb: int = MAX_CHUNK_MB,
         large: LargeReads | None = None,
     ) -> None:
-        self._limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
-        self._uncompressed = partial(uncompressed_payload, limit=self._limit)
-        self._indexes: ByteLru[McapIndex | Column] = ByteLru((cache_mb << 20) // 2)
-        self._chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
-        self._contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
+        self.limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
+        self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 2)
+        self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
+        self.contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
 
     def closing(self, path: Path) -> Closing:
         """Returns whether the writer has finished the file."""
@@ -146,7 +135,7 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
-            index = self._verified(file, self._index(file))
+            index = _Reading(self, file).verified()
         totals = [
             ChannelTotal(
                 index.channels[number],
@@ -169,7 +158,7 @@ class McapBags:
     def channels(self, path: Path) -> Sequence[Channel]:
         """Returns the channels declared in the file."""
         with OpenFile(path) as file:
-            return list(self._index(file).channels.values())
+            return list(_Reading(self, file).index.channels.values())
 
     def profile(self, path: Path) -> str:
         """Returns the profile in the header of the file; empty if there is no header."""
@@ -187,24 +176,9 @@ class McapBags:
 
         An error is yielded in place of the messages of a damaged chunk, where the first would be.
         """
-        if window.empty:
-            return
-        with OpenFile(path) as file:
-            index = self._index(file)
-            if index.contradiction:
-                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
-            try:
-                runs = self._runs(file, index, topics, window, newest_first=newest_first)
-                yield from merged(runs, newest_first=newest_first)
-            except _ContradictedError as error:
-                # Raised in place of a run: what was yielded lies before all that the run can hold.
-                right = self._distrust(file, error)
-                yield ContradictionError(right.contradiction, window.start, window.stop - 1)
-                left, passed = _split_window(window, error.chunk, newest_first=newest_first)
-                if overlooked := _overlooked(index, right, _wanted(right, topics), passed):
-                    yield LostError(str(error), *overlooked)
-                runs = self._runs(file, right, topics, left, newest_first=newest_first)
-                yield from merged(runs, newest_first=newest_first)
+        if not window.empty:
+            with OpenFile(path) as file:
+                yield from _Reading(self, file, topics, window).records(newest_first=newest_first)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str]
@@ -213,90 +187,204 @@ class McapBags:
 
         An error is yielded in place of the messages of a damaged chunk.
         """
-        if window.empty:
-            return
-        with OpenFile(path) as file:
-            index = self._index(file)
-            if index.contradiction:
-                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
-            wanted = _wanted(index, topics)
-            read = {number for number, channel in wanted.items() if channel.topic not in bare}
-            passed: dict[int, Chunk] = {}
+        if not window.empty:
+            with OpenFile(path) as file:
+                yield from _Reading(self, file, topics, window).batches(bare)
+
+
+class _Reading:
+    """One reading of an open file: messages of some topics in a window of log time."""
+
+    def __init__(
+        self,
+        bags: McapBags,
+        file: OpenFile,
+        topics: Collection[str] = (),
+        window: TimeWindow = _EVERYTHING,
+    ) -> None:
+        self._bags = bags
+        self._file = file
+        self._topics = topics
+        self._window = window
+        self._uncompressed = partial(uncompressed_payload, limit=bags.limit)
+        self.index = self._known_index()
+
+    def _known_index(self) -> McapIndex:
+        file, limit = self._file, self._bags.limit
+        index = self._bags.indexes.get(file.key)
+        if isinstance(index, McapIndex):
+            return index
+        reason = self._bags.contradictions.get(file.key)
+        if reason is not None:
+            return self._index_without_indexes(reason)
+        if not is_finished(file):
+            return self._remembered(index_by_scan(file, limit))
+        try:
+            index = index_from_summary(file)
+        except DoubtError as doubt:
+            index = index_by_scan(file, limit, str(doubt))
+        except UnreadableError as error:
+            return self._without_indexes(error)
+        return self._remembered(index)
+
+    def _remembered(self, index: McapIndex) -> McapIndex:
+        self._bags.indexes.put(self._file.key, index, index.memory_bytes)
+        return index
+
+    def _without_indexes(self, error: UnreadableError) -> McapIndex:
+        """Returns an index of the messages themselves, in place of one that was found wrong."""
+        reason, key = f"{error}; {READ_WITHOUT_INDEXES}", self._file.key
+        # Kept apart from the index: not every read that follows would find it out again.
+        self._bags.contradictions.put(key, reason, len(reason) + len(key.path) + 200)
+        return self._index_without_indexes(reason)
+
+    def _index_without_indexes(self, reason: str) -> McapIndex:
+        index = index_by_scan(self._file, self._bags.limit, reason)
+        return self._remembered(index._replace(contradiction=reason))
+
+    def verified(self) -> McapIndex:
+        """Returns the index if its first and last times agree with the messages; else another.
+
+        A bag is chosen for a question by these times: a wrong one would hide its messages.
+        """
+        index = self.index
+        totals = index.totals.values()
+        ends = sorted({end for total in totals for end in (total.first, total.last)})
+        odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
+        looked_at = {chunk.offset for chunk in odd}
+        left = _VERIFIED_BYTES
+        for chunk in index.chunks:
+            nth = bisect_left(ends, chunk.start)
+            is_end = nth < len(ends) and ends[nth] <= chunk.end
+            if chunk.index_places is None or not (is_end or chunk.offset in looked_at):
+                continue
+            left -= chunk.length
+            if left < 0:
+                break
             try:
-                yield from self._batches(file, index, wanted, read, window, passed=passed)
-                column = _loose(index, wanted, window)
-                fetch = _fetch_loose(file, wanted, self._uncompressed)
-                pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
-                yield from batched((loose_place(place), fetch(place, at)) for place, at in pairs)
+                self._require_declared(chunk)
             except _ContradictedError as error:
-                index = self._distrust(file, error)
-                yield ContradictionError(index.contradiction, window.start, window.stop - 1)
-                wanted = _wanted(index, topics)
-                for chunk in _with_any(index, wanted, window):
-                    before = passed.get(chunk.offset)
-                    yield from self._batches_of_chunk(file, chunk, wanted, window, before)
+                return self._without_indexes(error)
+            except UnreadableError:
+                continue
+        return index
+
+    def _require_declared(self, chunk: Chunk) -> None:
+        """Compares a chunk with what its indexes and the summary section say of it.
+
+        Raises:
+            _ContradictedError: it has other messages, or declares a channel otherwise.
+            UnreadableError: it cannot be read.
+        """
+        data = self._chunk_data(chunk)
+        places = in_file_order(self._pairs(chunk, data).offsets)
+        declared = self.index.declared
+        try:
+            with as_unreadable():
+                agrees = declared is None or all(
+                    declared.agrees(*declaration) for declaration in declarations_of(data, places)
+                )
+        except UnreadableError as error:
+            raise _ContradictedError(reason_of(error)) from error
+        if not agrees:
+            raise _ContradictedError(OTHER_DECLARED)
+
+    def records(self, *, newest_first: bool) -> Iterator[Record | LostError]:
+        """Yields the messages in order, and errors where some are lost."""
+        if self.index.contradiction:
+            yield self._contradiction()
+        try:
+            yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
+        except _ContradictedError as error:
+            # Raised in place of a run: what was yielded lies before all that the run can hold.
+            believed, self.index = self.index, self._without_indexes(error)
+            yield self._contradiction()
+            self._window, passed = _split_window(
+                self._window, error.chunk, newest_first=newest_first
+            )
+            if overlooked := _overlooked(believed, self.index, self._wanted, passed):
+                yield LostError(str(error), *overlooked)
+            yield from merged(self._runs(newest_first=newest_first), newest_first=newest_first)
+
+    def batches(self, bare: Collection[str]) -> Iterator[Batch | LostError]:
+        """Yields the messages many at once, and errors where some are lost."""
+        if self.index.contradiction:
+            yield self._contradiction()
+        passed: dict[int, Chunk] = {}
+        try:
+            yield from self._batches(bare, passed)
+            column = self._inside(self.index.loose, self._wanted)
+            pairs = zip(column.places.tolist(), column.times.tolist(), strict=True)
+            yield from batched(
+                (loose_place(at), self._loose_record(at, time)) for at, time in pairs
+            )
+        except _ContradictedError as error:
+            self.index = self._without_indexes(error)
+            yield self._contradiction()
+            for chunk in _with_any(self.index, self._wanted, self._window):
+                yield from self._batches_of_chunk(chunk, passed.get(chunk.offset))
+
+    def _contradiction(self) -> ContradictionError:
+        return ContradictionError(
+            self.index.contradiction, self._window.start, self._window.stop - 1
+        )
+
+    @property
+    def _wanted(self) -> dict[int, Channel]:
+        """The channels of the topics that have messages."""
+        return {
+            number: channel
+            for number, channel in self.index.channels.items()
+            if channel.topic in self._topics and number in self.index.totals
+        }
 
     def _batches(
-        self,
-        file: OpenFile,
-        index: McapIndex,
-        wanted: dict[int, Channel],
-        read: Collection[int],
-        window: TimeWindow,
-        *,
-        passed: dict[int, Chunk],
+        self, bare: Collection[str], passed: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks, and adds these to `passed`.
 
-        Chunks without a channel that is to be `read` are known by their indexes alone.
+        Chunks that have only `bare` topics of those wanted are known by their indexes alone.
 
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records.
         """
-        chunks = [*_with_any(index, wanted, window)]
+        file, wanted, window = self._file, self._wanted, self._window
+        read = {number for number, channel in wanted.items() if channel.topic not in bare}
+        chunks = [*_with_any(self.index, wanted, window)]
         indexed = [chunk for chunk in chunks if chunk.index_places is not None]
         together = [chunk for chunk in indexed if not chunk.channels.isdisjoint(read)]
         if wanted:
             # Those of which all is wanted are compared when they are read.
-            whole = {chunk.offset for chunk in together if chunk.channels <= wanted.keys()}
-            self._require_beside(file, index, window, passed=whole)
-        for group in read_groups(file, together, self._limit):
-            yield from self._batches_of_group(file, group, wanted, window, passed)
+            self._require_beside(
+                {chunk.offset for chunk in together if chunk.channels <= wanted.keys()}
+            )
+        for group in read_groups(file, together, self._bags.limit):
+            yield from self._batches_of_group(group, passed)
             del group  # before the next is read
         for chunk in chunks:
             if chunk.index_places is None:
-                yield from self._batches_of_chunk(file, chunk, wanted, window, None)
+                yield from self._batches_of_chunk(chunk)
         unread = [chunk for chunk in indexed if chunk.channels.isdisjoint(read)]
         yield from bare_batches(file, unread, wanted, window)
         passed.update({chunk.offset: chunk for chunk in unread})
 
     def _batches_of_group(
-        self,
-        file: OpenFile,
-        group: ReadChunks,
-        wanted: dict[int, Channel],
-        window: TimeWindow,
-        passed: dict[int, Chunk],
+        self, group: ReadChunks, passed: dict[int, Chunk]
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of chunks that were read together; if that failed, one by one."""
         if group.buffer is not None:
             with suppress(UnreadableError, ValueError, IndexError):
-                pairs = pairs_in(group.chunks, group.indexes, wanted)
-                batches = batches_of(group, pairs, wanted, window, self._uncompressed)
+                pairs = pairs_in(group.chunks, group.indexes, self._wanted)
+                batches = self._batches_of(group, pairs)
                 passed.update({chunk.offset: chunk for chunk in group.chunks})
                 yield from batches
                 return
         for chunk in group.chunks:
-            yield from self._batches_of_chunk(file, chunk, wanted, window, None)
+            yield from self._batches_of_chunk(chunk)
             passed[chunk.offset] = chunk
 
     def _batches_of_chunk(
-        self,
-        file: OpenFile,
-        chunk: Chunk,
-        wanted: dict[int, Channel],
-        window: TimeWindow,
-        before: Chunk | None,
+        self, chunk: Chunk, before: Chunk | None = None
     ) -> Iterator[Batch | LostError]:
         """Yields the messages of one chunk, but for those that `before` had in its indexes.
 
@@ -305,303 +393,168 @@ class McapBags:
                 was yielded.
         """
         try:
-            with as_unreadable():
-                data = self._chunk_data(file, chunk)
+            data = self._chunk_data(chunk)
         except UnreadableError as error:
-            lost = self._lost(file, chunk, wanted, window, str(error))
+            lost = self._lost(chunk, str(error))
             if lost is not None:
                 yield lost
             return
+        pairs = self._pairs(chunk, data)
+        pairs = pairs.taken(np.isin(pairs.channels, [*self._wanted]))
+        if before is not None:
+            pairs = pairs.taken(~np.isin(pairs.offsets, self._stated_pairs(before).offsets))
         try:
-            pairs = _pairs(file, chunk, wanted, data)
-            if before is not None:
-                earlier = _pairs(file, before, wanted, data)
-                pairs = pairs.taken(~np.isin(pairs.offsets, earlier.offsets))
-            content = ReadChunks([chunk], data, [len(data)])
-            batches = batches_of(content, pairs, wanted, window, self._uncompressed)
+            batches = self._batches_of(ReadChunks([chunk], data, [len(data)]), pairs)
         except (UnreadableError, ValueError, IndexError) as error:
             if chunk.index_places is None:
                 raise
             raise _ContradictedError(reason_of(error)) from error
         yield from batches
 
-    def _runs(
-        self,
-        file: OpenFile,
-        index: McapIndex,
-        topics: Collection[str],
-        window: TimeWindow,
-        *,
-        newest_first: bool,
-    ) -> Iterator[SortedRun[Record | LostError]]:
+    def _batches_of(self, content: ReadChunks, pairs: Pairs) -> Iterator[Batch]:
+        return batches_of(content, pairs, self._wanted, self._window, self._uncompressed)
+
+    def _runs(self, *, newest_first: bool) -> Iterator[SortedRun[Record | LostError]]:
         """Yields a run for each chunk with messages of the topics, and one for all loose messages.
 
         Raises:
             _ContradictedError: the indexes of a chunk do not agree with its records; also raised
                 when a run is read.
         """
-        wanted = _wanted(index, topics)
+        wanted = self._wanted
         # Of large chunks only the last used stays decompressed: all that overlap in time would
         # otherwise be in memory at once.
-        last_used = lru_cache(1)(partial(self._chunk_data, file))
-
-        def fetch_large(chunk: Chunk, place: int, time: Ns) -> Record:
-            return _fetch_from_chunk(last_used(chunk), wanted, self._uncompressed)(place, time)
+        last_used = lru_cache(1)(self._chunk_data)
 
         def rows_of(chunk: Chunk) -> RunRows[Record | LostError] | None:
             last_used.cache_clear()  # before the next is decompressed
             try:
-                with as_unreadable():
-                    data = last_used(chunk)
+                data = last_used(chunk)
             except UnreadableError as error:
                 # Only what is wanted by the chunk's index is lost.
-                lost = self._lost(file, chunk, wanted, window, str(error))
-                return None if lost is None else _lost_rows(lost, newest_first=newest_first)
-            columns = self._chunk_columns(file, chunk, wanted, data)
-            column = joined([indexed.between(window.start, window.stop) for indexed in columns])
+                lost = self._lost(chunk, str(error))
+                if lost is None:
+                    return None
+                at = lost.last if newest_first else lost.first
+                return RunRows([at], [0], lambda _place, _time: lost)
+            column = self._inside(self._pairs(chunk, data), wanted)
             if not column.times.size:
                 return None
             if len(data) <= _LARGE_BYTES:
-                fetch = _fetch_from_chunk(data, wanted, self._uncompressed)
-            else:
-                fetch = partial(fetch_large, chunk)
-            return _rows(column, fetch, newest_first=newest_first)
+                return rows(column, partial(self._record, data, wanted))
+            return rows(column, lambda *at: self._record(last_used(chunk), wanted, *at))
+
+        def rows(column: Column, fetch: Callable[[int, Ns], Record]) -> RunRows[Record | LostError]:
+            step = -1 if newest_first else 1
+            return RunRows(column.times[::step].tolist(), column.places[::step].tolist(), fetch)
 
         if wanted:
-            self._require_beside(file, index, window)
-        for chunk in _with_any(index, wanted, window):
+            self._require_beside()
+        for chunk in _with_any(self.index, wanted, self._window):
             yield SortedRun(chunk.start, chunk.end, chunk.offset, partial(rows_of, chunk))
-        column = _loose(index, wanted, window)
-        if column.times.size:
-            fetch = _fetch_loose(file, wanted, self._uncompressed)
-            rows = _rows(column, fetch, newest_first=newest_first)
-            yield SortedRun(int(column.times[0]), int(column.times[-1]), 0, lambda: rows)
+        loose = self._inside(self.index.loose, wanted)
+        if loose.times.size:
+            run = rows(loose, self._loose_record)
+            yield SortedRun(int(loose.times[0]), int(loose.times[-1]), 0, lambda: run)
 
-    def _index(self, file: OpenFile) -> McapIndex:
-        index = self._indexes.get(file.key)
-        if isinstance(index, McapIndex):
-            return index
-        reason = self._contradictions.get(file.key)
-        if reason is not None:
-            return self._index_without_indexes(file, reason)
-        if not is_finished(file):
-            return self._cache_index(file, index_by_scan(file, self._limit))
-        try:
-            index = index_from_summary(file)
-        except DoubtError as doubt:
-            index = index_by_scan(file, self._limit, str(doubt))
-        except UnreadableError as error:
-            return self._distrust(file, error)
-        return self._cache_index(file, index)
+    def _inside(self, pairs: Pairs, wanted: Collection[int]) -> Column:
+        """Returns the wanted messages inside the window, in order."""
+        times, window = pairs.times, self._window
+        is_inside = np.isin(pairs.channels, [*wanted])
+        is_inside &= (times >= window.start) & (times < window.stop)
+        return Column.of(times[is_inside], pairs.offsets[is_inside])
 
-    def _cache_index(self, file: OpenFile, index: McapIndex) -> McapIndex:
-        self._indexes.put(file.key, index, index.memory_bytes)
-        return index
-
-    def _lost(
-        self,
-        file: OpenFile,
-        chunk: Chunk,
-        wanted: Collection[int],
-        window: TimeWindow,
-        reason: str,
-    ) -> LostError | None:
+    def _lost(self, chunk: Chunk, reason: str) -> LostError | None:
         """Returns what of the window is lost with a chunk that cannot be read; None if nothing."""
+        window = self._window
         try:
             with as_unreadable():
-                columns = self._chunk_columns(file, chunk, wanted, None)
+                times = self._inside(self._stated_pairs(chunk), self._wanted).times
         except UnreadableError:
-            first, last = max(chunk.start, window.start), min(chunk.end, window.stop - 1)
-            return LostError(reason, first, last)
-        times = joined([column.between(window.start, window.stop) for column in columns]).times
+            window = self._window
+            return LostError(
+                reason, max(chunk.start, window.start), min(chunk.end, window.stop - 1)
+            )
         return LostError(reason, int(times[0]), int(times[-1])) if times.size else None
 
-    def _chunk_columns(
-        self, file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes | None
-    ) -> list[Column]:
-        """Returns the messages of the wanted channels in a chunk, compared with its records.
-
-        Without `data`, the decompressed records, the message indexes are believed.
-
-        Raises:
-            _ContradictedError: the message indexes do not agree with the records.
-        """
-        columns: list[Column] = []
-        missing: list[int] = []
-        for channel in chunk.channels.intersection(wanted):
-            column = self._indexes.get((file.key, chunk.offset, channel))
-            if isinstance(column, Column):
-                columns.append(column)
-            else:
-                missing.append(channel)
-        if not missing:
-            return columns
-        if chunk.index_places is None:
-            data = self._chunk_data(file, chunk) if data is None else data
-            read = walk_chunk(data).pairs.columns(missing)
-        else:
-            try:
-                read = chunk_columns(file, chunk, missing)
-                for channel, fresh in read.items():
-                    if data is not None:
-                        require_indexed(fresh.of_channel(channel), data, fresh.places)
-            except (UnreadableError, ValueError, IndexError, struct.error) as error:
-                raise _ContradictedError(reason_of(error), chunk) from error
-        for channel, fresh in read.items():
-            if data is not None:
-                self._indexes.put((file.key, chunk.offset, channel), fresh, fresh.memory_bytes)
-        return [*columns, *read.values()]
-
-    def _require_beside(
-        self,
-        file: OpenFile,
-        index: McapIndex,
-        window: TimeWindow,
-        *,
-        passed: Collection[int] = (),
-    ) -> None:
-        """Compares the chunks beside a window with their records, each once.
+    def _require_beside(self, passed: Collection[int] = ()) -> None:
+        """Compares the chunks beside the window with their records, each once.
 
         Not those at the offsets `passed`, which are compared anyway.
 
         Raises:
             _ContradictedError: the indexes of one of them do not agree with its records.
         """
-        for chunk in _beside(index, window):
-            if chunk.index_places is None or chunk.offset in passed:
-                continue
-            if self._indexes.get((file.key, chunk.offset, _COMPARED)):
-                continue
-            data = self._readable_data(file, chunk)
-            if data is None:
-                continue
-            try:
-                self._compared(file, chunk, data)
-            except _ContradictedError as error:
-                raise _ContradictedError(str(error)) from error
-            del data  # before the next is read
+        for chunk in _beside(self.index, self._window):
+            if chunk.index_places is not None and chunk.offset not in passed:
+                try:
+                    self._pairs(chunk)
+                except _ContradictedError as error:
+                    raise _ContradictedError(str(error)) from error
+                except UnreadableError:
+                    continue
 
-    def _compared(self, file: OpenFile, chunk: Chunk, data: bytes) -> IntArray:
-        """Returns where a chunk's messages begin in its records, ascending, compared with these.
+    def _pairs(self, chunk: Chunk, data: bytes | None = None) -> Pairs:
+        """Returns the messages of a chunk, compared with its decompressed records.
 
         Raises:
             _ContradictedError: the indexes do not agree with the records.
+            UnreadableError: the records cannot be read.
         """
-        try:
-            pairs = _pairs(file, chunk, chunk.channels, data)
-            require_indexed(pairs, data, pairs.offsets)
-            places = in_file_order(pairs.offsets)
-        except (UnreadableError, ValueError, IndexError) as error:
-            raise _ContradictedError(reason_of(error), chunk) from error
-        self._indexes.put((file.key, chunk.offset, _COMPARED), _YES, _YES.memory_bytes)
-        return places
+        key = (self._file.key, chunk.offset, chunk.index_places is None)
+        pairs = self._bags.indexes.get(key)
+        if isinstance(pairs, Pairs):
+            return pairs
+        data = self._chunk_data(chunk) if data is None else data
+        if chunk.index_places is None:
+            pairs = walk_chunk(data).pairs
+        else:
+            try:
+                pairs = self._stated_pairs(chunk)
+                require_indexed(pairs, data, pairs.offsets)
+                in_file_order(pairs.offsets)
+            except (UnreadableError, ValueError, IndexError) as error:
+                raise _ContradictedError(reason_of(error), chunk) from error
+        self._bags.indexes.put(key, pairs, 4 * pairs.times.nbytes + 600)
+        return pairs
 
-    def _readable_data(self, file: OpenFile, chunk: Chunk) -> bytes | None:
-        """Returns the records of a chunk; None if they cannot be read."""
-        try:
-            with as_unreadable():
-                return self._chunk_data(file, chunk)
-        except UnreadableError:
-            return None
+    def _stated_pairs(self, chunk: Chunk) -> Pairs:
+        """Returns the messages of a chunk by its indexes.
 
-    def _verified(self, file: OpenFile, index: McapIndex) -> McapIndex:
-        """Returns the index if its first and last times agree with the messages; else another.
-
-        A bag is chosen for a question by these times: a wrong one would hide its messages.
+        Raises:
+            UnreadableError: it has none, or others than it should.
         """
-        totals = index.totals.values()
-        ends = sorted({end for total in totals for end in (total.first, total.last)})
-        odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
-        looked_at = {chunk.offset for chunk in odd}
-        left = _VERIFIED_BYTES
-        try:
-            for chunk in index.chunks:
-                nth = bisect_left(ends, chunk.start)
-                is_end = nth < len(ends) and ends[nth] <= chunk.end
-                if chunk.index_places is None or not (is_end or chunk.offset in looked_at):
-                    continue
-                left -= chunk.length
-                if left < 0:
-                    break
-                data = self._readable_data(file, chunk)
-                if data is None:
-                    continue
-                places = self._compared(file, chunk, data)
-                if index.declared is not None:
-                    _require_declared(index.declared, data, places)
-                del data  # before the next is read
-        except _ContradictedError as error:
-            return self._distrust(file, error)
-        return index
+        [(chunks, indexes)] = index_groups(self._file, [chunk])
+        return pairs_in(chunks, indexes)
 
-    def _distrust(self, file: OpenFile, error: UnreadableError) -> McapIndex:
-        """Returns an index of the messages themselves, in place of one that was found wrong."""
-        reason = f"{error}; {READ_WITHOUT_INDEXES}"
-        # Kept apart from the index: not every read that follows would find it out again.
-        self._contradictions.put(file.key, reason, len(reason) + len(file.key.path) + 200)
-        return self._index_without_indexes(file, reason)
+    def _chunk_data(self, chunk: Chunk) -> bytes:
+        """Returns the decompressed records of a chunk.
 
-    def _index_without_indexes(self, file: OpenFile, reason: str) -> McapIndex:
-        index = index_by_scan(file, self._limit, reason)
-        return self._cache_index(file, index._replace(contradiction=reason))
-
-    def _chunk_data(self, file: OpenFile, chunk: Chunk) -> bytes:
-        key = (file.key, chunk.offset)
-        data = self._chunks.get(key)
+        Raises:
+            UnreadableError: they cannot be read.
+        """
+        key = (self._file.key, chunk.offset)
+        data = self._bags.chunks.get(key)
         if data is None:
-            data = chunk_data(file, chunk, self._limit)
-            self._chunks.put(key, data, len(data))
+            with as_unreadable():
+                data = chunk_data(self._file, chunk, self._bags.limit)
+            self._bags.chunks.put(key, data, len(data))
         return data
 
+    def _record(self, data: bytes, channels: Mapping[int, Channel], place: int, time: Ns) -> Record:
+        """Returns a message of a decompressed chunk, whose place was compared with its records."""
+        _, length, number, _, _, published = MESSAGE.unpack_from(data, place)
+        channel = channels[number]
+        payload = data[place + MESSAGE.size : place + RECORD.size + length]
+        if payload.startswith(FRAME_MAGIC):
+            payload = self._uncompressed(channel, payload)
+        return Record(channel, time, published if 0 < published < MAX_NS else time, payload)
 
-def _pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int], data: bytes) -> Pairs:
-    """Returns the messages of the wanted channels in a chunk, by its indexes if it has some.
-
-    Raises:
-        UnreadableError: it has other indexes than it should.
-    """
-    if chunk.index_places is None:
-        pairs = walk_chunk(data).pairs
-        return pairs.taken(np.isin(pairs.channels, sorted(wanted)))
-    [(chunks, indexes)] = index_groups(file, [chunk])
-    return pairs_in(chunks, indexes, wanted)
-
-
-def _require_declared(declared: Declarations, data: bytes, places: IntArray) -> None:
-    """Compares what a summary section declares with what a chunk declares and holds.
-
-    Args:
-        declared: the schemas and channels of the summary section.
-        data: the decompressed records of the chunk, which its checksum protects.
-        places: where its messages begin in these, ascending.
-
-    Raises:
-        _ContradictedError: the chunk declares a channel otherwise, or holds more messages.
-    """
-    try:
-        with as_unreadable():
-            agrees = all(
-                declared.agrees(*declaration) for declaration in declarations_of(data, places)
-            )
-    except UnreadableError as error:
-        raise _ContradictedError(reason_of(error)) from error
-    if not agrees:
-        raise _ContradictedError(OTHER_DECLARED)
-
-
-def _wanted(index: McapIndex, topics: Collection[str]) -> dict[int, Channel]:
-    """Returns the channels of the topics that have messages."""
-    return {
-        number: channel
-        for number, channel in index.channels.items()
-        if channel.topic in topics and number in index.totals
-    }
-
-
-def _loose(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Column:
-    """Returns the wanted messages outside chunks."""
-    loose = [column for channel, column in index.loose.items() if channel in wanted]
-    return joined([column.between(window.start, window.stop) for column in loose])
+    def _loose_record(self, place: int, time: Ns) -> Record:
+        """Returns a message outside of chunks."""
+        _, length = RECORD.unpack(self._file.read(place, RECORD.size))
+        data = self._file.read(place, RECORD.size + length)
+        return self._record(data, self.index.channels, 0, time)
 
 
 def _with_any(index: McapIndex, wanted: Collection[int], window: TimeWindow) -> Iterator[Chunk]:
@@ -637,10 +590,10 @@ def _split_window(
     window: TimeWindow, chunk: Chunk | None, *, newest_first: bool
 ) -> tuple[TimeWindow, TimeWindow]:
     """Splits a window at a chunk: what is left to read, and what was read before it."""
-    if chunk is None:
-        return window, TimeWindow(window.start, window.start)
-    at = chunk.end + 1 if newest_first else chunk.start
-    at = min(max(at, window.start), window.stop)
+    at = window.stop if newest_first else window.start
+    if chunk is not None:
+        at = chunk.end + 1 if newest_first else chunk.start
+        at = min(max(at, window.start), window.stop)
     before, behind = TimeWindow(window.start, at), TimeWindow(at, window.stop)
     return (before, behind) if newest_first else (behind, before)
 
@@ -653,7 +606,9 @@ def _overlooked(
     chunks = [
         chunk
         for chunk in _with_any(index, wanted, passed)
-        if not _describes(believed_at.get(chunk.offset), chunk)
+        if (known := believed_at.get(chunk.offset)) is None
+        or not (known.start <= chunk.start and chunk.end <= known.end)
+        or not chunk.channels <= known.channels
     ]
     if not chunks:
         return None
@@ -661,83 +616,8 @@ def _overlooked(
     return first, min(max(chunk.end for chunk in chunks), passed.stop - 1)
 
 
-def _describes(believed: Chunk | None, chunk: Chunk) -> bool:
-    """Returns whether an index had all times and channels of a chunk."""
-    if believed is None:
-        return False
-    is_within = believed.start <= chunk.start and chunk.end <= believed.end
-    return is_within and chunk.channels <= believed.channels
-
-
 def _out_of_order(chunks: Sequence[Chunk]) -> Iterator[Chunk]:
     """Yields chunks that follow each other in the file, and whose times are the other way round."""
     for before, after in pairwise(sorted(chunks, key=attrgetter("offset"))):
         if after.end < before.start:
             yield from (before, after)
-
-
-def _lost_rows(lost: LostError, *, newest_first: bool) -> RunRows[Record | LostError]:
-    """Returns a loss as the one message of its run."""
-    at = lost.last if newest_first else lost.first
-    return RunRows([at], [0], lambda _place, _time: lost)
-
-
-def _rows(
-    column: Column, fetch: Callable[[int, Ns], Record | LostError], *, newest_first: bool
-) -> RunRows[Record | LostError]:
-    times, places = column
-    if newest_first:
-        times, places = times[::-1], places[::-1]
-    return RunRows(times.tolist(), places.tolist(), fetch)
-
-
-def _fetch_from_chunk(
-    data: bytes, channels: dict[int, Channel], uncompressed: Uncompressed
-) -> Callable[[int, Ns], Record]:
-    """Returns what fetches messages from a decompressed chunk."""
-    unpack = MESSAGE.unpack_from
-    last = len(data) - MESSAGE.size
-
-    def fetch(place: int, time: Ns) -> Record:
-        if not 0 <= place <= last:
-            raise UnreadableError(NOT_THERE)
-        opcode, length, number, _, log_time, publish_time = unpack(data, place)
-        end = place + RECORD.size + length
-        if opcode != Opcode.MESSAGE or log_time != time or end > len(data):
-            raise UnreadableError(NOT_THERE)
-        channel = _channel(channels, number)
-        payload = data[place + MESSAGE.size : end]
-        return _record(channel, log_time, publish_time, payload, uncompressed)
-
-    return fetch
-
-
-def _fetch_loose(
-    file: OpenFile, channels: dict[int, Channel], uncompressed: Uncompressed
-) -> Callable[[int, Ns], Record]:
-    """Returns what fetches messages outside of chunks."""
-
-    def fetch(place: int, time: Ns) -> Record:
-        head = MESSAGE.unpack(file.read(place, MESSAGE.size))
-        _, length, number, _, _, published = head
-        channel = _channel(channels, number)
-        payload = file.read(place + MESSAGE.size, length + RECORD.size - MESSAGE.size)
-        return _record(channel, time, published, payload, uncompressed)
-
-    return fetch
-
-
-def _channel(channels: dict[int, Channel], number: int) -> Channel:
-    channel = channels.get(number)
-    if channel is None:
-        raise UnreadableError("damaged: a message is not of the channel that its index says")
-    return channel
-
-
-def _record(
-    channel: Channel, log_time: Ns, publish_time: Ns, payload: bytes, uncompressed: Uncompressed
-) -> Record:
-    if payload.startswith(FRAME_MAGIC):
-        payload = uncompressed(channel, payload)
-    published = publish_time if 0 < publish_time < MAX_NS else log_time
-    return Record(channel, log_time, published, payload)

@@ -66,18 +66,13 @@ _ZERO: Final[IntArray] = np.zeros(1, dtype=np.int64)
 
 
 class Column(NamedTuple):
-    """The messages of one channel in one part of a file, by log time, ties in file order.
+    """Messages of one part of a file, by log time, ties in file order.
 
     `places` are the offsets of the message records, in the file or in the decompressed chunk.
     """
 
     times: IntArray
     places: IntArray
-
-    @property
-    def memory_bytes(self) -> int:
-        """About how much memory it takes, in bytes."""
-        return 2 * self.times.nbytes + 300
 
     @classmethod
     def of(cls, times: IntArray, places: IntArray) -> Column:
@@ -88,33 +83,6 @@ class Column(NamedTuple):
             if bool(((times[1:] == times[:-1]) & (places[1:] == places[:-1])).any()):
                 raise UnreadableError("damaged: a message index holds a message twice")
         return cls(times, places)
-
-    def of_channel(self, channel: int) -> Pairs:
-        """Returns the same as messages of a channel, in one chunk."""
-        return Pairs(np.array(channel), self.times, self.places, _ZERO)
-
-    def between(self, start: int, stop: int) -> Column:
-        """Returns the part with log times in `[start, stop)`."""
-        times = self.times
-        first, last = times.searchsorted(start), times.searchsorted(stop)
-        if not first and last == times.size:
-            return self
-        return Column(times[first:last], self.places[first:last])
-
-
-NO_MESSAGES: Final = Column(_EMPTY, _EMPTY)
-
-
-def joined(columns: list[Column]) -> Column:
-    """Returns the messages of several channels as one column."""
-    if len(columns) == 1:
-        return columns[0]
-    if not columns:
-        return NO_MESSAGES
-    times = np.concatenate([column.times for column in columns])
-    places = np.concatenate([column.places for column in columns])
-    order = np.lexsort((places, times))
-    return Column(times[order], places[order])
 
 
 class Chunk(NamedTuple):
@@ -164,14 +132,8 @@ class Pairs(NamedTuple):
         """Returns some of the messages."""
         return Pairs(*(column[rows] for column in self))
 
-    def columns(self, wanted: Collection[int]) -> dict[int, Column]:
-        """Returns the messages of the wanted channels, which are of one chunk."""
-        columns: dict[int, Column] = {}
-        for number in wanted:
-            is_wanted = self.channels == number
-            if is_wanted.any():
-                columns[number] = Column.of(self.times[is_wanted], self.offsets[is_wanted])
-        return columns
+
+NO_PAIRS: Final = Pairs(_EMPTY, _EMPTY, _EMPTY, _EMPTY)
 
 
 def pairs_in(

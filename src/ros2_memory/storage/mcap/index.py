@@ -38,9 +38,9 @@ from ros2_memory.storage.errors import (
 )
 from ros2_memory.storage.mcap.chunk import (
     INDEX_OFFSET,
+    NO_PAIRS,
     OUTSIDE,
     Chunk,
-    Column,
     Extent,
     Pairs,
     decompressed_chunk,
@@ -60,7 +60,7 @@ from ros2_memory.storage.mcap.records import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Mapping, Sequence
+    from collections.abc import Mapping, Sequence
 
     from mcap.records import Statistics
 
@@ -69,10 +69,7 @@ if TYPE_CHECKING:
 
 _CHUNK_INDEX: Final = struct.Struct("<QQQQI")
 """A chunk's first and last log time, offset and length, and the bytes of its index offsets."""
-_INDEX_OFFSET: Final = struct.Struct("<HQ")
 _INDEX_LENGTH: Final = struct.Struct("<Q")
-_INDEX_HEAD: Final = struct.Struct("<BQHI")
-"""A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
 _new_tuple: Final = tuple.__new__
 _NONE: Final = np.empty(0, np.int64)
 _MAX_CACHED_BYTES: Final = 128 << 10
@@ -215,7 +212,7 @@ class McapIndex(NamedTuple):
         channel_bytes: memory that the channels take which no other file shares.
         chunks: the chunks with messages, in file order.
         totals: the messages of each channel that has some.
-        loose: the messages outside chunks, by channel; their places are offsets in the file.
+        loose: the messages outside chunks; their offsets are in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
         set_back: by how much the log times of a channel go back at most, from one chunk to a later
@@ -232,7 +229,7 @@ class McapIndex(NamedTuple):
     channel_bytes: int
     chunks: tuple[Chunk, ...]
     totals: Mapping[int, Extent]
-    loose: Mapping[int, Column] = MappingProxyType({})
+    loose: Pairs = NO_PAIRS
     complete: bool = True
     notes: tuple[str, ...] = ()
     set_back: tuple[Ns, Ns] = (0, 0)
@@ -246,29 +243,8 @@ class McapIndex(NamedTuple):
     def memory_bytes(self) -> int:
         """About how much memory it takes, without the channels that files share."""
         places = sum([len(chunk.index_places or ()) for chunk in self.chunks])
-        loose = sum([column.times.nbytes * 2 for column in self.loose.values()])
+        loose = 4 * self.loose.times.nbytes
         return 1000 + self.channel_bytes + 400 * len(self.chunks) + places + loose
-
-
-def chunk_columns(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> dict[int, Column]:
-    """Returns the messages of the `wanted` channels of a chunk, by its message indexes.
-
-    `pairs_in` checks all indexes of the chunk, which makes a cold point query a fifth slower. Here
-    they are believed: all indexes of the file were found right together (`index_from_summary`).
-
-    Raises:
-        UnreadableError, ValueError, struct.error: they have changed.
-    """
-    base = chunk.offset + chunk.length
-    region = file.read(base, chunk.index_length)
-    columns: dict[int, Column] = {}
-    for number, offset in _INDEX_OFFSET.iter_unpack(chunk.index_places or b""):
-        if number in wanted:
-            _, _, _, size = _INDEX_HEAD.unpack_from(region, offset - base)
-            at = offset - base + _INDEX_HEAD.size
-            pairs = np.frombuffer(region, "<i8", size // 8, at).reshape(-1, 2)
-            columns[number] = Column.of(pairs[:, 0].copy(), pairs[:, 1].copy())
-    return columns
 
 
 class Contents:

@@ -182,7 +182,7 @@ class _Scan:
             unshared_bytes(channels),
             tuple(self.chunks),
             totals,
-            loose.columns({*loose.channels.tolist()}),
+            loose,
             complete=complete,
             notes=tuple(notes),
             set_back=self.contents.back,
