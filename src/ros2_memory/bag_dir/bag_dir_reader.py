@@ -26,9 +26,9 @@ from ros2_memory.bag_dir.handover_file import (
     FileRule,
     Handover,
     HandoverReading,
-    read_handover,
     sure_handover,
 )
+from ros2_memory.bag_dir.json_files import until_changed
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, MOMENTS_FOLDER
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.directories import LINK_NOT_FOLLOWED
@@ -43,8 +43,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import BagSummary, TopicSummary
     from ros2_memory.core.timebase import Ns
 
-_MAX_CACHED_SIDECARS: Final = 4096
-_NO_SIDECAR: Final = HandoverReading(Handover(), None)
+_sidecar: Final = until_changed(HANDOVER_FILE, most=4096)(sure_handover)
 
 
 class BagDirReader(BagReader):
@@ -65,7 +64,6 @@ class BagDirReader(BagReader):
         self._reader = reader
         self._bag_dir = bag_dir
         self._every_message = every_message
-        self._sidecars: dict[str, tuple[tuple[int, int, int], HandoverReading]] = {}
 
     def reads(self, path: Path) -> bool:
         """Returns what the adapter returns."""
@@ -219,10 +217,7 @@ class BagDirReader(BagReader):
 
     def _rule_of(self, path: Path, topics: Collection[str], window: TimeWindow) -> FileRule | None:
         """Returns which messages of the topics in a window count; None where all do."""
-        reading = self._sidecar_of(path)
-        if reading is _NO_SIDECAR:
-            return None
-        rule = reading.handover.rule(path.name)
+        rule = self._sidecar_of(path).handover.rule(path.name)
         return rule if rule is not None and rule.touches(window, topics) else None
 
     def _sidecar_of(self, path: Path) -> HandoverReading:
@@ -232,27 +227,15 @@ class BagDirReader(BagReader):
             BagUnreachableError: the disk fails, so which messages count is unknown.
         """
         if self._every_message:
-            return _NO_SIDECAR
-        file = str(path)
-        sidecar = file[: file.rfind("/") + 1] + HANDOVER_FILE
-        try:
-            status = os.stat(sidecar)  # noqa: PTH116 - before every reading; a Path costs more
-            stamp = (status.st_mtime_ns, status.st_size, status.st_ino)
-            stamp_before, reading = self._sidecars.get(sidecar, (None, _NO_SIDECAR))
-            if stamp_before == stamp:
-                return reading
-            reading = sure_handover(path.parent)
-        except (FileNotFoundError, NotADirectoryError):
-            return _NO_SIDECAR
-        except PermissionError:
-            return read_handover(path.parent)
-        except OSError as error:
-            # Without its sidecar a recording would count messages twice.
-            reason = f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
-            raise BagUnreachableError(file, reason) from error
-        if len(self._sidecars) >= _MAX_CACHED_SIDECARS:
-            self._sidecars.clear()
-        self._sidecars[sidecar] = (stamp, reading)
+            return HandoverReading(Handover(), None)
+        reading = _sidecar(path.parent)
+        if reading is None:
+            try:
+                reading = sure_handover(path.parent)
+            except OSError as error:
+                # Without its sidecar a recording would count messages twice.
+                reason = f"{HANDOVER_FILE} cannot be read: {error.strerror or error}"
+                raise BagUnreachableError(str(path), reason) from error
         return reading
 
     def _counted_summary(

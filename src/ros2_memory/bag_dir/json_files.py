@@ -249,15 +249,17 @@ class JsonDocument(Generic[_T]):
         flush(target.parent)
 
 
-def until_changed(name: str) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T | None]]:
-    """Has a function of a bag directory called again only once a file there has changed.
+def until_changed(
+    name: str, most: int = 2
+) -> Callable[[Callable[[Path], _T]], Callable[[Path], _T | None]]:
+    """Has a function of a directory called again only once a file there has changed.
 
-    For files that every answer needs. Where there is none, the function is called each time; where
-    it cannot be read, None is returned.
+    For files that every answer needs, in `most` directories. Where there is none, the function is
+    called each time; where it cannot be read, None is returned.
     """
 
     def decorate(read: Callable[[Path], _T]) -> Callable[[Path], _T | None]:
-        @lru_cache(2)
+        @lru_cache(most)
         def known(bag_dir: Path, _stamp: tuple[int, int, int]) -> _T:
             return read(bag_dir)
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
@@ -26,7 +25,7 @@ from ros2_memory.core.timebase import NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
     from collections import Counter
-    from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.core.model import TimeWindow
@@ -531,47 +530,59 @@ class BagWriter(ABC):
         """
 
 
-class ChannelTotal(NamedTuple):
-    """The messages of one channel: how many (at least one), the earliest and the latest.
+@dataclass(slots=True)
+class Extent:
+    """Messages of one channel: how many, and the log times of the earliest and the latest."""
 
-    `pauses` are those of more than `SHORTEST_SILENCE_NS`.
-    """
-
-    channel: Channel
-    messages: int
+    count: int
     first: Ns
     last: Ns
-    pauses: Sequence[CountedPause] = ()
 
 
 def summarize_channels(
-    totals: Iterable[ChannelTotal],
-    declared: Iterable[Channel],
+    channels: Mapping[int, Channel],
+    totals: Mapping[int, Extent],
+    absences: Mapping[int, Sequence[CountedPause]],
     *,
     complete: bool = True,
     notes: tuple[str, ...] = (),
     set_back: tuple[Ns, Ns] = (0, 0),
     pauses: Sequence[CountedPause] = (),
 ) -> BagSummary:
-    """Returns the summary of a file; channels of one topic and type count as one."""
-    by_topic: dict[tuple[str, str], ChannelTotal] = {}
-    for total in totals:
-        key = (total.channel.topic, total.channel.type)
-        other = by_topic.get(key)
-        by_topic[key] = total if other is None else _together(other, total)
-    silent = {channel.topic for channel in declared} - {topic for topic, _ in by_topic}
+    """Returns the summary of a file; channels of one topic and type count as one.
+
+    Args:
+        channels: those that it declares, by number.
+        totals: the messages of each that has some.
+        absences: the pauses of each of more than `SHORTEST_SILENCE_NS`.
+        complete: whether the file was readable to its end.
+        notes: sentences on what is wrong with it.
+        set_back: by how much log times go back, and the first one after that.
+        pauses: where no channel has a message for a while.
+    """
+    by_topic: dict[tuple[str, str], list[int]] = {}
+    for number in totals:
+        channel = channels[number]
+        by_topic.setdefault((channel.topic, channel.type), []).append(number)
+    silent = {channel.topic for channel in channels.values()} - {topic for topic, _ in by_topic}
     headers: list[TopicHeader] = []
     numbers: list[int] = []
     # Encoded at once, without an object for each topic: an index makes thousands of summaries.
-    absences: dict[str, tuple[CountedPause, ...]] = {}
-    for (topic, type_name), total in sorted(by_topic.items(), key=itemgetter(0)):
-        channel, count, first, last, own_pauses = total
-        headers.append(TopicHeader(topic, type_name, channel.encoding, channel.latched))
+    noted: dict[str, tuple[CountedPause, ...]] = {}
+    for (topic, type_name), members in sorted(by_topic.items()):
+        number, *others = members
+        total, latched, listed = totals[number], channels[number].latched, absences.get(number, ())
+        count, first, last = total.count, total.first, total.last
+        for other in others:
+            total, listed, latched = totals[other], (), latched or channels[other].latched
+            count += total.count
+            first, last = min(first, total.first), max(last, total.last)
+        headers.append(TopicHeader(topic, type_name, channels[number].encoding, latched))
         numbers += count, first, last
         # Where it has several types, a pause of one is none of the topic.
-        is_other_type = topic in absences
-        found = absences_of(own_pauses, count, last - first) if own_pauses else ()
-        absences[topic] = () if is_other_type else found
+        is_other_type = topic in noted
+        found = absences_of(listed, count, last - first) if listed else ()
+        noted[topic] = () if is_other_type else found
     length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
     schema = shared_schema(
         tuple(headers),
@@ -580,15 +591,6 @@ def summarize_channels(
         notes,
         set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
         pauses=noteworthy(pauses, numbers[::3], length),
-        absences=tuple((topic, found) for topic, found in absences.items() if found),
+        absences=tuple((topic, found) for topic, found in noted.items() if found),
     )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
-
-
-def _together(total: ChannelTotal, other: ChannelTotal) -> ChannelTotal:
-    """Returns two channels of one topic and type as one."""
-    channel = total.channel
-    if other.channel.latched and not channel.latched:
-        channel = replace(channel, latched=True)
-    first, last = min(total.first, other.first), max(total.last, other.last)
-    return ChannelTotal(channel, total.messages + other.messages, first, last)

@@ -12,7 +12,7 @@ import time
 import weakref
 from collections import OrderedDict
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -42,12 +42,13 @@ _UNLOCKED_S = 60
 
 
 @dataclass(slots=True, eq=False)
-class _Entry:
-    lock: threading.Lock = field(default_factory=threading.Lock)
-    folder: Path | None = None
+class _Copy:
+    """A temporary file and a note on it, in a folder of its own; how many read it at the moment."""
+
+    folder: Path
     size: int = 0
     users: int = 0
-    filled: tuple[Path, str] | None = None
+    filled: tuple[Path, str] = (Path(), "")
 
 
 class Scratch:
@@ -64,8 +65,7 @@ class Scratch:
     def __init__(self, max_bytes: int) -> None:
         self._max_bytes = max_bytes
         self._root: Path | None = None
-        self._root_lock = threading.Lock()
-        self._entries: OrderedDict[Hashable, _Entry] = OrderedDict()
+        self._copies: OrderedDict[Hashable, _Copy] = OrderedDict()
         self._bytes = 0
         self._lock = threading.Lock()
 
@@ -84,72 +84,59 @@ class Scratch:
             UnreadableError: the file does not fit into `max_bytes`.
             UnreachableError: the disk of the temporary files is full.
         """
+        # One file at a time is made: of two that are, either might leave no room for the other.
         with self._lock:
-            entry = self._entries.setdefault(key, _Entry())
-            entry.users += 1
-            self._entries.move_to_end(key)
+            copy = self._copies.get(key)
+            if copy is None or not copy.filled[0].exists():
+                self._delete(key)
+                copy = self._copies[key] = self._made(fill)
+            self._copies.move_to_end(key)
+            copy.users += 1
         try:
-            with entry.lock:
-                if entry.filled is None or not entry.filled[0].exists():
-                    entry.filled = self._fill(entry, fill)
-                filled = entry.filled
-            yield filled
+            yield copy.filled
         finally:
             with self._lock:
-                entry.users -= 1
-                if entry.filled is None and not entry.users:
-                    self._entries.pop(key, None)
+                copy.users -= 1
 
-    def _fill(
-        self, entry: _Entry, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
-    ) -> tuple[Path, str]:
-        self._empty(entry)
+    def _made(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
         try:
-            entry.folder = self._new_folder()
-            return fill(entry.folder, lambda size: self._reserve(entry, size))
+            if self._root is None or not self._root.exists():
+                _delete_abandoned()
+                self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
+                weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
+                with suppress(OSError):  # where nothing can be locked, nobody else deletes it
+                    weakref.finalize(self, os.close, _lock(self._root))
+            copy = _Copy(Path(tempfile.mkdtemp(dir=self._root)))
+        except OSError as error:
+            raise _disk_full(error) from error
+        try:
+            copy.filled = fill(copy.folder, partial(self._reserve, copy))
         except BaseException as error:
-            self._empty(entry)
+            self._bytes -= copy.size
+            shutil.rmtree(copy.folder, ignore_errors=True)
             if isinstance(error, OSError) and error.errno in _DISK_FULL:
                 raise _disk_full(error) from error
             raise
+        return copy
 
-    def _new_folder(self) -> Path:
-        try:
-            with self._root_lock:
-                if self._root is None or not self._root.exists():
-                    _delete_abandoned()
-                    self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
-                    weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
-                    with suppress(OSError):  # where nothing can be locked, nobody else deletes it
-                        weakref.finalize(self, os.close, _lock(self._root))
-                return Path(tempfile.mkdtemp(dir=self._root))
-        except OSError as error:
-            raise _disk_full(error) from error
+    def _delete(self, key: Hashable) -> None:
+        copy = self._copies.pop(key, None)
+        if copy is not None:
+            self._bytes -= copy.size
+            shutil.rmtree(copy.folder, ignore_errors=True)
 
-    def _empty(self, entry: _Entry) -> None:
-        if entry.folder is not None:
-            shutil.rmtree(entry.folder, ignore_errors=True)
-        with self._lock:
-            self._bytes -= entry.size
-            entry.size = 0
-            entry.filled = None
-
-    def _reserve(self, entry: _Entry, size: int) -> None:
-        with self._lock:
-            for key, other in list(self._entries.items()):
-                if self._bytes + size <= self._max_bytes:
-                    break
-                if not other.users and other.folder is not None:
-                    del self._entries[key]
-                    self._bytes -= other.size
-                    shutil.rmtree(other.folder, ignore_errors=True)
-            if self._bytes + size > self._max_bytes:
-                raise UnreadableError(
-                    f"unpacked it takes more than the {self._max_bytes >> 20} MiB allowed for"
-                    " temporary files; raise unpack_max_mb"
-                )
-            self._bytes += size
-            entry.size += size
+    def _reserve(self, copy: _Copy, size: int) -> None:
+        for key in [key for key, other in self._copies.items() if not other.users]:
+            if self._bytes + size <= self._max_bytes:
+                break
+            self._delete(key)
+        if self._bytes + size > self._max_bytes:
+            raise UnreadableError(
+                f"unpacked it takes more than the {self._max_bytes >> 20} MiB allowed for"
+                " temporary files; raise unpack_max_mb"
+            )
+        self._bytes += size
+        copy.size += size
 
 
 def _delete_abandoned() -> None:

@@ -31,8 +31,8 @@ from ros2_memory.storage.base import (
     ROS2_PROFILE,
     Batch,
     Channel,
-    ChannelTotal,
     Closing,
+    Extent,
     Record,
     Schema,
     batched,
@@ -197,22 +197,26 @@ class SqliteBags:
             raise UnreadableError(
                 "damaged: messages without an integer timestamp or a binary payload"
             )
-        totals = [
-            ChannelTotal(topics.channels[number], count, first, last, absences.get(number, ()))
+        totals = {
+            number: Extent(count, first, last)
             for number, count, first, last, _, is_impossible in stored
             if number in topics.channels and not is_impossible
-        ]
+        }
         impossible = sum(count for _, count, _, _, _, is_impossible in stored if is_impossible)
         counts = sum(count for _, count, *_ in stored)
-        orphans = counts - impossible - sum(total.messages for total in totals)
+        orphans = counts - impossible - sum(total.count for total in totals.values())
         notes = [] if is_right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
         if impossible:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
-        declared = topics.channels.values()
         return summarize_channels(
-            totals, declared, notes=tuple(notes), set_back=set_back, pauses=pauses
+            topics.channels,
+            totals,
+            absences,
+            notes=tuple(notes),
+            set_back=set_back,
+            pauses=pauses,
         )
 
     def channels(self, path: Path) -> Sequence[Channel]:

@@ -26,7 +26,6 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
     Batch,
     Channel,
-    ChannelTotal,
     Closing,
     Record,
     batched,
@@ -136,19 +135,10 @@ class McapBags:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
             index = _Reading(self, file).verified()
-        totals = [
-            ChannelTotal(
-                index.channels[number],
-                total.count,
-                total.first,
-                total.last,
-                index.absences.get(number, ()),
-            )
-            for number, total in index.totals.items()
-        ]
         return summarize_channels(
-            totals,
-            index.channels.values(),
+            index.channels,
+            index.totals,
+            index.absences,
             complete=index.complete,
             notes=index.notes,
             set_back=index.set_back,

@@ -313,15 +313,6 @@ def declarations_of(data: bytes, places: IntArray) -> list[tuple[int, bytes]]:
 
 
 @dataclass(slots=True)
-class Extent:
-    """Messages of one channel: how many, and the log times of the earliest and the latest."""
-
-    count: int
-    first: int
-    last: int
-
-
-@dataclass(slots=True)
 class ChunkContent:
     """The content of a decompressed chunk.
 

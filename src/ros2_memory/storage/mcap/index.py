@@ -27,6 +27,7 @@ from ros2_memory.core.pauses import (
     pauses_among,
 )
 from ros2_memory.core.timebase import MAX_NS, Ns, unix_from_ns
+from ros2_memory.storage.base import Extent
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import (
     MAX_CHUNKS,
@@ -41,7 +42,6 @@ from ros2_memory.storage.mcap.chunk import (
     NO_PAIRS,
     OUTSIDE,
     Chunk,
-    Extent,
     Pairs,
     decompressed_chunk,
     decompressed_prefix,

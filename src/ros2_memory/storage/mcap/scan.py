@@ -14,10 +14,10 @@ import numpy as np
 from mcap.opcode import Opcode
 
 from ros2_memory.core.text import counted
-from ros2_memory.storage.base import Closing
+from ros2_memory.storage.base import Closing, Extent
 from ros2_memory.storage.cache import unshared_bytes
 from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable, too_large
-from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Extent, Pairs
+from ros2_memory.storage.mcap.chunk import Chunk, ChunkContent, ChunkOpener, Pairs
 from ros2_memory.storage.mcap.index import (
     OTHER_DECLARED,
     Contents,
