@@ -112,7 +112,9 @@ class View:
     def bounds(self, topic: str, window: TimeWindow) -> tuple[IntArray, IntArray]:
         """Returns the first and the last log time of a topic in each bag of a window, or near."""
         none = np.empty(0, np.int64)
-        bounds = [segment.bounds(topic) for segment in self.timeline.segments_in(window)]
+        segments = self.timeline.segments_in(window)
+        columns = filter(None, (segment.column(topic) for segment in segments))
+        bounds = [(column.firsts, column.lasts) for column in columns]
         firsts, lasts = zip((none, none), *bounds, strict=True)
         return np.concatenate(firsts), np.concatenate(lasts)
 

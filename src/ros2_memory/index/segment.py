@@ -115,11 +115,10 @@ class Pace(NamedTuple):
 
 
 class Tally(NamedTuple):
-    """How many bags, how many messages they hold, and their bytes."""
+    """How many bags, and how many messages they hold."""
 
     bags: int = 0
     messages: int = 0
-    size: int = 0
 
 
 def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
@@ -133,7 +132,7 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._known_recordings: dict[str, dict[Path, Span]] = {}
+        self._known_recordings: dict[str, dict[Path, TopicTotals]] = {}
 
     @cached_property
     def latest(self) -> Ns:
@@ -198,13 +197,10 @@ class Segment:
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
         folders, numbers = self._numbered_folders
-        tallies = np.zeros((len(folders), 3), np.int64)
         messages = _topic_columns(self).numbers[:, :, 0].sum(axis=0)
-        sizes = np.array([bag.size for bag in self.bags], np.int64)
-        np.add.at(tallies, numbers, np.stack([np.ones_like(sizes), messages, sizes], axis=1))
-        return {
-            folder: Tally(*tally) for folder, tally in zip(folders, tallies.tolist(), strict=True)
-        }
+        columns = (np.bincount(numbers), np.bincount(numbers, messages))
+        rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
+        return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
@@ -259,20 +255,26 @@ class Segment:
             for topic, by_type in self.totals.items()
         }
 
-    def recordings(self, topic: str) -> dict[Path, Span]:
-        """Returns the recordings that hold the topic, with its first and last log time in each."""
+    def recordings(self, topic: str) -> dict[Path, TopicTotals]:
+        """Returns what the bags of each recording that holds the topic have of it, of any type."""
         if topic not in self._known_recordings:
-            self._known_recordings[topic] = self._spans_by_recording(topic)
+            self._known_recordings[topic] = self._totals_by_recording(topic)
         return self._known_recordings[topic]
 
-    def _spans_by_recording(self, topic: str) -> dict[Path, Span]:
+    def _totals_by_recording(self, topic: str) -> dict[Path, TopicTotals]:
         column = self.column(topic)
         if column is None:
             return {}
         _, folder_numbers = self._numbered_folders
         numbers, paths = folder_numbers[column.bags], self._recording_paths
         spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
-        return {paths[number]: spans[number] for number in dict.fromkeys(numbers.tolist())}
+        counts = np.zeros(len(paths), np.int64)
+        np.add.at(counts, numbers, column.messages)
+        totals = [
+            TopicTotals(first, last, messages)
+            for (first, last), messages in zip(spans, counts.tolist(), strict=True)
+        ]
+        return {paths[number]: totals[number] for number in dict.fromkeys(numbers.tolist())}
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
@@ -282,27 +284,19 @@ class Segment:
         _, rows = np.unique(folder_numbers, return_index=True)
         return [self.bags[row].recording for row in rows.tolist()]
 
-    def extents(self, topic: str, window: TimeWindow | None = None) -> Iterator[TopicExtent]:
-        """Yields the bags that hold the topic (in a window), in order, once for each type."""
+    def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
+        """Yields the bags that hold the topic in a window, in order, once for each type."""
         column = self.column(topic)
         if column is None:
             return
-        if window is not None:
-            is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
-            column = TopicColumn(*(values[is_inside] for values in column))
-        bags, firsts, lasts, _ = (values.tolist() for values in column)
+        is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
+        bags, firsts, lasts, _ = (values[is_inside].tolist() for values in column)
         for row, first, last in zip(bags, firsts, lasts, strict=True):
             yield TopicExtent(self.bags[row], first, last)
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
         return _topic_columns(self).of(topic)
-
-    def bounds(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Returns the log times of the first and the last message of the topic in each bag."""
-        column = self.column(topic)
-        none = np.empty(0, np.int64)
-        return (none, none) if column is None else (column.firsts, column.lasts)
 
     def bounds_in(self, topics: Collection[str], window: TimeWindow) -> NDArray[np.int64]:
         """Returns the first and last log time of topics (2 x N) in each bag that has any there."""
@@ -330,18 +324,6 @@ class Segment:
         return frozenset(
             header.topic for schema in self._schemas for header in schema.topics if header.latched
         )
-
-    def totals_in(self, topic: str, folder: str) -> TopicTotals | None:
-        """Returns what the bags in a folder hold of a topic, under all of its types."""
-        column = self.column(topic)
-        folders, numbers = self._numbered_folders
-        if column is None or folder not in folders:
-            return None
-        in_folder = numbers[column.bags] == folders.index(folder)
-        _, firsts, lasts, counts = (values[in_folder] for values in column)
-        if not counts.size:
-            return None
-        return TopicTotals(int(firsts.min()), int(lasts.max()), int(counts.sum()))
 
     @cached_property
     def activities(self) -> dict[str, Activity]:

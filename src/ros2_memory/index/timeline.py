@@ -126,8 +126,8 @@ class Timeline:
         if topic not in self._recordings:
             spans: dict[Path, Span] = {}
             for segment in self.segments:
-                for folder, span in segment.recordings(topic).items():
-                    spans[folder] = wider(spans.get(folder), span)
+                for folder, totals in segment.recordings(topic).items():
+                    spans[folder] = wider(spans.get(folder), totals[:2])
             self._recordings[topic] = spans
         return self._recordings[topic]
 
@@ -214,7 +214,7 @@ class Timeline:
         """Returns how often a recording has messages of a topic; it must hold some."""
         folder = str(recording)
         segments = [segment for segment in self.segments if folder in segment.folders]
-        totals = filter(None, (segment.totals_in(topic, folder) for segment in segments))
+        totals = filter(None, (segment.recordings(topic).get(recording) for segment in segments))
         extents = (segment.folder_spans[folder] for segment in segments)
         return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
 
