@@ -178,16 +178,20 @@ class Typestores:
                 if members > MAX_MEMBERS:
                     raise _UnusableError(f"its definition has more than {MAX_MEMBERS} fields")
                 definitions.update(definition)
-            fields = [field for _, field in definitions[name][1]]
-            if wide := _WIDE.intersection(map(_short_name, fields)):
+            shapes = [_shape(field) for _, field in definitions[name][1]]
+            if wide := _WIDE.intersection(kind.rpartition("/")[2] for kind, _ in shapes):
                 raise _UnusableError(f"its definition has a {min(wide)}, which is not decoded")
-            unrolled += sum(map(_unrolled, fields))
+            unrolled += sum(
+                length or 0
+                for kind, length in shapes
+                if length != SEQUENCE and ("/" in kind or kind == "string")
+            )
             if unrolled > MAX_UNROLLED:
                 raise _UnusableError(
                     f"its fixed arrays of strings and messages hold more than {MAX_UNROLLED}"
                     " elements"
                 )
-            nested = dict.fromkeys(filter(None, map(_nested_type, fields)))
+            nested = dict.fromkeys(kind for kind, _ in shapes if "/" in kind)
             todo += [(inner, (*trail, name)) for inner in reversed(nested)]
         return {
             name: (constants, [(field_name, _unsigned(field)) for field_name, field in fields])
@@ -354,73 +358,41 @@ def definition_of(definitions: Typesdict, root: str) -> Definition:
         definitions: those of the type and of its nested types; none contains itself.
         root: the name of the type.
     """
-    finished_types: dict[str, Definition] = {}
-    waiting = [root]
-    while waiting:
-        described = definitions[waiting[-1]][1]
-        nested = {_nested_type(field) for _, field in described} - finished_types.keys() - {None}
-        if nested:
-            waiting += sorted(filter(None, nested))
-            continue
-        fields: list[Field] = []
-        for name, field in described:
-            if field[0] == Nodetype.BASE or field[0] == Nodetype.NAME:
-                fields.append(Field(name, _kind(field, finished_types)))
-            else:
-                element, length = field[1]
-                stated = length if field[0] == Nodetype.ARRAY else SEQUENCE
-                fields.append(Field(name, _kind(element, finished_types), stated))
-        finished = waiting.pop()
-        finished_types[finished] = Definition(finished, tuple(fields))
-    return finished_types[root]
+
+    @cache
+    def defined(name: str) -> Definition:
+        shapes = [(field_name, *_shape(field)) for field_name, field in definitions[name][1]]
+        return Definition(
+            name,
+            tuple(
+                Field(field_name, defined(kind) if "/" in kind else kind, length)
+                for field_name, kind, length in shapes
+            ),
+        )
+
+    return defined(root)
 
 
-def _kind(field: FieldDesc, finished_types: Mapping[str, Definition]) -> str | Definition:
-    """Returns what a field that is no array holds: the name of a primitive, or a known type."""
-    if field[0] == Nodetype.BASE:
-        return str(field[1][0])
-    return finished_types[str(field[1])]
+def _shape(field: FieldDesc) -> tuple[str, int | None]:
+    """Returns the type of a field, or of its elements, and its length, as that of a `Field`.
 
-
-def _nested_type(field: FieldDesc) -> str | None:
-    """Returns the message type of a field, alone or in an array; None for a primitive."""
-    if field[0] == Nodetype.NAME:
-        return str(field[1])
+    Names of messages have a slash, those of primitive types have none.
+    """
+    length: int | None = None
     if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
-        element = field[1][0]
-        return str(element[1]) if element[0] == Nodetype.NAME else None
-    return None
+        length = field[1][1] if field[0] == Nodetype.ARRAY else SEQUENCE
+        field = field[1][0]
+    return str(field[1][0] if field[0] == Nodetype.BASE else field[1]), length
 
 
 def _unsigned(field: FieldDesc) -> FieldDesc:
     """Returns a field whose bytes are unsigned, as in ROS; rosbags decodes them as int8."""
-    if _primitive(field) != "byte":
+    if _shape(field)[0] != "byte":
         return field
     byte: BaseDesc = (Nodetype.BASE, ("uint8", 0))
     if field[0] == Nodetype.ARRAY:
         return (Nodetype.ARRAY, (byte, field[1][1]))
     return (Nodetype.SEQUENCE, (byte, field[1][1])) if field[0] == Nodetype.SEQUENCE else byte
-
-
-def _short_name(field: FieldDesc) -> str:
-    """Returns the name of a type without its package, of a field alone or in an array."""
-    return (_primitive(field) or _nested_type(field) or "").rpartition("/")[2]
-
-
-def _primitive(field: FieldDesc) -> str | None:
-    """Returns the primitive type of a field, alone or in an array; None for a message."""
-    if field[0] == Nodetype.ARRAY or field[0] == Nodetype.SEQUENCE:
-        field = field[1][0]
-    return str(field[1][0]) if field[0] == Nodetype.BASE else None
-
-
-def _unrolled(field: FieldDesc) -> int:
-    """Returns how many elements generated code spells out one by one."""
-    if field[0] != Nodetype.ARRAY:
-        return 0
-    element, count = field[1]
-    is_primitive = element[0] == Nodetype.BASE and element[1][0] != "string"
-    return 0 if is_primitive else count
 
 
 def _definitions_below(folder: Path) -> Iterator[tuple[str, str]]:

@@ -22,9 +22,10 @@ from itertools import starmap, zip_longest
 from operator import eq
 from typing import IO, TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.core.large_reads import LARGE_BYTES, LargeReads
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS, SHORTEST_SILENCE_NS
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
@@ -32,7 +33,6 @@ from ros2_memory.storage.base import (
     Batch,
     Channel,
     Closing,
-    Extent,
     Record,
     Schema,
     batched,
@@ -52,6 +52,8 @@ from ros2_memory.storage.errors import (
     UnreadableError,
 )
 from ros2_memory.storage.file_io import EMPTY_FILE, FileKey, OpenFile, open_regular
+from ros2_memory.storage.mcap.chunk import Pairs
+from ros2_memory.storage.mcap.index import Contents
 from ros2_memory.storage.mcap.records import offered_as_latched
 from ros2_memory.storage.zstd_bag import uncompressed_payload
 from ros2_memory.typestore import full_name
@@ -61,45 +63,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.core.pauses import CountedPause
 
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
 _PROOF_BYTES: Final = 200
-_LAST_NS: Final[Ns] = MAX_NS - 1
-"""The last possible log time; the first is 0, as in MCAP: so no length of time overflows."""
-_TOTALS: Final = """
-    SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END AS topic, count(*),
-           min(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
-           max(CASE WHEN typeof(timestamp) = 'integer' THEN timestamp END),
-           sum(typeof(timestamp) != 'integer' OR typeof(data) != 'blob'),
-           timestamp NOT BETWEEN 0 AND ? AS impossible
-    FROM messages NOT INDEXED GROUP BY topic, impossible
+_ROWS: Final = """
+    SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END, timestamp,
+        typeof(timestamp) = 'integer' AND typeof(data) = 'blob'
+    FROM messages NOT INDEXED ORDER BY rowid
 """
-_PAUSES: Final = """
-    SELECT before, timestamp, number - 1 FROM (
-        SELECT timestamp, lag(timestamp) OVER ordered AS before, row_number() OVER ordered AS number
-        FROM messages NOT INDEXED
-        WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
-        WINDOW ordered AS (ORDER BY timestamp)
-    ) WHERE timestamp - before > ?
-"""
-_ABSENCES: Final = """
-    SELECT topic_id, before, timestamp, number - 1 FROM (
-        SELECT topic_id, timestamp, lag(timestamp) OVER ordered AS before,
-            row_number() OVER ordered AS number
-        FROM messages NOT INDEXED
-        WHERE timestamp BETWEEN 0 AND ?
-        WINDOW ordered AS (PARTITION BY topic_id ORDER BY timestamp)
-    ) WHERE timestamp - before > ? ORDER BY timestamp
-"""
-_SET_BACK: Final = """
-    SELECT max(before - timestamp, 0), timestamp FROM (
-        SELECT timestamp, lag(timestamp) OVER (PARTITION BY topic_id ORDER BY rowid) AS before
-        FROM messages NOT INDEXED
-        WHERE timestamp BETWEEN 0 AND ? AND topic_id IN (SELECT value FROM json_each(?))
-    ) WHERE before IS NOT NULL ORDER BY before - timestamp DESC LIMIT 1
-"""
+_ROWS_AT_ONCE: Final = 1 << 16
+_ROWS_OF_SPAN: Final = 64
+"""Of so many rows, if they are short, the first and last time alone are kept: as of a chunk."""
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
 _ASCENDING: Final = """
     SELECT timestamp, rowid, topic_id FROM messages
@@ -179,32 +154,23 @@ class SqliteBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with self._opened(path) as (base, topics):
-            stored: list[tuple[int, int, int, int, int, int]]
-            stored = base.execute(_TOTALS, (_LAST_NS,)).fetchall()
             is_right = self._is_indexed_right(base, topics)
-            asked = (_LAST_NS, json.dumps([*topics.channels]), SHORTEST_PAUSE_NS)
-            pauses = base.execute(_PAUSES, asked).fetchall()
-            absences: dict[int, list[CountedPause]] = {}
-            possible = [(first, last) for _, _, first, last, _, is_not in stored if not is_not]
-            firsts, lasts = zip(*possible, strict=True) if possible else ((0,), (0,))
-            if max(lasts) - min(firsts) > SHORTEST_SILENCE_NS:
-                for number, start, end, sent in base.execute(
-                    _ABSENCES, (_LAST_NS, SHORTEST_SILENCE_NS)
-                ):
-                    absences.setdefault(number, []).append((start, end, sent))
-            set_back = base.execute(_SET_BACK, asked[:2]).fetchone() or (0, 0)
-        if any(undecodable for *_, undecodable, _ in stored):
-            raise UnreadableError(
-                "damaged: messages without an integer timestamp or a binary payload"
-            )
-        totals = {
-            number: Extent(count, first, last)
-            for number, count, first, last, _, is_impossible in stored
-            if number in topics.channels and not is_impossible
-        }
-        impossible = sum(count for _, count, _, _, _, is_impossible in stored if is_impossible)
-        counts = sum(count for _, count, *_ in stored)
-        orphans = counts - impossible - sum(total.count for total in totals.values())
+            contents = Contents()
+            orphans = impossible = 0
+            rows = base.execute(_ROWS)
+            while part := rows.fetchmany(_ROWS_AT_ONCE):
+                if not all(is_message for _, _, is_message in part):
+                    raise UnreadableError(
+                        "damaged: messages without an integer timestamp or a binary payload"
+                    )
+                timed = [(number, time) for number, time, _ in part if 0 <= time < MAX_NS]
+                known = [
+                    (number, time, 0, 0) for number, time in timed if number in topics.channels
+                ]
+                impossible += len(part) - len(timed)
+                orphans += len(timed) - len(known)
+                if known:
+                    contents.add(Pairs(*np.array(known, np.int64).T))
         notes = [] if is_right else [_WRONG_INDEX]
         if orphans:
             notes.append(f"left out: {counted(orphans, 'message')} of no topic")
@@ -212,11 +178,11 @@ class SqliteBags:
             notes.append(f"left out: {counted(impossible, 'message')} without a possible log time")
         return summarize_channels(
             topics.channels,
-            totals,
-            absences,
+            contents.totals,
+            contents.absences,
             notes=tuple(notes),
-            set_back=set_back,
-            pauses=pauses,
+            set_back=contents.back,
+            pauses=contents.pauses,
         )
 
     def channels(self, path: Path) -> Sequence[Channel]:
