@@ -449,10 +449,12 @@ class _Reading:
 
     def _inside(self, pairs: Pairs, wanted: Collection[int]) -> Column:
         """Returns the wanted messages inside the window, in order."""
-        times, window = pairs.times, self._window
-        is_inside = np.isin(pairs.channels, [*wanted])
-        is_inside &= (times >= window.start) & (times < window.stop)
-        return Column.of(times[is_inside], pairs.offsets[is_inside])
+        channels, numbers = pairs.channels, [*wanted]
+        # One alone, as in most questions, is compared in a tenth of the time.
+        is_wanted = channels == numbers[0] if len(numbers) == 1 else np.isin(channels, numbers)
+        column = Column.of(pairs.times[is_wanted], pairs.offsets[is_wanted])
+        first, last = column.times.searchsorted((self._window.start, self._window.stop))
+        return Column(column.times[first:last], column.places[first:last])
 
     def _lost(self, chunk: Chunk, reason: str) -> LostError | None:
         """Returns what of the window is lost with a chunk that cannot be read; None if nothing."""
