@@ -321,7 +321,6 @@ class RequestQueue:
     def __init__(self, bag_dir: Path) -> None:
         self._bag_dir = bag_dir
         self._folder = bag_dir / REQUESTS_FOLDER
-        self._foreign = 0
         self._ignored: set[str] = set()
 
     def open(self) -> None:
@@ -347,7 +346,6 @@ class RequestQueue:
             OSError: the folder cannot be listed, or written to.
         """
         names = sorted(path.name for path in self._folder.iterdir())
-        self._report_foreign(names)
         requests = [name for name in names if self._is_request(name)]
         requests.sort(key=lambda name: not name.endswith(".taken"))
         for name in requests[:MAX_AT_ONCE]:
@@ -390,12 +388,6 @@ class RequestQueue:
     def _is_request(self, name: str) -> bool:
         """Returns whether a file is a request by its name, and was not found to be invalid."""
         return name not in self._ignored and _REQUEST_NAME.fullmatch(name) is not None
-
-    def _report_foreign(self, names: list[str]) -> None:
-        foreign = sum(_OWN_NAME.fullmatch(name) is None for name in names)
-        if foreign > self._foreign:
-            _log.warning("requests_foreign", folder=str(self._folder), files=foreign)
-        self._foreign = foreign
 
     def _delete_left_over(self, names: list[str], now: Ns) -> None:
         """Deletes answers that were never fetched, and unfinished files."""

@@ -10,13 +10,15 @@ from __future__ import annotations
 import json
 import struct
 import sys
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cache, cached_property, lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
+from pydantic import TypeAdapter
 
+from ros2_memory.core.pauses import Absences, Pauses
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -24,11 +26,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from ros2_memory.core.pauses import Absences, Pauses
-
     IntArray = NDArray[np.int64]
 
-SetBack: TypeAlias = "tuple[Ns, Ns] | None"
+SetBack: TypeAlias = tuple[Ns, Ns] | None
 """By how much log times go back, and the first one after that; None where they do not."""
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
@@ -68,6 +68,12 @@ class TopicHeader(NamedTuple):
     type: str
     encoding: str
     latched: bool
+
+
+_StoredSchema: TypeAlias = tuple[
+    tuple[TopicHeader, ...], tuple[str, ...], bool, tuple[str, ...], SetBack, Pauses, Absences
+]
+"""The fields of a `SummarySchema`."""
 
 
 @dataclass(frozen=True)
@@ -115,25 +121,13 @@ class SummarySchema:
 
         Raises:
             ValueError: the text is not valid.
-            TypeError: likewise.
         """
-        topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
-        headers = tuple(
-            TopicHeader(topic, type_name, encoding, bool(latched))
-            for topic, type_name, encoding, latched in topics
-        )
-        return shared_schema(
-            headers,
-            tuple(silent),
-            bool(complete),
-            tuple(notes),
-            set_back=set_back and (int(set_back[0]), int(set_back[1])),
-            pauses=tuple((int(start), int(end)) for start, end in pauses),
-            absences=tuple(
-                (topic, tuple((int(start), int(end), int(sent)) for start, end, sent in listed))
-                for topic, listed in absences
-            ),
-        )
+        return shared_schema(SummarySchema(*_stored_schema().validate_json(text)))
+
+
+@cache
+def _stored_schema() -> TypeAdapter[_StoredSchema]:
+    return TypeAdapter(_StoredSchema)
 
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"
@@ -176,26 +170,14 @@ def set_back_while_written(by: Ns) -> str:
 
 
 @lru_cache(maxsize=_CACHED_SCHEMAS)
-def shared_schema(
-    topics: tuple[TopicHeader, ...],
-    silent: tuple[str, ...],
-    complete: bool,
-    notes: tuple[str, ...],
-    *,
-    set_back: SetBack = None,
-    pauses: Pauses = (),
-    absences: Absences = (),
-) -> SummarySchema:
+def shared_schema(schema: SummarySchema) -> SummarySchema:
     """Returns one schema for all bags that have it, with one copy of each name."""
     intern = sys.intern
-    headers = tuple(
-        TopicHeader(
-            intern(header.topic), intern(header.type), intern(header.encoding), header.latched
-        )
-        for header in topics
+    topics = tuple(
+        TopicHeader(intern(topic), intern(type_name), intern(encoding), latched)
+        for topic, type_name, encoding, latched in schema.topics
     )
-    names = tuple(intern(name) for name in silent)
-    return SummarySchema(headers, names, complete, notes, set_back, pauses, absences)
+    return replace(schema, topics=topics, silent=tuple(map(intern, schema.silent)))
 
 
 class BagSummary:
@@ -235,13 +217,7 @@ class BagSummary:
             TopicHeader(topic.topic, topic.type, topic.encoding, topic.latched) for topic in topics
         )
         self.schema = shared_schema(
-            tuple(headers),
-            silent,
-            complete,
-            notes,
-            set_back=set_back,
-            pauses=pauses,
-            absences=absences,
+            SummarySchema(tuple(headers), silent, complete, notes, set_back, pauses, absences)
         )
         numbers = (part for topic in topics for part in (topic.count, topic.first, topic.last))
         self._numbers = self.schema.numbers.pack(*numbers)

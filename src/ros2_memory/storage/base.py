@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 
-from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS, BagSummary, TopicHeader, shared_schema
+from ros2_memory.core.bag_summary import (
+    OUT_OF_ORDER_NS,
+    BagSummary,
+    SummarySchema,
+    TopicHeader,
+    shared_schema,
+)
 from ros2_memory.core.errors import BagError, UndecodableError
 from ros2_memory.core.pauses import absences_of, noteworthy
 from ros2_memory.core.text import counted
@@ -585,12 +591,14 @@ def summarize_channels(
         noted[topic] = () if is_other_type else found
     length = max(numbers[2::3], default=0) - min(numbers[1::3], default=0)
     schema = shared_schema(
-        tuple(headers),
-        tuple(sorted(silent)),
-        complete,
-        notes,
-        set_back=set_back if set_back[0] > OUT_OF_ORDER_NS else None,
-        pauses=noteworthy(pauses, numbers[::3], length),
-        absences=tuple((topic, found) for topic, found in noted.items() if found),
+        SummarySchema(
+            tuple(headers),
+            tuple(sorted(silent)),
+            complete,
+            notes,
+            set_back if set_back[0] > OUT_OF_ORDER_NS else None,
+            noteworthy(pauses, numbers[::3], length),
+            tuple((topic, found) for topic, found in noted.items() if found),
+        )
     )
     return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
