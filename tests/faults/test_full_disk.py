@@ -12,7 +12,8 @@ import zstandard
 from ros2_memory.core.errors import BagUnreachableError
 from ros2_memory.index.file_state import RETRY_SOON_NS
 from ros2_memory.storage.errors import UnreachableError
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader, Scratch
+from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.storage.scratch import Scratch
 from tests.faults.small_disk import filled, needs_mounts, small_disk
 from tests.faults.world import NOW, told, write_bags
 from tests.support.clocks import SettableClock

@@ -2,176 +2,175 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
-import os
-import shutil
-import tempfile
-import threading
-import time
-import weakref
-from collections import OrderedDict
+import json
+import struct
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
+from rosbags.serde.utils import SIZEMAP
+
+from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import BAG_KINDS, COMPRESSED
-from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreachableError, UnreadableError, reading
-from ros2_memory.storage.file_io import OpenFile
-from ros2_memory.storage.file_reader import FileReader, OpenedBag
-from ros2_memory.storage.mcap.bag_file import McapBags
-from ros2_memory.storage.sqlite_bag import (
-    SqliteBags,
-    copy_with_journal,
-    journals_beside,
+from ros2_memory.storage.base import SEQUENCE, BagReader, Batch, Channel, Definition, Record
+from ros2_memory.storage.errors import (
+    MAX_CHUNK_MB,
+    LostError,
+    UnreadableError,
+    raise_if_lost,
+    reading,
 )
-from ros2_memory.storage.zstd_bag import closing_of_zstd, unpack
+from ros2_memory.storage.file_io import OpenFile
+from ros2_memory.storage.mcap.bag_file import McapBags
+from ros2_memory.storage.scratch import Scratch
+from ros2_memory.storage.sqlite_bag import SqliteBags, copy_with_journal, journals_beside
+from ros2_memory.storage.zstd_bag import FRAME_MAGIC, closing_of_zstd, unpack
+from ros2_memory.typestore import MessageType, Typestores
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Hashable, Iterator, Sequence
+    from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+    from pathlib import Path
 
+    from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import Closing
 
-_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
-_PREFIX = "ros2-memory-unpacked-"
-_UNLOCKED_S = 60
-"""A folder of less age may be of a program that is about to lock it."""
+_HEADER_BYTES: Final = 4
+# A float128 is not aligned to its own size.
+_SIZES: Final[Mapping[str, int]] = {
+    str(name): size for name, size in SIZEMAP.items() if name != "float128"
+}
+
+MAX_OBJECTS: Final = 200_000
+"""Texts and messages in one message; each is an object when it is decoded."""
+_COUNTED_FROM_BYTES: Final = 256 << 10
 
 
-@dataclass(slots=True, eq=False)
-class _Copy:
-    """A temporary file and a note on it, in a folder of its own; how many read it at the moment."""
-
-    folder: Path
-    size: int = 0
-    users: int = 0
-    filled: tuple[Path, str] = (Path(), "")
+class _StoppedError(Exception):
+    """There are more objects than are counted, or the payload does not fit its definition."""
 
 
-class Scratch:
-    """Folders for temporary files, bounded in bytes. Safe to use from several threads.
+def holds_too_many(definition: Definition, payload: bytes) -> bool:
+    """Returns whether decoding a payload would make more than `MAX_OBJECTS` objects.
 
-    The least recently used are deleted first, never one in use. All are deleted with the reader, or
-    when the program ends. A program that is killed leaves its folders: the next deletes those that
-    nobody has locked.
-
-    Args:
-        max_bytes: what all files together may take.
+    One byte of it can become an object of a hundred. The length that a sequence states counts. A
+    payload that does not fit its definition otherwise is left to decoding, which names the fault.
     """
-
-    def __init__(self, max_bytes: int) -> None:
-        self._max_bytes = max_bytes
-        self._root: Path | None = None
-        self._copies: OrderedDict[Hashable, _Copy] = OrderedDict()
-        self._bytes = 0
-        self._lock = threading.Lock()
-
-    @contextmanager
-    def use(
-        self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
-    ) -> Iterator[tuple[Path, str]]:
-        """Yields the file that is made of the content `key`; it is not deleted inside the block.
-
-        Args:
-            key: the content that it is made of.
-            fill: makes the file if it is not there: takes an empty folder, and a function to call
-                with a number of bytes before it writes as many; returns the file and a note on it.
-
-        Raises:
-            UnreadableError: the file does not fit into `max_bytes`.
-            UnreachableError: the disk of the temporary files is full.
-        """
-        # One file at a time is made: of two that are, either might leave no room for the other.
-        with self._lock:
-            copy = self._copies.get(key)
-            if copy is None or not copy.filled[0].exists():
-                self._delete(key)
-                copy = self._copies[key] = self._made(fill)
-            self._copies.move_to_end(key)
-            copy.users += 1
-        try:
-            yield copy.filled
-        finally:
-            with self._lock:
-                copy.users -= 1
-
-    def _made(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
-        try:
-            if self._root is None or not self._root.exists():
-                _delete_abandoned()
-                self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
-                weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
-                with suppress(OSError):  # where nothing can be locked, nobody else deletes it
-                    weakref.finalize(self, os.close, _lock(self._root))
-            copy = _Copy(Path(tempfile.mkdtemp(dir=self._root)))
-        except OSError as error:
-            raise _disk_full(error) from error
-        try:
-            copy.filled = fill(copy.folder, partial(self._reserve, copy))
-        except BaseException as error:
-            self._bytes -= copy.size
-            shutil.rmtree(copy.folder, ignore_errors=True)
-            if isinstance(error, OSError) and error.errno in _DISK_FULL:
-                raise _disk_full(error) from error
-            raise
-        return copy
-
-    def _delete(self, key: Hashable) -> None:
-        copy = self._copies.pop(key, None)
-        if copy is not None:
-            self._bytes -= copy.size
-            shutil.rmtree(copy.folder, ignore_errors=True)
-
-    def _reserve(self, copy: _Copy, size: int) -> None:
-        for key in [key for key, other in self._copies.items() if not other.users]:
-            if self._bytes + size <= self._max_bytes:
-                break
-            self._delete(key)
-        if self._bytes + size > self._max_bytes:
-            raise UnreadableError(
-                f"unpacked it takes more than the {self._max_bytes >> 20} MiB allowed for"
-                " temporary files; raise unpack_max_mb"
-            )
-        self._bytes += size
-        copy.size += size
+    if len(payload) < _COUNTED_FROM_BYTES:
+        return False
+    walk = _Walk(payload)
+    with suppress(_StoppedError, struct.error, IndexError):
+        walk.message(definition)
+    return walk.objects > MAX_OBJECTS
 
 
-def _delete_abandoned() -> None:
-    """Deletes the folders of programs that were killed: no process has them locked any more."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        with suppress(OSError):  # of another user, or in use
-            if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
-                descriptor = _lock(folder)
-                shutil.rmtree(folder, ignore_errors=True)
-                os.close(descriptor)
+class _Walk:
+    """Goes through the fields of a payload, in either byte order, and counts texts and messages."""
+
+    def __init__(self, payload: bytes) -> None:
+        self.objects = 0
+        self._payload = payload
+        self._length_of = struct.Struct("<I" if payload[1] & 1 else ">I")
+        self._position = _HEADER_BYTES
+
+    def message(self, definition: Definition) -> None:
+        self._count()
+        if not definition.fields:
+            self._advance(1, 1)
+        for field in definition.fields:
+            if field.length is None:
+                self._one(field.kind)
+            else:
+                length = self._length() if field.length == SEQUENCE else field.length
+                self._elements(field.kind, length)
+
+    def _elements(self, kind: str | Definition, count: int) -> None:
+        """Goes past some elements: at once where all have one size."""
+        if isinstance(kind, str) and kind in _SIZES:
+            if count:  # without elements there is no padding either
+                self._advance(_SIZES[kind], _SIZES[kind] * count)
+            return
+        if isinstance(kind, Definition) and self.objects + count > MAX_OBJECTS:
+            # Each is an object: none of them needs to be read.
+            self.objects += count
+            raise _StoppedError
+        for _ in range(count):
+            self._one(kind)
+
+    def _one(self, kind: str | Definition) -> None:
+        if isinstance(kind, Definition):
+            self.message(kind)
+        elif kind == "string":
+            self._count()
+            self._advance(1, self._length())
+        elif kind in _SIZES:
+            self._advance(_SIZES[kind], _SIZES[kind])
+        else:
+            raise _StoppedError
+
+    def _length(self) -> int:
+        at = self._advance(4, 4)
+        length: int = self._length_of.unpack_from(self._payload, at)[0]
+        return length
+
+    def _advance(self, alignment: int, size: int) -> int:
+        """Goes past an aligned value, and returns where it begins."""
+        at = self._position + -(self._position - _HEADER_BYTES) % alignment
+        self._position = at + size
+        if self._position > len(self._payload):
+            raise _StoppedError
+        return at
+
+    def _count(self) -> None:
+        self.objects += 1
+        if self.objects > MAX_OBJECTS:
+            raise _StoppedError
 
 
-def _lock(folder: Path) -> int:
-    """Locks a folder while this process lives, and returns its descriptor.
-
-    Raises:
-        OSError: another has it, or it cannot be locked.
-    """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        os.close(descriptor)
-        raise
-    return descriptor
+_MAX_KNOWN = 10_000
+_MAX_JSON_BYTES = 4 << 20
+"""A byte of JSON can become thirty of memory."""
+_EMPTY_MESSAGE_BYTES = 8
+"""The CDR header, the one byte of a message without fields, and padding."""
 
 
-def _disk_full(error: OSError) -> UnreachableError:
-    return UnreachableError(
-        "it must be unpacked, and nothing can be written into the folder for temporary files"
-        f" ({error.strerror or error}); free disk space there, or name another folder in TMPDIR"
-    )
+def _json(payload: bytes) -> object:
+    if len(payload) > _MAX_JSON_BYTES:
+        raise UnreadableError(f"it is longer than the {_MAX_JSON_BYTES >> 20} MiB that are read")
+    value: object = json.loads(payload)
+    return value
 
 
-class Rosbag2Reader(FileReader):
+def _deserialized(message_type: MessageType, payload: bytes) -> object:
+    """Decodes a payload, unless it holds more than `MAX_OBJECTS` objects."""
+    # The recorder may not have found the text of an empty definition.
+    if not message_type.fields.fields and len(payload) > _EMPTY_MESSAGE_BYTES:
+        raise UnreadableError(
+            "the definition in the bag is empty and the message is not; put the package's .msg"
+            " folder into reader.custom_msg_paths"
+        )
+    if holds_too_many(message_type.fields, payload):
+        raise UnreadableError(f"it states more than {MAX_OBJECTS} texts or messages")
+    return message_type.deserialize(payload)
+
+
+def _reason(record: Record, error: Exception) -> str:
+    if record.payload[:4] == FRAME_MAGIC and record.channel.encoding == "cdr":
+        return "its compressed payload is damaged or too large"
+    words = " ".join(str(error).split())[:160] or type(error).__name__
+    if isinstance(error, UnreadableError):
+        return f"the payload is not decoded: {words}"
+    if record.channel.encoding == "json":
+        return f"the payload is not JSON: {words}"
+    return f"the payload does not fit the definition: {words}"
+
+
+MUCH_DECODED_BYTES: Final = 1 << 20
+"""A larger message counts as large: decoded it may take thirty times as much."""
+
+
+class Rosbag2Reader(BagReader):
     """Reads `.mcap` and `.db3` files, also compressed as a whole (`.zstd`).
 
     Args:
@@ -195,7 +194,11 @@ class Rosbag2Reader(FileReader):
         large: LargeReads | None = None,
     ) -> None:
         large = large or LargeReads()
-        super().__init__(custom_msg_paths, large)
+        self._typestores = Typestores(custom_msg_paths)
+        # By identity, since hashing a channel hashes its definition; the channel is kept, so that
+        # its identity is not given to another.
+        self._known: dict[int, tuple[Channel, Callable[[bytes], object] | str]] = {}
+        self._large = large
         self._formats: dict[str, McapBags | SqliteBags] = {
             ".mcap": McapBags(cache_mb, max_chunk_mb, large),
             ".db3": SqliteBags(max_chunk_mb, large),
@@ -214,8 +217,11 @@ class Rosbag2Reader(FileReader):
             return self._formats[path.suffix].closing(path)
 
     @contextmanager
-    def _open(self, path: Path) -> Iterator[OpenedBag]:
-        """Opens the file itself, or a temporary copy, decompressed or with its journal applied."""
+    def _open(self, path: Path) -> Iterator[tuple[McapBags | SqliteBags, Path, str]]:
+        """Yields what reads a file, where that is, and a note on why it is not complete, or "".
+
+        That is the file itself, or a temporary copy, decompressed or with its journal applied.
+        """
         if not self.reads(path):
             raise UnreadableError(f"not of a kind that is read ({', '.join(BAG_KINDS)})")
         is_compressed = path.suffix == COMPRESSED
@@ -227,11 +233,118 @@ class Rosbag2Reader(FileReader):
             sources += journals_beside(path)
             fill = partial(copy_with_journal, path)
         else:
-            yield OpenedBag(bags, path, "")
+            yield bags, path, ""
             return
         keys = []
         for source in sources:
             with OpenFile(source) as file:
                 keys.append(file.key)
         with self._scratch.use(tuple(keys), fill) as (copy, note):
-            yield OpenedBag(bags, copy, note)
+            yield bags, copy, note
+
+    def summarize(self, path: Path) -> BagSummary:
+        """Returns topics with exact counts and exact first and last log times."""
+        with reading(path), self._open(path) as (bags, file, note):
+            summary = bags.summarize(file)
+        return summary.replaced(complete=False, notes=(note, *summary.notes)) if note else summary
+
+    def records(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        newest_first: bool = False,
+    ) -> Iterator[Record]:
+        """Yields the undecoded messages of `topics` inside the window, by log time."""
+
+        def read() -> Iterator[Record | LostError]:
+            with reading(path), self._open(path) as (bags, file, _):
+                yield from bags.records(file, topics, window, newest_first=newest_first)
+
+        # Mapped outside of the generator: one that has raised could not go on behind lost messages.
+        return map(partial(raise_if_lost, path), read())
+
+    def batches(
+        self,
+        path: Path,
+        topics: Collection[str],
+        window: TimeWindow,
+        *,
+        bare: Collection[str] = (),
+    ) -> Iterator[Batch]:
+        """Yields the messages of `topics` inside the window, many at once."""
+
+        def read() -> Iterator[Batch | LostError]:
+            with reading(path), self._open(path) as (bags, file, _):
+                yield from bags.batches(file, topics, window, bare)
+
+        return map(partial(raise_if_lost, path), read())
+
+    def channels(self, path: Path) -> Sequence[Channel]:
+        """Returns every channel that is declared in the file."""
+        with reading(path), self._open(path) as (bags, file, _):
+            return bags.channels(file)
+
+    def profile(self, path: Path) -> str:
+        """Returns the profile in the header of an MCAP file; `ros2` for a sqlite file."""
+        with reading(path), self._open(path) as (bags, file, _):
+            return bags.profile(file)
+
+    def undecodable(self, channel: Channel) -> str | None:
+        """Returns why no message of this channel can be decoded, or None."""
+        decoder = self._decoder(channel)
+        return decoder if isinstance(decoder, str) else None
+
+    def decode(self, record: Record) -> object:
+        """Decodes the message of a record."""
+        if len(record.payload) > MUCH_DECODED_BYTES:
+            self._large.acquire()
+        channel = record.channel
+        decoder = self._decoder(channel)
+        if isinstance(decoder, str):
+            raise UndecodableError(channel.topic, channel.type, decoder)
+        try:
+            return decoder(record.payload)
+        # rosbags raises whatever the generated code runs into; a payload may hold anything.
+        except Exception as error:
+            reason = _reason(record, error)
+            raise UndecodableError(channel.topic, channel.type, reason) from error
+
+    def encode(self, channel: Channel, message: object) -> bytes:
+        """Encodes a decoded message of a channel."""
+        message_type = self._type_of(channel)
+        reason = f"messages encoded as {channel.encoding} are not written"
+        if channel.encoding != "cdr" or isinstance(message_type, str):
+            raise UndecodableError(channel.topic, channel.type, reason)
+        try:
+            return message_type.serialize(message)
+        # rosbags raises whatever the generated code runs into, as for `decode`.
+        except Exception as error:
+            reason = f"the message is not encoded: {' '.join(str(error).split())[:160]}"
+            raise UndecodableError(channel.topic, channel.type, reason) from error
+
+    def definition(self, channel: Channel) -> Definition | None:
+        """Returns the fields of the channel's messages, or None."""
+        message_type = self._type_of(channel) if channel.encoding == "cdr" else ""
+        return None if isinstance(message_type, str) else message_type.fields
+
+    def _decoder(self, channel: Channel) -> Callable[[bytes], object] | str:
+        _, cached = self._known.get(id(channel), (channel, None))
+        if cached is not None:
+            return cached
+        decoder: Callable[[bytes], object] | str = _json
+        if channel.encoding == "cdr":
+            usable = self._type_of(channel)
+            usable = usable if isinstance(usable, str) else usable.compiled()
+            decoder = usable if isinstance(usable, str) else partial(_deserialized, usable)
+        elif channel.encoding != "json":
+            decoder = f"its message encoding {channel.encoding!r} is not read (cdr and json are)"
+        if len(self._known) >= _MAX_KNOWN:
+            self._known.clear()
+        self._known[id(channel)] = (channel, decoder)
+        return decoder
+
+    def _type_of(self, channel: Channel) -> MessageType | str:
+        schema = channel.schema
+        return self._typestores.lookup(schema.name, schema.encoding, schema.text)

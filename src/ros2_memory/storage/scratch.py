@@ -1,0 +1,158 @@
+"""Temporary files of a reader: copies of bags that are decompressed, or have a journal applied."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import shutil
+import tempfile
+import threading
+import time
+import weakref
+from collections import OrderedDict
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ros2_memory.storage.errors import UnreachableError, UnreadableError
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterator
+
+_DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EROFS}
+_PREFIX = "ros2-memory-unpacked-"
+_UNLOCKED_S = 60
+"""A folder of less age may be of a program that is about to lock it."""
+
+
+@dataclass(slots=True, eq=False)
+class _Copy:
+    """A temporary file and a note on it, in a folder of its own; how many read it at the moment."""
+
+    folder: Path
+    size: int = 0
+    users: int = 0
+    filled: tuple[Path, str] = (Path(), "")
+
+
+class Scratch:
+    """Folders for temporary files, bounded in bytes. Safe to use from several threads.
+
+    The least recently used are deleted first, never one in use. All are deleted with the reader, or
+    when the program ends. A program that is killed leaves its folders: the next deletes those that
+    nobody has locked.
+
+    Args:
+        max_bytes: what all files together may take.
+    """
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._root: Path | None = None
+        self._copies: OrderedDict[Hashable, _Copy] = OrderedDict()
+        self._bytes = 0
+        self._lock = threading.Lock()
+
+    @contextmanager
+    def use(
+        self, key: Hashable, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]
+    ) -> Iterator[tuple[Path, str]]:
+        """Yields the file that is made of the content `key`; it is not deleted inside the block.
+
+        Args:
+            key: the content that it is made of.
+            fill: makes the file if it is not there: takes an empty folder, and a function to call
+                with a number of bytes before it writes as many; returns the file and a note on it.
+
+        Raises:
+            UnreadableError: the file does not fit into `max_bytes`.
+            UnreachableError: the disk of the temporary files is full.
+        """
+        # One file at a time is made: of two that are, either might leave no room for the other.
+        with self._lock:
+            copy = self._copies.get(key)
+            if copy is None or not copy.filled[0].exists():
+                self._delete(key)
+                copy = self._copies[key] = self._made(fill)
+            self._copies.move_to_end(key)
+            copy.users += 1
+        try:
+            yield copy.filled
+        finally:
+            with self._lock:
+                copy.users -= 1
+
+    def _made(self, fill: Callable[[Path, Callable[[int], None]], tuple[Path, str]]) -> _Copy:
+        try:
+            if self._root is None or not self._root.exists():
+                _delete_abandoned()
+                self._root = Path(tempfile.mkdtemp(prefix=_PREFIX))
+                weakref.finalize(self, shutil.rmtree, self._root, ignore_errors=True)
+                with suppress(OSError):  # where nothing can be locked, nobody else deletes it
+                    weakref.finalize(self, os.close, _lock(self._root))
+            copy = _Copy(Path(tempfile.mkdtemp(dir=self._root)))
+        except OSError as error:
+            raise _disk_full(error) from error
+        try:
+            copy.filled = fill(copy.folder, partial(self._reserve, copy))
+        except BaseException as error:
+            self._bytes -= copy.size
+            shutil.rmtree(copy.folder, ignore_errors=True)
+            if isinstance(error, OSError) and error.errno in _DISK_FULL:
+                raise _disk_full(error) from error
+            raise
+        return copy
+
+    def _delete(self, key: Hashable) -> None:
+        copy = self._copies.pop(key, None)
+        if copy is not None:
+            self._bytes -= copy.size
+            shutil.rmtree(copy.folder, ignore_errors=True)
+
+    def _reserve(self, copy: _Copy, size: int) -> None:
+        for key in [key for key, other in self._copies.items() if not other.users]:
+            if self._bytes + size <= self._max_bytes:
+                break
+            self._delete(key)
+        if self._bytes + size > self._max_bytes:
+            raise UnreadableError(
+                f"unpacked it takes more than the {self._max_bytes >> 20} MiB allowed for"
+                " temporary files; raise unpack_max_mb"
+            )
+        self._bytes += size
+        copy.size += size
+
+
+def _delete_abandoned() -> None:
+    """Deletes the folders of programs that were killed: no process has them locked any more."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        with suppress(OSError):  # of another user, or in use
+            if time.time() - folder.stat().st_mtime > _UNLOCKED_S:
+                descriptor = _lock(folder)
+                shutil.rmtree(folder, ignore_errors=True)
+                os.close(descriptor)
+
+
+def _lock(folder: Path) -> int:
+    """Locks a folder while this process lives, and returns its descriptor.
+
+    Raises:
+        OSError: another has it, or it cannot be locked.
+    """
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(descriptor)
+        raise
+    return descriptor
+
+
+def _disk_full(error: OSError) -> UnreachableError:
+    return UnreachableError(
+        "it must be unpacked, and nothing can be written into the folder for temporary files"
+        f" ({error.strerror or error}); free disk space there, or name another folder in TMPDIR"
+    )
