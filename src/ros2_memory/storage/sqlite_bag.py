@@ -51,7 +51,7 @@ from ros2_memory.storage.errors import (
     SizeLimit,
     UnreadableError,
 )
-from ros2_memory.storage.file_io import EMPTY_FILE, FileKey, OpenFile, open_regular
+from ros2_memory.storage.file_io import EMPTY_FILE, OpenFile, open_regular
 from ros2_memory.storage.mcap.chunk import Pairs
 from ros2_memory.storage.mcap.index import Contents
 from ros2_memory.storage.mcap.records import offered_as_latched
@@ -66,7 +66,6 @@ if TYPE_CHECKING:
 
 JOURNALS: Final = ("-wal", "-journal")
 _CACHE_BYTES: Final = 16 << 20
-_PROOF_BYTES: Final = 200
 _ROWS: Final = """
     SELECT CASE WHEN typeof(topic_id) = 'integer' THEN topic_id END, timestamp,
         typeof(timestamp) = 'integer' AND typeof(data) = 'blob'
@@ -113,12 +112,12 @@ _COMPUTED: Final = "SELECT count(*) FROM pragma_table_xinfo(?) WHERE hidden != 0
 _MESSAGE_COLUMNS: Final = {"topic_id", "timestamp", "data"}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class _Topics:
-    """The channels of a file by topic id; `key` identifies the content of the file."""
+    """The channels of a file by topic id; whether its indexes agree with its table, if known."""
 
-    key: FileKey
     channels: Mapping[int, Channel]
+    is_indexed_right: bool | None = None
 
     def named(self, topics: Collection[str]) -> dict[int, Channel]:
         return {
@@ -142,8 +141,6 @@ class SqliteBags:
         self._large = large or LargeReads()
         self._limit = SizeLimit(max_message_mb << 20, self._large.acquire)
         self._known: ByteLru[_Topics] = ByteLru(_CACHE_BYTES)
-        # Whether the indexes of a file agree with its table.
-        self._proven: ByteLru[bool] = ByteLru(_CACHE_BYTES)
 
     def closing(self, path: Path) -> Closing:
         """Returns open if a journal or WAL lies beside the file, or it is empty."""
@@ -212,7 +209,15 @@ class SqliteBags:
             for time, row, number in _ordered_rows(
                 base, wanted, window, newest_first=newest_first, indexed=is_right
             ):
-                yield self._record(base, wanted, time, row, number)
+                stored, *indexed = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
+                if not isinstance(stored, bytes):
+                    raise UnreadableError("damaged: a message without a binary payload")
+                if indexed != [time, number]:
+                    raise UnreadableError("damaged: a message is not the one that an index names")
+                if len(stored) > LARGE_BYTES:
+                    self._large.acquire()
+                payload = uncompressed_payload(wanted[number], stored, self._limit)
+                yield Record(wanted[number], time, time, payload)
 
     def batches(
         self, path: Path, topics: Collection[str], window: TimeWindow, bare: Collection[str]
@@ -223,38 +228,17 @@ class SqliteBags:
             self._large.acquire()
         yield from batched(enumerate(self.records(path, topics, window, newest_first=False)))
 
-    def _record(
-        self,
-        base: sqlite3.Connection,
-        wanted: Mapping[int, Channel],
-        time: Ns,
-        row: int,
-        number: int,
-    ) -> Record:
-        stored, *indexed = base.execute(_PAYLOAD, (row,)).fetchone() or (None,)
-        if not isinstance(stored, bytes):
-            raise UnreadableError("damaged: a message without a binary payload")
-        if indexed != [time, number]:
-            raise UnreadableError("damaged: a message is not the one that an index names")
-        channel = wanted[number]
-        if len(stored) > LARGE_BYTES:
-            self._large.acquire()
-        payload = uncompressed_payload(channel, stored, self._limit)
-        return Record(channel, time, time, payload)
-
     def _is_indexed_right(self, base: sqlite3.Connection, topics: _Topics) -> bool:
         """Returns whether the indexes of a file agree with its table; compares them once."""
-        is_right = self._proven.get(topics.key)
-        if is_right is None:
+        if topics.is_indexed_right is None:
             ordered = partial(_ordered_rows, base, topics.channels, TimeWindow.everything())
             try:
                 both = zip_longest(ordered(indexed=True), ordered(indexed=False))
-                is_right = all(starmap(eq, both))
+                topics.is_indexed_right = all(starmap(eq, both))
             except sqlite3.DatabaseError:
                 # An index may be malformed where the table is not.
-                is_right = False
-            self._proven.put(topics.key, is_right, _PROOF_BYTES)
-        return is_right
+                topics.is_indexed_right = False
+        return topics.is_indexed_right
 
     @contextmanager
     def _opened(self, path: Path) -> Iterator[tuple[sqlite3.Connection, _Topics]]:
@@ -275,7 +259,7 @@ class SqliteBags:
             topics = self._known.get(key)
             if topics is None:
                 require_plain_tables(base)
-                topics = _Topics(key, self._read_channels(base))
+                topics = _Topics(self._read_channels(base))
                 size = 1000 + sum(300 + c.memory_bytes for c in topics.channels.values())
                 self._known.put(key, topics, size)
             yield base, topics
