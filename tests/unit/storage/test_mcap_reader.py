@@ -203,17 +203,6 @@ class TestIndexesThatAreWrong:
         path.write_bytes(data[:-60] + bytes((data[-60] ^ 1,)) + data[-59:])
         assert [each.type for each in McapReader().summarize(path).of("/chatter")] == [STRING]
 
-    def test_an_index_that_names_a_message_twice_is_not_believed(self, tmp_path: Path) -> None:
-        path = write_mcap(tmp_path / "a.mcap", [text(5, f"{n:0100d}") for n in range(4)])
-        (chunk,) = chunks_of(path)
-        (index_at,) = chunk.message_index_offsets.values()
-        data = bytearray(path.read_bytes())
-        data[index_at + 15 : index_at + 31] = data[index_at + 31 : index_at + 47]
-        path.write_bytes(data)
-        found, notes = read_on(McapReader(), path)
-        assert found == [5] * 4
-        assert len(notes) == 1
-
     @pytest.mark.parametrize(
         ("at", "value"),
         [
@@ -261,25 +250,6 @@ class TestIndexesThatAreWrong:
         assert times(read(reader, path)) == times(read(reader, path, "/bumper")) == [*range(12)]
         [note] = reader.summarize(path).notes
         assert note == "its message indexes do not hold what its statistics state"
-
-    def test_a_channel_that_a_chunk_index_calls_by_another_number_is_not_lost(
-        self, tmp_path: Path
-    ) -> None:
-        both = [each for n in range(20) for each in (*chatter(1, start=n), boolean(n, True))]
-        path = write_mcap(tmp_path / "a.mcap", both, SMALL)
-        middle = chunks_of(path)[2].chunk_start_offset
-
-        def renamed(body: bytearray) -> None:
-            if from_bytes(bytes(body[16:24])) == middle:
-                body[36:38] = struct.pack("<H", 999)
-
-        edit_summary(path, Opcode.CHUNK_INDEX, renamed)
-        for newest_first in (False, True):
-            reader = McapReader()
-            found, notes = read_on(reader, path, newest_first=newest_first)
-            assert found == sorted(range(20), reverse=newest_first)
-            assert notes or reader.summarize(path).notes
-            assert times(read(McapReader(), path, "/bumper")) == [*range(20)]
 
     def test_a_chunk_that_neither_indexes_nor_statistics_know_is_not_lost(
         self, tmp_path: Path
