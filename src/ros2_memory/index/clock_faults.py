@@ -14,7 +14,6 @@ clock is before 2017 no date counts as being in the future.
 
 from __future__ import annotations
 
-from bisect import bisect_left, bisect_right
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, takewhile
@@ -23,11 +22,11 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.core.bag_summary import set_back_while_written
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.index.segment import Segment
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
-    from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
     from ros2_memory.index.timeline import Timeline
 
@@ -167,8 +166,12 @@ def check_dates(
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(fault._replace(misleads=False) for fault in faults))
-    earliest, latest = _span(segments, [fault.bag for fault in dating.faults if fault.misleads])
-    return replace(dating, earliest=earliest, latest=latest)
+    dated = dated_segments(segments, dating.misdated)
+    return replace(
+        dating,
+        earliest=dated[0].bags[0].start if dated else None,
+        latest=max((segment.latest for segment in dated), default=None),
+    )
 
 
 def _step_faults(
@@ -198,20 +201,18 @@ def _step_faults(
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def _span(segments: Sequence[Segment], left_out: Sequence[BagFile]) -> tuple[Ns | None, Ns | None]:
-    """Returns the first start and the last end of the bags that are not left out."""
-    starts = sorted(bag.start for bag in left_out)
-    files = {bag.file for bag in left_out}
-    spans: list[tuple[Ns, Ns]] = []
+def dated_segments(segments: Sequence[Segment], misdated: Collection[str]) -> Sequence[Segment]:
+    """Returns segments without the bags at these paths, in order."""
+    if not misdated:
+        return segments
+    dated: list[Segment] = []
     for segment in segments:
-        first, last = segment.bags[0].start, segment.bags[-1].start
-        if bisect_left(starts, first) == bisect_right(starts, last):
-            spans.append((first, segment.latest))
-        else:
-            spans += [(bag.start, bag.end) for bag in segment.bags if bag.file not in files]
-    if not spans:
-        return None, None
-    return min(first for first, _ in spans), max(last for _, last in spans)
+        bags = [bag for bag in segment.bags if bag.file not in misdated]
+        if len(bags) == len(segment.bags):
+            dated.append(segment)  # what it remembers serves the next snapshot
+        elif bags:
+            dated.append(Segment(bags))
+    return dated
 
 
 def _seconds(at: Ns) -> str:

@@ -22,9 +22,8 @@ from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, Ns
-from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates
+from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates, dated_segments
 from ros2_memory.index.holes import Pause, Rhythm, pauses_between
-from ros2_memory.index.segment import Segment, TopicTotals
 from ros2_memory.index.split_order import (
     Neighbours,
     is_recording,
@@ -38,6 +37,8 @@ from ros2_memory.index.unreadable_span import unreadable_bounds, unreadable_span
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from pathlib import Path
+
+    from ros2_memory.index.segment import Segment, TopicTotals
 
 
 _MAX_PLACED: Final = 500
@@ -114,18 +115,7 @@ class Snapshot:
     @cached_property
     def _dated_segments(self) -> Sequence[Segment]:
         """The bags that a correct clock dated, without that of carried messages, in order."""
-        segments = self.timeline.recorded_segments
-        misdated = self.dating.misdated
-        if not misdated:
-            return segments
-        dated_segments: list[Segment] = []
-        for segment in segments:
-            dated = [bag for bag in segment.bags if bag.file not in misdated]
-            if len(dated) == len(segment.bags):
-                dated_segments.append(segment)  # what it remembers serves the next snapshot
-            elif dated:
-                dated_segments.append(Segment(dated))
-        return dated_segments
+        return dated_segments(self.timeline.recorded_segments, self.dating.misdated)
 
     @cached_property
     def _activities(self) -> dict[str, Activity]:
