@@ -334,9 +334,9 @@ _Between: TypeAlias = Annotated[
 ]
 _FrameId: TypeAlias = Annotated[_Name, Field(description="Of the reply.")]
 _Limit: TypeAlias = Annotated[
-    Annotated[int, Field(strict=True, ge=1, le=100)],
+    int,
+    Field(strict=True, ge=1, le=100, description="Rows."),
     BeforeValidator(_as_integer),
-    Field(description="Rows."),
 ]
 _ConditionType: TypeAlias = Annotated[
     Literal["contains", "contains_word", "equals", "above", "below", "near_position"],
@@ -512,9 +512,9 @@ class TopicRangeArguments(Arguments):
     topic: _Topic
     span: TimeRange
     max_samples: Annotated[
-        Annotated[int, Field(strict=True, ge=1, le=10_000)],
+        int,
+        Field(strict=True, ge=1, le=10_000, description="Rows."),
         BeforeValidator(_as_integer),
-        Field(description="Rows."),
     ] = 100
     fields: _Fields = ()
     changes: (
@@ -584,9 +584,9 @@ class TrajectoryArguments(Arguments):
     where: _WhereInFull | None = None
     frame_id: _FrameId | None = None
     max_waypoints: Annotated[
-        Annotated[int, Field(strict=True, ge=0, le=MOST_WAYPOINTS)],
+        int,
+        Field(strict=True, ge=0, le=MOST_WAYPOINTS, description="Corners."),
         BeforeValidator(_as_integer),
-        Field(description="Corners."),
     ] = MAX_WAYPOINTS
     farthest: _Point | None = Field(default=None, alias="farthest_from")
     by: _By | None = None
