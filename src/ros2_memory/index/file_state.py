@@ -120,10 +120,6 @@ class ScanContext:
         """
         return read_withheld(self.root)
 
-    def may_be_recorded(self, path: Path) -> bool:
-        """Returns whether no live heartbeat shows that this file's recording is over."""
-        return self.open_recordings is None or self.names(path)
-
     def names(self, path: Path) -> bool:
         """Returns whether a live heartbeat names this file's recording."""
         recording = path.parent.relative_to(self.root).as_posix()
@@ -270,7 +266,7 @@ def _is_active(notes: FileNotes, context: ScanContext) -> bool:
     return (
         notes.closing is Closing.CLOSED
         and notes.kind == ".db3"
-        and context.may_be_recorded(notes.path)
+        and (context.open_recordings is None or context.names(notes.path))
         and notes.grew_lately(context)
         and not context.is_finished(notes.path)
     )

@@ -60,13 +60,6 @@ def pauses_between(bags: Sequence[BagFile]) -> Iterator[Pause]:
             before = after
 
 
-def pauses_within(bags: Sequence[BagFile]) -> Iterator[Pause]:
-    """Yields the pauses of each bag; other bags may have messages in them."""
-    for bag in bags:
-        for start, end in bag.summary.schema.pauses:
-            yield Pause(start, end, (bag,), ran_on=not is_thinned(bag.file))
-
-
 def _follows(before: BagFile, after: BagFile) -> bool:
     """Returns whether a bag is the next split of the same recording."""
     name, next_name = split_of(before.file), split_of(after.file)

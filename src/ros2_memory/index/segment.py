@@ -19,7 +19,7 @@ from ros2_memory.bag_dir.layout import is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import Pause, pauses_between, pauses_within
+from ros2_memory.index.holes import Pause, pauses_between
 from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ranges_of
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
@@ -361,8 +361,12 @@ class Segment:
 
     @cached_property
     def pauses_within(self) -> tuple[Pause, ...]:
-        """The pauses of each bag."""
-        return tuple(pauses_within(self.bags))
+        """The pauses of each bag; other bags may have messages in them."""
+        return tuple(
+            Pause(start, end, (bag,), ran_on=not is_thinned(bag.file))
+            for bag in self.bags
+            for start, end in bag.summary.schema.pauses
+        )
 
     @cached_property
     def silent(self) -> frozenset[str]:

@@ -253,17 +253,13 @@ class Timeline:
         if that was within a day.
         """
         faulty = []
-        for segment in self._faulty_segments:
+        for segment in self.segments:
             for bag in segment.faulty if segment.bags[0].start < window.stop else ():
                 is_cut = bag.state is BagState.INCOMPLETE
                 is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
                 if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
                     faulty.append(bag)
         return faulty
-
-    @cached_property
-    def _faulty_segments(self) -> list[Segment]:
-        return [segment for segment in self.segments if segment.faulty]
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic (in a window), in order, once for each type.
