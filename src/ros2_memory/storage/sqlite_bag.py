@@ -15,7 +15,7 @@ import shutil
 import sqlite3
 import stat
 from collections import Counter
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import starmap, zip_longest
@@ -333,18 +333,18 @@ def _definitions(base: sqlite3.Connection) -> dict[str, Schema]:
 
 
 def journals_beside(path: Path) -> list[Path]:
-    """Returns the journal and WAL with content that the file itself lacks."""
-    beside = [path.with_name(path.name + suffix) for suffix in JOURNALS]
-    return [journal for journal in beside if _has_content(journal)]
+    """Returns the journal and WAL with content that the file itself lacks.
 
-
-def _has_content(journal: Path) -> bool:
-    """Returns whether a journal is not empty; a link counts, and is refused when it is opened."""
-    try:
-        status = journal.lstat()
-    except OSError:
-        return False
-    return stat.S_ISLNK(status.st_mode) or (stat.S_ISREG(status.st_mode) and status.st_size > 0)
+    A link counts, and is refused when it is opened.
+    """
+    journals: list[Path] = []
+    for suffix in JOURNALS:
+        journal = path.with_name(path.name + suffix)
+        with suppress(OSError):
+            status = journal.lstat()
+            if stat.S_ISLNK(status.st_mode) or (stat.S_ISREG(status.st_mode) and status.st_size):
+                journals.append(journal)
+    return journals
 
 
 def copy_with_journal(path: Path, folder: Path, reserve: Callable[[int], None]) -> tuple[Path, str]:
