@@ -69,7 +69,7 @@ def cat(
     messages = view.stream.messages([name], window, newest_first=tail is not None)
     chosen = islice(messages, limit if tail is None else tail)
     exact = as_csv or as_json
-    rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
+    rows = extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
     if as_csv:
         lines = _csv(rows)
     elif as_json:
@@ -98,7 +98,7 @@ def cat(
     return not count or not view.notes.complete
 
 
-def _extracted(
+def extracted(
     view: View, messages: Iterable[StoredMessage], fields: Sequence[str], exact: bool
 ) -> Iterator[Row]:
     """Yields the values of messages; those that cannot be decoded are counted in a note.
