@@ -18,6 +18,7 @@ from ros2_memory.cli.output import (
     print_line,
     print_reply,
     stdout_console,
+    with_shorter_lists,
 )
 from ros2_memory.config import Settings
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
@@ -34,8 +35,6 @@ from ros2_memory.results import Budget, TopicRow
 _TOLD_TWICE: Final = frozenset(
     {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics", "budget"}
 )
-_MOST_ROWS: Final = 10
-"""Of a list that are printed."""
 _MOST_SILENT: Final = 30
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
 _SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
@@ -154,15 +153,10 @@ def _show(memory: Memory, report: JsonObject) -> None:
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
     if budget.most is not None:  # bags that are only looked at have none
         shown["budget"] = describe_budget(budget)
-    left_out: list[JsonValue] = []
     if snapshot.silent_topics:
         topics = sorted(snapshot.silent_topics)
         shown["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
-    for name, rows in shown.items():
-        if isinstance(rows, list) and len(rows) > _MOST_ROWS:
-            shown[name] = rows[:_MOST_ROWS]
-            left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
-    print_reply(shown | ({"notes": left_out} if left_out else {}))
+    print_reply(with_shorter_lists(shown, shown))
 
 
 def _object(value: JsonValue) -> JsonObject:

@@ -171,7 +171,7 @@ def _qos(stream: Stream) -> dict[str, JsonValue]:
     return {
         "history": "unknown",
         "depth": 0,
-        "reliability": "reliable" if stream.reliable else "best_effort",
+        "reliability": "reliable",
         "durability": "transient_local" if stream.latched else "volatile",
         "deadline": dict(_FOR_EVER),
         "lifespan": dict(_FOR_EVER),

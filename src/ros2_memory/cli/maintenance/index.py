@@ -26,7 +26,7 @@ from ros2_memory.cli.options import (
     load_given,
     open_robot,
 )
-from ros2_memory.cli.output import print_json, progress_bar
+from ros2_memory.cli.output import print_json, spinner
 from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
@@ -99,13 +99,8 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
             "columns can be stored neither beside the bags nor in the cache folder: "
             "set XDG_CACHE_HOME to a writable folder"
         )
-    with progress_bar() as bar:
-        task = bar.add_task("", total=None)
-
-        def show(progress: Progress) -> None:
-            bar.update(task, completed=progress.stored, total=progress.closed)
-
-        return _filled(backfill, show)
+    with spinner("storing columns") as show:
+        return _filled(backfill, lambda progress: show(describe_progress(progress)))
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
