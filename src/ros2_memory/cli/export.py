@@ -8,11 +8,11 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated
 
+from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.options import AsJson, Bags, Times
 from ros2_memory.cli.output import made_whole, print_json, print_line, print_notes, spinner
 from ros2_memory.core.errors import (
     BagError,
-    ConfigError,
     InvalidArgumentsError,
     NoDataError,
     NoDataReason,
@@ -238,13 +238,9 @@ def _write_parquet(
     Raises:
         ConfigError: the optional dependency is missing.
     """
-    try:
-        from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
-    except ImportError as error:
-        raise ConfigError(
-            f"Parquet needs the optional part of this package (no {error.name}): "
-            "pip install '.[parquet]'"
-        ) from error
+    require_extra("export --parquet", "parquet", "pyarrow")
+    from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
+
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
     types = ", ".join(sorted(dataset.undecoded))

@@ -12,7 +12,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
@@ -20,6 +19,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.cat import extracted
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
@@ -33,7 +33,7 @@ from ros2_memory.cli.output import (
     spinner,
 )
 from ros2_memory.config_sources import quoted
-from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Polygon
 from ros2_memory.core.spans import united, without
@@ -370,10 +370,7 @@ def _checked_request(out: Path, bags: Bags, when: Times | str | None, *settings:
         ConfigError: the optional dependency is missing.
         InvalidArgumentsError: the name has a suffix of no picture.
     """
-    if find_spec("matplotlib") is None:
-        raise ConfigError(
-            "pictures need the optional part of this package (no matplotlib): pip install '.[plot]'"
-        )
+    require_extra("plot", "plot", "matplotlib")
     if out.suffix.lower() not in FORMATS:
         kinds = ", ".join(FORMATS)
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")

@@ -261,7 +261,7 @@ def test_a_picture_that_cannot_be_written_leaves_the_one_before(
 def test_without_the_extra_it_names_the_command_that_installs_it(
     bags: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("ros2_memory.cli.plot.find_spec", lambda name: None)
+    monkeypatch.setattr("ros2_memory.bootstrap.find_spec", lambda name: None)
     assert "pip install '.[plot]'" in exits(2, f"plot path {bags} --out {tmp_path}/a.svg").err
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import bootstrap_fleet, cli
+from ros2_memory import bootstrap, bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
@@ -179,7 +179,7 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
 def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        bootstrap_fleet, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
+        bootstrap, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
     )
     assert "pip install '.[lake]'" in ship(2).err
 
