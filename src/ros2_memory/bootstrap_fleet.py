@@ -113,7 +113,7 @@ def engine_of(node: DuckdbNode) -> LakeEngine:
     Raises:
         ConfigError: its extra is missing, or it cannot be built.
     """
-    require_extra("lake=duckdb", "lake", "duckdb")
+    require_extra("lake: duckdb", "lake", "duckdb")
     from ros2_memory.lake.engines.base import LakeEngine
 
     return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
