@@ -61,7 +61,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS: Final = (".svg", ".png", ".pdf")
-_PIXEL_M: Final = 0.005
+_PIXEL_M: Final = 0.001
 """As exactly the path is drawn."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""

@@ -43,7 +43,6 @@ _BATCH: Final = 4096
 _FOLLOWED: Final = 256
 """Bags stored before what follows from them is made."""
 _CACHE_MB: Final = 32
-_BAR_WIDTH: Final = 40
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
 
@@ -169,11 +168,9 @@ def _garbage_collected_rarely() -> Iterator[None]:
 
 def describe_progress(progress: Progress) -> str:
     """Returns how many bags are stored, in one line."""
-    share = progress.stored / progress.closed if progress.closed else 1.0
-    bar = "#" * int(share * _BAR_WIDTH)
     bags = counted(progress.closed, "bag is", "bags are")
     refused = f", {progress.refused} cannot be" if progress.refused else ""
-    return f"[{bar:<{_BAR_WIDTH}}] {progress.stored} of {bags} stored{refused}"
+    return f"{progress.stored} of {bags} stored{refused}"
 
 
 def _end_with_parent(parent: int) -> bool:
