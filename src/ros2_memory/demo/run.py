@@ -284,8 +284,8 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
     timeline = MessageSchedule(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
     name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
     recorder = DemoRecorder(bag_dir / name, timeline, split_duration_s=SPLIT_DURATION_S)
-    recorder.write_until(now)
-    recorder.start()
+    if recorder.failure is not None:
+        raise recorder.failure
     return recorder
 
 
