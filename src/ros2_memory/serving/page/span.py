@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, RobotTrack
+from ros2_memory.analysis.motion.robot_track import RobotTrack
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -348,7 +348,7 @@ def _drawn(path: RobotPath) -> JsonObject:
     track = path.track
     kept = np.arange(len(track.times))
     if len(kept) > MOST_POINTS:
-        kept = path.line.simplified(TOLERANCE_M, MOST_POINTS)
+        kept = path.line.simplified(0.0, MOST_POINTS)
     return {
         "frame": path.frame,
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
