@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.motion.robot_track import RobotTrack
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -62,6 +61,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.columns.fill import Progress
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
