@@ -477,23 +477,15 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
 
 
 def check_ros(robot: Examined) -> Iterator[Finding]:
-    """Checks that `ros2 bag record` runs in the environment that the recorder gives it.
-
-    A recorder that is running may have its setup files by its own arguments.
-    """
+    """Checks that `ros2 bag record` runs in the environment that the recorder gives it."""
     settings, recorder = robot.settings, robot.settings.recorder
     setup_files = () if isinstance(recorder, NullRecorderNode) else recorder.setup_files
     try:
         build_recorder(settings, reader=robot.memory.reader).check()
     except EpisodicError as problem:
         reason, _, do = str(problem).partition("; ")
-        if setup_files or robot.live is None or robot.live.state is RecorderState.STOPPED:
-            yield error(reason, do or "correct recorder.setup_files")
-            return
-        seen = f"{reason} with these settings, but the running recorder has it by its own"
-        yield warning(
-            seen, "give this command the recorder's settings (its environment and arguments)"
-        )
+        given = "correct recorder.setup_files, or give this command the settings of the recorder"
+        yield error(reason, do or given)
         return
     files = ", ".join(map(str, setup_files))
     yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")

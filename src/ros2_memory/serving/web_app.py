@@ -69,8 +69,8 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     recording = is_live is True and state == "recording" and not any(faults.values())
     shown: JsonObject = {"recording": recording}
     if all_of_it:
-        shown |= {"recorder": state, "recorder_alive": is_live, **faults}
-        shown |= {"waiting_for": recorder.get("waiting_for")}
+        shown |= {"recorder": state, "recorder_alive": is_live}
+        shown |= {"waiting_for": recorder.get("waiting_for"), **faults}
         shown |= {"degraded": recorder.get("degraded") or []}
     return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
