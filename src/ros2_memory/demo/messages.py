@@ -38,7 +38,6 @@ CMD_VEL: Final = "/cmd_vel"
 BATTERY: Final = "/battery_state"
 PATH_CLEAR: Final = "/path_clear"
 SCENE_OBJECTS: Final = "/vision/scene/scene_objects"
-SCENE_DESCRIPTION: Final = "/vision/scene/scene_description"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +57,6 @@ STREAMS: Final = (
     Stream(CMD_VEL, "geometry_msgs/msg/Twist", 100 * NS_PER_MS),
     Stream(PATH_CLEAR, "std_msgs/msg/Bool", 500 * NS_PER_MS),
     Stream(SCENE_OBJECTS, "ros2_vision_interfaces/msg/VisionDetectionArray", 500 * NS_PER_MS),
-    Stream(SCENE_DESCRIPTION, "ros2_vision_interfaces/msg/StampedString", NS_PER_S),
     Stream(BATTERY, "sensor_msgs/msg/BatteryState", NS_PER_S),
 )
 
@@ -130,7 +128,6 @@ VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetectionArray": (
         "std_msgs/Header header\nstring skill\nVisionDetection[] detections\n"
     ),
-    "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
 _FOCAL_PX: Final = 320.0
 _CENTRE_PX: Final = np.array([320.0, 240.0])
@@ -151,12 +148,6 @@ def payload(message: Message) -> bytes:
 def definition(type_name: str) -> str:
     """Returns the type's ros2msg text with all nested definitions, as bags contain it."""
     return _typestore().generate_msgdef(type_name, ros_version=2)[0]
-
-
-def description(t: float) -> str:
-    """Returns the robot's description of what it sees: "In the hall I see shoes and umbrella."."""
-    labels = [thing.label for thing in robot.seen(t)]
-    return f"In the {robot.place(t)} I see {listed_in_words(labels)}."
 
 
 def listed_in_words(names: Sequence[str]) -> str:
@@ -280,10 +271,6 @@ _BODIES: Final[Mapping[str, Callable[[Message], Body]]] = {
     CMD_VEL: _twist,
     PATH_CLEAR: lambda message: {"data": robot.path_clear(message.t)},
     SCENE_OBJECTS: _detections,
-    SCENE_DESCRIPTION: lambda message: {
-        **_headed(message, "camera"),
-        "data": description(message.t),
-    },
     BATTERY: _battery,
 }
 """What the robot publishes in a message of each topic."""
