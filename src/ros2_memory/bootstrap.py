@@ -12,8 +12,8 @@ import gc
 import hashlib
 import json
 import os
-from contextlib import contextmanager
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
 
@@ -45,7 +45,7 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -82,6 +82,20 @@ _READ_ALIKE = (
 )
 _MOST_SPLITS = 5000
 """The splits of one recording that `bag_dir.state_files` takes."""
+
+
+def require_extra(what: str, extra: str, *modules: str) -> None:
+    """Checks that the modules of an extra can be imported.
+
+    Raises:
+        ConfigError: one cannot; the sentence says which, and how to install the extra.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            raise ConfigError(
+                f"{what} needs the optional part of this package (no {module}): "
+                f"pip install '.[{extra}]'"
+            )
 
 
 def build_reader(
@@ -757,27 +771,18 @@ def build_telemetry(settings: Settings, memory: Memory) -> Telemetry:
                 "server.metrics: true is not allowed with server.transport=stdio, which has no "
                 "/metrics; choose server.transport=sse or leave it out"
             )
-        with _extra_required("server.metrics"):
-            from ros2_memory.observability.prometheus import MemoryGauges, Metrics
+        require_extra("server.metrics: true", "observability", "prometheus_client")
+        from ros2_memory.observability.prometheus import MemoryGauges, Metrics
+
         metrics = Metrics(MemoryGauges(memory), package_version())
         observers.append(metrics)
         exposition = metrics.exposition
     if settings.server.traces:
-        with _extra_required("server.traces"):
-            from ros2_memory.observability import opentelemetry
+        modules = ("opentelemetry", "opentelemetry.sdk", "opentelemetry.exporter")
+        require_extra("server.traces: true", "observability", *modules)
+        from ros2_memory.observability import opentelemetry
+
         observers.append(
             opentelemetry.traces_from_environment(arguments=settings.logging.arguments)
         )
     return Telemetry(tuple(observers), exposition)
-
-
-@contextmanager
-def _extra_required(key: str) -> Iterator[None]:
-    """Names the extra where the import of an optional dependency fails."""
-    try:
-        yield
-    except ImportError as error:
-        raise ConfigError(
-            f"{key}: true needs the optional part of this package (no {error.name}): "
-            "pip install '.[observability]'"
-        ) from error

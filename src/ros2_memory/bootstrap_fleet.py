@@ -7,7 +7,6 @@ import gc
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -20,6 +19,7 @@ from ros2_memory.bootstrap import (
     instantiated,
     query_settings_of,
     reading_of,
+    require_extra,
     shared_parts,
 )
 from ros2_memory.config import DuckdbNode, NullRecorderNode, Settings, is_robot_name
@@ -46,11 +46,7 @@ def lake_location(settings: Settings) -> LakeLocation:
     Raises:
         ConfigError: no warehouse is given, its secrets cannot be read, or the extra is missing.
     """
-    for name in ("pyarrow", "pyiceberg"):
-        if find_spec(name) is None:
-            raise ConfigError(
-                f"a lake needs the optional part of this package (no {name}): pip install '.[lake]'"
-            )
+    require_extra("a lake", "lake", "pyarrow", "pyiceberg")
     from ros2_memory.lake.warehouse import LakeLocation, location_of
 
     lake = settings.lake
@@ -117,11 +113,7 @@ def engine_of(node: DuckdbNode) -> LakeEngine:
     Raises:
         ConfigError: its extra is missing, or it cannot be built.
     """
-    if find_spec("duckdb") is None:
-        raise ConfigError(
-            "lake: duckdb needs the optional part of this package (no duckdb): "
-            "pip install '.[lake]'"
-        )
+    require_extra("lake: duckdb", "lake", "duckdb")
     from ros2_memory.lake.engines.base import LakeEngine
 
     return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with

@@ -272,7 +272,7 @@ def _fill(world: World, memory: Memory, verdict: Verdict) -> None:
 def _recovered(world: World, verdict: Verdict) -> None:
     begun = time.process_time()
     with suppress(EpisodicError):
-        recover_files(world.bag_dir, _quiet, force=True)
+        recover_files(world.bag_dir, force=True)
     verdict.recover_s = time.process_time() - begun
     if verdict.recover_s > MOST_S:
         verdict.faults.append(f"slow: recovering took {verdict.recover_s:.1f} s")
@@ -290,10 +290,6 @@ def _indexed(world: World) -> None:
         )
     if code:
         raise AssertionError(f"ros2-memory index ended with {code}")
-
-
-def _quiet(_line: str) -> None:
-    pass
 
 
 class _failures_in:  # noqa: N801  reads as the statement that it is

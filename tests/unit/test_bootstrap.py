@@ -17,8 +17,6 @@ from ros2_memory.config import Settings, load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
-from ros2_memory.tools.reply_size import to_json_text
-from tests.support.robot_run import ANSWERED, ask, write_run
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:
@@ -97,37 +95,3 @@ async def test_the_server_is_built_as_configured(
         }
         assert info.version == version("ros2-memory") == package_version()
     assert expected in texts[key]
-
-
-async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
-    chosen = settings(tmp_path)
-    async with Client(build_server(chosen, build_memory(chosen))) as client:
-        for name, given, _ in ANSWERED:
-            reply, is_error = await ask(client, name, given)
-            assert not is_error
-            if name == "list_recorded_topics":
-                assert reply == []
-            elif name not in {"data_time_range", "memory_status"}:
-                assert reply["reason"] == "empty_memory", (name, reply)
-
-
-@pytest.mark.parametrize(("pattern", "count"), [("/vision/*", 1), ("/*", 5), ("/odom", 1)])
-async def test_recorded_topics_are_narrowed_by_a_glob(
-    tmp_path: Path, pattern: str, count: int
-) -> None:
-    write_run(tmp_path)
-    chosen = settings(tmp_path)
-    async with Client(build_server(chosen, build_memory(chosen))) as client:
-        reply, _ = await ask(client, "list_recorded_topics", {"pattern": pattern})
-        assert len(reply) == count
-        none, is_error = await ask(client, "list_recorded_topics", {"pattern": "/visoin/*"})
-    assert (none["reason"], is_error) == ("topic_not_recorded", False)
-
-
-async def test_the_size_of_replies_is_as_configured(tmp_path: Path) -> None:
-    write_run(tmp_path)
-    chosen = settings(tmp_path, "server.max_reply_chars=1000")
-    async with Client(build_server(chosen, build_memory(chosen))) as client:
-        for name, given, _ in ANSWERED:
-            reply, _ = await ask(client, name, given)
-            assert len(to_json_text(reply)) <= 1000

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 
 import pytest
-from hydra.core.global_hydra import GlobalHydra
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -23,26 +22,12 @@ PATH_CHARACTERS = st.sampled_from("'\"\\ $#{}[](),:;=~%!&*") | st.characters(
 
 
 class TestDefaults:
-    def test_leave_no_trace_in_hydra_or_in_the_working_directory(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(tmp_path)
-        load_settings((), {})
-        assert not GlobalHydra.instance().is_initialized()
-        assert list(tmp_path.iterdir()) == []
-
     def test_do_not_read_a_dotenv_file(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         (tmp_path / ".env").write_text("MCP_PORT=1\n")
         monkeypatch.chdir(tmp_path)
         assert load_settings((), {}).server.port == 9203
-
-    def test_the_environment_of_the_process_counts_where_none_is_given(
-        self, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setenv("MCP_PORT", "9300")
-        assert load_settings().server.port == 9300
 
 
 class TestEnvironment:
@@ -73,12 +58,6 @@ class TestEnvironment:
         else:
             settings = load_settings((), {"MEMORY_BAG_DIR": f"/bags/{name}"})
             assert settings.recording.bag_dir == Path(f"/bags/{name}")
-
-    def test_home_is_expanded(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("HOME", "/home/robot")
-        assert load_settings((), {"MEMORY_BAG_DIR": "~/bags"}).recording.bag_dir == Path(
-            "/home/robot/bags"
-        )
 
     def test_the_interface_folder_joins_those_of_the_files(self, tmp_path: Path) -> None:
         one, two = tmp_path / "one", tmp_path / "two"
@@ -206,10 +185,6 @@ class TestLake:
             with pytest.raises(ConfigError, match="secrets_file") as refused:
                 load_settings([each], {})
             assert "abc" not in str(refused.value)
-
-    def test_takes_settings_of_the_store(self) -> None:
-        settings = load_settings(['+lake.properties={s3.endpoint: "http://nas:9000"}'], {})
-        assert settings.lake.properties == {"s3.endpoint": "http://nas:9000"}
 
     def test_needs_the_address_of_a_rest_catalogue(self) -> None:
         with pytest.raises(ConfigError, match="address of the catalogue"):

@@ -10,7 +10,6 @@ import pytest
 
 from ros2_memory.bootstrap import query_settings_of
 from ros2_memory.config import (
-    config_dir,
     load_labels,
     load_message_schemas,
     load_settings,
@@ -30,9 +29,6 @@ def own_config(tmp_path: Path) -> Path:
 
 
 class TestConfigFolder:
-    def test_is_the_checkouts_without_a_variable(self) -> None:
-        assert config_dir({}) == ROOT / "config"
-
     def test_files_in_the_working_directory_win_over_those_that_are_shipped(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
@@ -174,10 +170,6 @@ class TestLabels:
             "mug": ("coffee mug", "Mug"),
             "remote control": ("tv-remote",),
         }
-
-    def test_are_none_as_shipped_and_without_a_file(self) -> None:
-        assert load_labels(load_settings((), {})) == {}
-        assert load_labels(load_settings(["data.labels_file=null"], {})) == {}
 
     def test_reach_the_queries(self, tmp_path: Path) -> None:
         path = tmp_path / "labels.yaml"

@@ -215,20 +215,12 @@ class LazyCommand(TyperCommand):
         **extra: object,
     ) -> "Context":
         """Returns the context of the real command, which runs, completes and shows its help."""
-        command = self._load()
-        # Of a group, the commands have the options.
-        commands = getattr(command, "commands", {self._name: command}).values()
-        is_verbose = parent is not None and parent.params.get("verbose")
-        if is_verbose and all(
-            any(option.name == "verbose" for option in subcommand.params) for subcommand in commands
-        ):
-            args = [*args, "--verbose"]
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if word in _HELP else word for word in args]
         if self._name == "plot" and args and args[0] not in _PICTURES and Path(args[0]).exists():
             picture = args.pop(1) if args[1:] and args[1] in _PICTURES else _PICTURES[0]
             args = [picture, *args]
-        return command.make_context(info_name, args, parent, **extra)
+        return self._load().make_context(info_name, args, parent, **extra)
 
     def _load(self) -> "Command":
         module, _, attribute = COMMANDS[self._name].path.rpartition(".")
@@ -264,11 +256,8 @@ def _options_of_all(
             "--version", callback=_print_version, is_eager=True, help="Show the version and exit."
         ),
     ] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="The same as after the command.")
-    ] = False,
 ) -> None:
-    del version, verbose  # `LazyCommand` passes it on
+    del version  # its callback has printed it
 
 
 def demo(

@@ -25,7 +25,7 @@ from ros2_memory.cli.options import (
     parse_time,
     present_time,
 )
-from ros2_memory.cli.output import print_line, print_reply, spinner
+from ros2_memory.cli.output import print_line, print_reply, spinner, with_shorter_lists
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
 from ros2_memory.core.reply import JsonObject
@@ -43,8 +43,6 @@ _SETTING: Final = re.compile(
     re.DOTALL,
 )
 """A word that sets a setting; no argument of a tool is named so."""
-_MOST_ROWS: Final = 10
-"""Waypoints that text shows."""
 _TIMES_OF_RECAP: Final = ("last_s", "start", "end", "around")
 NEVER: Final = "never: no recorded message meets the condition"
 """Printed for `null`, the reply of tools that look for the last match."""
@@ -127,7 +125,9 @@ def ask(
     elif answer is None:
         print_line(NEVER)
     else:
-        print_reply(_without_waypoints(answer), unix_from_ns(present_time(memory)))
+        if isinstance(answer, dict):
+            answer = with_shorter_lists(answer, ["waypoints"])
+        print_reply(answer, unix_from_ns(present_time(memory)))
     return reply.is_error or (isinstance(answer, dict) and "error" in answer)
 
 
@@ -237,17 +237,6 @@ def _takes_text(schema: JsonObject) -> bool:
     kinds = [form.get("type") for form in forms if isinstance(form, dict)]
     # A list in place of one text is read from its JSON by the argument itself.
     return schema.get("type") == "string" or kinds == ["string", "array"]
-
-
-def _without_waypoints(answer: JsonValue) -> JsonValue:
-    """Returns a reply with the number of its waypoints in their place, if they are many."""
-    waypoints = answer.get("waypoints") if isinstance(answer, dict) else None
-    if isinstance(answer, dict) and isinstance(waypoints, list) and len(waypoints) > _MOST_ROWS:
-        rest = {key: value for key, value in answer.items() if key != "waypoints"}
-        more = f"{len(waypoints) - 2} (--json prints them, `plot path` draws them)"
-        ends = {"first_waypoint": waypoints[0], "last_waypoint": waypoints[-1]}
-        return rest | ends | {"more_waypoints": more}
-    return answer
 
 
 def _arguments(tool: Tool) -> Iterator[tuple[str, JsonObject]]:

@@ -14,7 +14,7 @@ from ros2_memory.cli.options import Bags, Times
 from ros2_memory.cli.output import escape, format_time, format_value, leaves, print_notes
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue
-from ros2_memory.core.text import counted, listed, match_topics
+from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
@@ -59,17 +59,12 @@ def cat(
     topic, bags = bags.with_topic(topic, "cat")
     memory = bags.memory()
     view = View(memory, Call())
-    timeline = view.timeline
-    if any(mark in topic for mark in "*?[") and topic not in timeline.types:
-        matched = match_topics(timeline.topics(), topic)
-        which = f"matching: {listed(matched)}" if matched else "`ros2-memory topics` lists all"
-        raise InvalidArgumentsError(f"cat prints one topic, and {topic} is a pattern; {which}")
     name = resolve_topic(view, topic)
     window = times.window(memory)
     messages = view.stream.messages([name], window, newest_first=tail is not None)
     chosen = islice(messages, limit if tail is None else tail)
     exact = as_csv or as_json
-    rows = _extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
+    rows = extracted(view, chosen if tail is None else reversed([*chosen]), field or (), exact)
     if as_csv:
         lines = _csv(rows)
     elif as_json:
@@ -98,7 +93,7 @@ def cat(
     return not count or not view.notes.complete
 
 
-def _extracted(
+def extracted(
     view: View, messages: Iterable[StoredMessage], fields: Sequence[str], exact: bool
 ) -> Iterator[Row]:
     """Yields the values of messages; those that cannot be decoded are counted in a note.

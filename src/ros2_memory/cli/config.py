@@ -11,7 +11,7 @@ import yaml
 
 from ros2_memory.cli.app import epilog
 from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_given
-from ros2_memory.cli.output import leaves, print_json, print_line
+from ros2_memory.cli.output import leaves, print_json, print_line, print_reply
 from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
 from ros2_memory.core.errors import ConfigError
@@ -78,18 +78,16 @@ def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[st
 
 
 def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Iterable[str]) -> None:
-    """Prints a line for each group's choice and for each key: its name, who set it, its value.
+    """Prints a row for each group's choice and for each key: its name, who set it, its value.
 
     A key of a group that only takes over another key's value names that one as its source.
     """
     print_line(f"# files are those of {source.folder}")
     chosen = {group: source.choice(group) for group in groups}
-    set_values = chosen | {key: (value, source(key)) for key, value in values.items()}
-    rows: list[tuple[str, str, str]] = []
-    for key, (value, who) in set_values.items():
+    rows: list[JsonValue] = []
+    for key, (value, who) in (chosen | {key: (values[key], source(key)) for key in values}).items():
         file, link, named_key = who.partition(", as ")
         set_by = f"as {named_key}" if link else file.replace(f"in {source.folder}/", "")
-        rows.append((key, set_by, value if isinstance(value, str) else json.dumps(value)))
-    key_width, source_width = (max(len(row[column]) for row in rows) for column in (0, 1))
-    for key, who, text in rows:
-        print_line(f"{key:<{key_width}}  {who:<{source_width}}  {text}")
+        text = value if isinstance(value, str) else json.dumps(value)
+        rows.append({"key": key, "set": set_by, "value": text})
+    print_reply(rows)

@@ -3,47 +3,36 @@
 One function for each concern; each yields findings, and changes nothing.
 """
 
-import getpass
 import http.client
 import os
 import shutil
-import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from difflib import get_close_matches
-from importlib.util import find_spec
-from itertools import filterfalse
+from enum import IntEnum
+from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, NamedTuple, TypeVar
 
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import ERASING_FILE
-from ros2_memory.bag_dir.state_files import describe_leaving
+from ros2_memory.bag_dir.layout import ERASING_FILE, MOMENTS_FOLDER, SHIPPED_FILE, is_carried
+from ros2_memory.bag_dir.state_files import describe_leaving, is_shipped, read_receipts
 from ros2_memory.bootstrap import build_recorder
-from ros2_memory.bootstrap_fleet import ROBOTS_SETTING
-from ros2_memory.cli.findings import (
-    Examined,
-    Finding,
-    Level,
-    check_lake,
-    check_shipping,
-    error,
-    ok,
-    warning,
-)
-from ros2_memory.cli.info import assumed_active, describe_budget
+from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
+from ros2_memory.cli.info import describe_budget
 from ros2_memory.cli.options import AsJson, Bags, open_memory, open_robot, reason_of
 from ros2_memory.cli.output import escape, print_json, spinner, stdout_console
+from ros2_memory.columns.store import relative
 from ros2_memory.config import NullRecorderNode, Settings, config_dir, files_in_use, unused_config
-from ros2_memory.core.errors import BagError, ConfigError, EpisodicError
-from ros2_memory.core.model import SetAside
-from ros2_memory.core.text import MAX_NAMED, counted, listed, match_topics
+from ros2_memory.core.errors import BagError, ConfigError, EpisodicError, LakeError
+from ros2_memory.core.model import BagState, SetAside
+from ros2_memory.core.text import counted, listed, match_topics
 from ros2_memory.core.timebase import FUTURE_NS, NS_PER_S, Ns, iso_local, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import is_whole
-from ros2_memory.history.robots import are_of_one_recorder, contradicting_frames, mixed_recordings
+from ros2_memory.history.robots import ADVICE, describe_mixed
 from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 from ros2_memory.index.listed_splits import describe_absent
 from ros2_memory.index.snapshot import Snapshot
@@ -57,7 +46,7 @@ from ros2_memory.insights.status import (
 from ros2_memory.queries import data_time_range
 from ros2_memory.recorder.process.installation import advice_on_rmw, rmw_of, robot_environment
 from ros2_memory.recorder.process.topics import TopicSelection, load_topics
-from ros2_memory.results import Undecodable
+from ros2_memory.results import DataTimeRange
 from ros2_memory.retention.policy import GB, SMALL_BUDGET_GB, small_budget
 from ros2_memory.serving.auth import api_token
 from ros2_memory.serving.health import read_health
@@ -65,19 +54,61 @@ from ros2_memory.storage.base import Closing
 
 T = TypeVar("T")
 
-_RECENT_NS: Final[Ns] = 3600 * NS_PER_S
-"""A topic without a message in the newest data of this length is not being recorded."""
-_COMMANDS_OF_EXTRAS: Final = (
-    ("export --parquet", "pyarrow", "parquet"),
-    ("plot", "matplotlib", "plot"),
-)
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
-_NOT_REPAIRED: Final = "copy them again from their source; what is so there, too, cannot be read"
 _READ: Final = "give this user the right to read it, or run as the user of the services"
-_UNOFFERED: Final = "no publisher has offered it since the recorder started"
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
-_LIST_TAKEN: Final = "a changed list is taken within seconds"
+_LATE_NS: Final[Ns] = 3600 * NS_PER_S
+"""A hub that is reached has confirmed closed bags after this time."""
+
+
+class Examined(NamedTuple):
+    """The robot that a check looks at; `now` is the wall clock's time."""
+
+    settings: Settings
+    memory: Memory
+    snapshot: Snapshot
+    now: Ns
+
+    @property
+    def records(self) -> bool:
+        """Whether bags are recorded there."""
+        return not isinstance(self.settings.recorder, NullRecorderNode)
+
+    @property
+    def live(self) -> Heartbeat | None:
+        """The heartbeat of a recorder that is at work."""
+        heartbeat = read_heartbeat(self.settings.recording.bag_dir).heartbeat
+        return heartbeat if heartbeat and heartbeat.is_live(self.now) else None
+
+
+class Level(IntEnum):
+    """How bad a finding is; its value is the exit code."""
+
+    OK = 0
+    WARNING = 1
+    ERROR = 2
+
+    def __str__(self) -> str:
+        """Returns it in small letters."""
+        return self.name.lower()
+
+
+class Finding(NamedTuple):
+    """What was seen, and what to do about it; nothing where all is in order.
+
+    `about` is empty where it is the concern of the check.
+    """
+
+    level: Level
+    about: str
+    seen: str
+    do: str | None = None
+
+
 _STYLES: Final = {Level.OK: "green", Level.WARNING: "yellow", Level.ERROR: "red"}
+ok: Final = partial(Finding, Level.OK, "")
+warning: Final = partial(Finding, Level.WARNING, "")
+error: Final = partial(Finding, Level.ERROR, "")
 
 
 def doctor(as_json: AsJson = False, *, bags: Bags) -> int:
@@ -146,12 +177,9 @@ def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
     """Yields what is wrong with the bags of a robot of a fleet; else how many there are."""
     snapshot, bag_dir = memory.index.snapshot(), own.recording.bag_dir
     findings: Iterable[Finding]
-    if snapshot.problem:
-        do = "is the disk mounted? The other robots are answered for meanwhile"
-        findings = [warning(f"{bag_dir}: {snapshot.problem}", do)]
-    elif not (snapshot.bags or snapshot.active):
-        do = f"{ROBOTS_SETTING} names another directory for it"
-        findings = [warning(f"{bag_dir}: {nothing_here(snapshot)}", do)]
+    if snapshot.problem or not (snapshot.bags or snapshot.active):
+        do = f"is the disk mounted? {ROBOTS_SETTING} names its directory"
+        findings = [warning(f"{bag_dir}: {snapshot.problem or nothing_here(snapshot)}", do)]
     else:
         findings = _findings_of(_OF_BAGS, Examined(own, memory, snapshot, memory.clock.now()))
     for finding in findings:
@@ -162,28 +190,22 @@ def _of_robot(name: str, own: Settings, memory: Memory) -> Iterator[Finding]:
 def check_bag_dir(robot: Examined) -> Iterator[Finding]:
     """Checks that the bag directory exists, and that this user may use it."""
     bag_dir = robot.settings.recording.bag_dir.absolute()
-    try:
-        user = getpass.getuser()
-    except (KeyError, OSError):  # a container's user without an entry
-        user = f"user {os.getuid()}"
-    if not bag_dir.is_dir():
-        if not robot.records:
-            do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
-            yield error(f"{bag_dir} is not a directory", do)
-            return
+    if not bag_dir.is_dir() and robot.records:
         do = "the recorder makes it when it starts; is its disk mounted?"
         yield warning(f"{bag_dir} is not there", do)
+    elif not bag_dir.is_dir():
+        do = "name the directory of the bags: MEMORY_BAG_DIR, or recording.bag_dir=DIR"
+        yield error(f"{bag_dir} is not a directory", do)
     elif not os.access(bag_dir, os.R_OK | os.X_OK):
-        yield error(f"{user} may not read {bag_dir}", _READ)
-        return
+        yield error(f"this user may not read {bag_dir}", _READ)
     elif robot.records and not os.access(bag_dir, os.W_OK):
         do = (
             "fine if the recorder runs as another user, who may: "
             "sudo -u USER ros2-memory doctor looks as that one"
         )
-        yield warning(f"{bag_dir}, readable but not writable by {user}", do)
+        yield warning(f"{bag_dir}, readable but not writable by this user", do)
     else:
-        yield ok(f"{bag_dir}, readable{' and writable' if robot.records else ''} by {user}")
+        yield ok(f"{bag_dir}, readable{' and writable' if robot.records else ''}")
     if (bag_dir / ERASING_FILE).exists():
         yield warning(
             "an earlier `ros2-memory forget` was interrupted: some data to delete is still there",
@@ -246,50 +268,43 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
     else:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield warning(nothing_here(snapshot), do)
-    aside: dict[tuple[str, str], list[str]] = {}
-    for bag in covered.unread:
-        aside.setdefault(("not read", bag.reason), []).append(bag.path.name)
-    for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
-        for bag in files:
-            names = aside.setdefault((state, _remedy(bag, memory)), [])
-            names.append(f"{bag.path.name} ({bag.reason})")
-    for (state, do), names in aside.items():
-        yield warning(f"{counted(len(names), 'file is', 'files are')} {state}: {listed(names)}", do)
-    yield from _check_content(memory, snapshot, covered.undecodable)
-    yield from _check_recordings(memory, snapshot)
-
-
-def _check_content(
-    memory: Memory, snapshot: Snapshot, undecodable: Iterable[Undecodable]
-) -> Iterator[Finding]:
-    """Checks that bags are whole, as they state, and that their messages can be decoded."""
-    for whole, forms, do in (
-        (
-            False,
-            ("bag is not whole", "bags are not whole"),
-            "answers use the readable part; copy the bags again for the rest",
-        ),
-        (
-            True,
-            ("bag contradicts itself", "bags contradict themselves"),
-            "nothing is missing: what it states of itself is wrong, not its messages",
-        ),
-    ):
-        odd = [bag for bag in bags_with_remarks(snapshot) if is_whole(bag) is whole]
-        names = listed([f"{bag.path.name} ({'; '.join(bag.summary.notes)})" for bag in odd])
-        if odd:
-            yield warning(f"{counted(len(odd), *forms)}: {names}", do)
+    names_by_fault: dict[tuple[str, str, str], list[str]] = {}
+    for kind, wrong, do, name in _faults(memory, snapshot, covered):
+        names_by_fault.setdefault((kind, wrong, do), []).append(name)
+    for (kind, wrong, do), names in names_by_fault.items():
+        yield warning(f"{counted(len(names), kind)} {wrong}: {listed(names)}", do)
     for sentence in describe_absent(memory.absent_splits(snapshot)):
         yield warning(sentence, "copy the missing data from its source")
-    for is_mended, do in (
-        (True, f"name the folder with the .msg files in {_MSG_FOLDERS}"),
-        (False, "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"),
-    ):
-        # The reason names the key where a configured folder would help.
-        topics = [topic for topic in undecodable if (_MSG_FOLDERS in topic.reason) is is_mended]
-        names = listed([f"{topic.topic} ({topic.reason})" for topic in topics])
-        if topics:
-            yield warning(f"{counted(len(topics), 'topic')} cannot be decoded: {names}", do)
+    for sentence in describe_mixed(memory, Call()):
+        do = (
+            "give the bags of each robot or run a folder of their own, and a server each; or look "
+            "at one of them: --recording NAME, data.recording=NAME"
+        )
+        yield warning(sentence.removesuffix(ADVICE), do)
+
+
+def _faults(
+    memory: Memory, snapshot: Snapshot, covered: DataTimeRange
+) -> Iterator[tuple[str, str, str, str]]:
+    """Yields of each fault a noun, what is wrong, what to do, and the name of what has it."""
+    for bag in covered.unread:
+        yield "file", "not read", bag.reason, bag.path.name
+    for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
+        for bag in files:
+            yield "file", state, _remedy(bag, memory), f"{bag.path.name} ({bag.reason})"
+    for odd in bags_with_remarks(snapshot):
+        name = f"{odd.path.name} ({'; '.join(odd.summary.notes)})"
+        do = "nothing is missing: what it states of itself is wrong, not its messages"
+        if is_whole(odd):
+            yield "bag", "in contradiction with what is in it", do, name
+        else:
+            do = "answers use the readable part; copy the bags again for the rest"
+            yield "bag", "not whole", do, name
+    for topic in covered.undecodable:
+        do = "nothing decodes them here: record them as ROS 2 messages (CDR) or as JSON"
+        if _MSG_FOLDERS in topic.reason:  # where a configured folder would help
+            do = f"name the folder with the .msg files in {_MSG_FOLDERS}"
+        yield "topic", "cannot be decoded", do, f"{topic.topic} ({topic.reason})"
 
 
 def _remedy(bag: SetAside, memory: Memory) -> str:
@@ -299,38 +314,7 @@ def _remedy(bag: SetAside, memory: Memory) -> str:
     with suppress(BagError):
         if bag.path.suffix == ".mcap" and memory.reader.closing(bag.path) is Closing.OPEN:
             return f"ros2-memory recover {memory.index.bag_dir}"
-    return _NOT_REPAIRED
-
-
-def _check_recordings(memory: Memory, snapshot: Snapshot) -> Iterator[Finding]:
-    """Checks that the recordings are one history, and that no file counts as active by mistake."""
-    pairs = sorted(mixed_recordings(memory, Call()), key=lambda pair: pair[1] is None)
-    do = (
-        "give the bags of each robot or run a folder of their own, and a server each; or look at "
-        "one of them: --recording NAME, data.recording=NAME"
-    )
-    for pair, topic in pairs[:MAX_NAMED]:
-        first, second = pair.names
-        why = (
-            "after a clock was set back" if are_of_one_recorder(memory, pair) else "from two robots"
-        )
-        differ = f"; each has different messages on {topic}, as {why}" if topic else ""
-        yield warning(
-            f"recordings {first} and {second} overlap from {iso_local(pair.start)} to "
-            f"{iso_local(pair.end)}, and are answered together{differ}",
-            do,
-        )
-    for contradiction in contradicting_frames(memory, Call())[:MAX_NAMED]:
-        yield warning(str(contradiction), do)
-    if len(pairs) > MAX_NAMED:
-        more = counted(len(pairs) - MAX_NAMED, "more pair overlaps", "more pairs overlap")
-        yield warning(more, "`ros2-memory info` lists them all")
-    for path, until in assumed_active(memory, snapshot):
-        yield warning(
-            f"{path.parent.name}/{path.name} has no end and was written lately: until "
-            f"{iso_local(until)} it counts as still being written",
-            "if no program writes it (a copy), wait until then: answers use its readable part",
-        )
+    return "copy them again from their source; what is so there, too, cannot be read"
 
 
 def check_columns(robot: Examined) -> Iterator[Finding]:
@@ -385,8 +369,14 @@ def _reported(beat: Heartbeat) -> Iterator[Finding]:
         )
         yield warning(seen, do)
     silent = sorted({*beat.silent} - {*beat.unheard, *beat.fell_silent})
+    missing = f"in its list, and offered by no publisher: {listed(beat.missing)}"
     failing = listed(beat.failing_rules) if beat.failing_rules else ""
     for finding, reported, do in (
+        (
+            warning,
+            beat.missing and missing,
+            "are their publishers running? compare with `ros2 topic list`",
+        ),
         (
             warning,
             f"subscribed, but no messages from: {listed(silent)}" if silent else "",
@@ -435,24 +425,67 @@ def _reported(beat: Heartbeat) -> Iterator[Finding]:
             yield warning(seen, "see its log")
 
 
-def check_ros(robot: Examined) -> Iterator[Finding]:
-    """Checks that `ros2 bag record` runs in the environment that the recorder gives it.
+def check_shipping(robot: Examined) -> Iterator[Finding]:
+    """Checks, where age waits until bags are shipped, whether they are."""
+    settings, _, snapshot, now = robot
+    if not settings.retention.require_shipped:
+        return
+    bag_dir = settings.recording.bag_dir
+    try:
+        receipts = read_receipts(bag_dir)
+    except OSError as problem:
+        seen = f"{bag_dir / SHIPPED_FILE} cannot be read: {problem.strerror or problem}"
+        yield error(seen, "correct its permissions: until then no bag is shipped")
+        return
+    closed = [
+        (name, bag)
+        for bag in snapshot.bags
+        if bag.state is BagState.CLOSED and not is_carried(bag.path)
+        if not (name := relative(bag.file, str(bag_dir))).startswith(f"{MOMENTS_FOLDER}/")
+    ]
+    waiting = [bag for name, bag in closed if not is_shipped(receipts, name, bag.size)]
+    newest = max((receipt.at for receipt in receipts.values()), default=None)
+    seen = f"{len(waiting)} of {counted(len(closed), 'closed bag')} not shipped"
+    if newest is None:
+        seen += ", and there is no receipt: no bag is deleted for its age"
+    else:
+        seen += f"; the newest receipt is from {iso_local(newest)}"
+    latest = now - _LATE_NS
+    if min((bag.end for bag in waiting), default=now) < latest and (newest or 0) < latest:
+        do = "does ros2-memory ship run, and may it write here? `doctor` there looks after it"
+        yield warning(seen, do)
+    else:
+        yield ok(seen)
 
-    A recorder that is running may have its setup files by its own arguments.
-    """
+
+def check_lake(settings: Settings) -> Iterator[Finding]:
+    """Checks, where bags are shipped, whether that can work; and whether the lake is reached."""
+    if settings.lake.warehouse is None:
+        return
+    try:
+        location = lake_location(settings)
+        committed = location.last_commit()
+    except (ConfigError, LakeError) as problem:
+        do = "correct lake.warehouse, lake.uri or what leads there; nothing is lost meanwhile"
+        yield error(str(problem), do)
+        return
+    if committed is None:
+        do = "ros2-memory ship makes it; was it there before, is its disk mounted?"
+        yield warning(f"{location.warehouse} has no bag yet", do)
+    else:
+        yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
+
+
+def check_ros(robot: Examined) -> Iterator[Finding]:
+    """Checks that `ros2 bag record` runs in the environment that the recorder gives it."""
     settings, recorder = robot.settings, robot.settings.recorder
     setup_files = () if isinstance(recorder, NullRecorderNode) else recorder.setup_files
     try:
         build_recorder(settings, reader=robot.memory.reader).check()
     except EpisodicError as problem:
         reason, _, do = str(problem).partition("; ")
-        if setup_files or robot.live is None or robot.live.state is RecorderState.STOPPED:
-            yield error(reason, do or "correct recorder.setup_files")
-            return
-        seen = f"{reason} with these settings, but the running recorder has it by its own"
-        yield warning(
-            seen, "give this command the recorder's settings (its environment and arguments)"
-        )
+        given = "correct recorder.setup_files, or give this command the settings of the recorder"
+        yield error(reason, do or given)
         return
     files = ", ".join(map(str, setup_files))
     yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")
@@ -462,140 +495,48 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
 
 
 def check_topics(robot: Examined) -> Iterator[Finding]:
-    """Checks that the topics of `topics.yaml` have been recorded lately."""
-    file, live = _list_file(robot.settings), robot.live
+    """Checks that each entry of `topics.yaml` has been recorded, or is received."""
+    file, live, recorded = _list_file(robot.settings), robot.live, robot.snapshot.timeline.topics()
     try:
         selection = load_topics(file)
     except EpisodicError as problem:
         yield error(str(problem), "correct recording.topics_file")
         return
-    if live is not None and (finding := _other_list(file, selection, live)):
-        yield finding
+    if live is not None and live.listed and {*live.listed} != {*selection.listed}:
+        others = {*live.listed} ^ {*selection.listed}
+        yield warning(
+            f"the running recorder has another list than {file}: {listed(sorted(others))}",
+            "a changed list is taken within seconds; if the recorder has another file, give this "
+            "command its settings (its environment and key=value arguments)",
+        )
         return
-    yield from _lives_of_others(robot, selection)
-    heard = {*live.subscribed} - {*live.silent} if live else set[str]()
-    missing = _unheard_entries(robot, selection, heard)
-    unoffered = live.missing if live else ()
-    unknown = live.unknown_types if live else ()
-    entries = counted(len(selection.entries), "entry", "entries")
-    if not robot.snapshot.bags:
-        yield ok(f"{file} lists {entries}; nothing is recorded yet")
-    elif not missing and not unoffered:
-        yield ok(f"{entries} of {file}: all are in the newest hour of data, or latched")
-    # ros2 bag record names one topic of each unknown type.
-    unseen = f"{_UNOFFERED}, or its type is unknown, too" if unknown else _UNOFFERED
-    for entry, similar in missing.items():
-        if of_unknown := [*filter(TopicSelection((entry,)).matches, unknown)]:
-            seen = f"{entry} is in {file}; ros2 bag record does not know the type of"
-            do = "name the workspace that defines it in recorder.setup_files"
-            yield warning(f"{seen} {listed(of_unknown)}", do)
-            continue
-        hint = f"is it {' or '.join(similar)}? " if similar else ""
-        why = f"; {unseen}" if entry in unoffered else ""
-        do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
-        seen = f"{entry} is in {file}, and not in the newest hour of data{why}"
-        yield warning(seen, f"{hint}{do}")
-    for entry in unoffered:
-        if entry not in missing:
-            do = "is its publisher running? compare with `ros2 topic list`"
-            yield warning(f"{entry} is in {file}; {unseen}", do)
-
-
-def _lives_of_others(robot: Examined, selection: TopicSelection) -> Iterator[Finding]:
-    """Yields a finding on each key of `retention.topics` that no topic has."""
-    names = (*selection.entries, *robot.snapshot.timeline.topics())
     for glob in robot.settings.retention.topics:
-        if not (selection.matches(glob) or match_topics(names, glob)):
-            do = "compare with `ros2-memory topics`"
-            yield warning(f"{glob} in retention.topics is no topic that is recorded", do)
+        if not (selection.matches(glob) or match_topics((*selection.entries, *recorded), glob)):
+            seen = f"{glob} in retention.topics is no topic that is recorded"
+            yield warning(seen, "compare with `ros2-memory topics`")
+    received = {*live.subscribed} - {*live.silent} if live else set[str]()
+    missing = [
+        entry
+        for entry in selection.entries
+        if not any(map(TopicSelection((entry,)).matches, (*recorded, *received)))
+    ]
+    if not robot.snapshot.bags or not missing:
+        so_far = "all are recorded" if robot.snapshot.bags else "nothing is recorded yet"
+        yield ok(f"{file} lists {counted(len(selection.entries), 'entry', 'entries')}; {so_far}")
+        return
+    for entry in missing:
+        similar = get_close_matches(entry, recorded, n=2)
+        hint = f"is it {' or '.join(similar)}? " if similar else ""
+        do = "compare with `ros2 topic list`; a topic without a publisher is not recorded"
+        yield warning(f"{entry} is in {file}, and was never recorded", f"{hint}{do}")
 
 
 def _list_file(settings: Settings) -> Path:
     """Returns the list of topics that the recorder has: what `up` wrote, where none was chosen."""
-    listed = settings.recording.topics_file
-    written, shipped = settings.recording.bag_dir / listed.name, config_dir({}) / listed.name
-    with suppress(OSError):
-        if written.is_file() and listed.read_bytes() == shipped.read_bytes():
-            return written
-    return listed
-
-
-def _other_list(file: Path, selection: TopicSelection, live: Heartbeat) -> Finding | None:
-    """Returns the finding on a running recorder whose list is not this one; else None."""
-    here, there = {*selection.listed}, {*live.listed}
-    differences = ("adds", here - there), ("lacks", there - here)
-    if there and here != there:
-        what = [f"{file} {how} {listed(sorted(names))}" for how, names in differences if names]
-        do = f"{_LIST_TAKEN}; if the recorder has another file, give this command its settings"
-        return warning(f"the running recorder has another list: {'; '.join(what)}", do)
-    waited = [name for name in live.missing if name not in selection.entries]
-    others = [name for name in (*live.subscribed, *waited) if not selection.matches(name)]
-    if not others:
-        return None
-    seen = f"the running recorder records or waits for {listed(others)}, not listed in {file}"
-    do = "give this command the recorder's settings (its environment and key=value arguments); "
-    return warning(seen, f"{do}{_LIST_TAKEN}")
-
-
-def _unheard_entries(
-    robot: Examined, selection: TopicSelection, received: Collection[str]
-) -> Mapping[str, list[str]]:
-    """Returns the entries without a recent message, with similar names among recorded topics.
-
-    `received`: of those the recorder has messages, in a split that may not be closed yet.
-    """
-    snapshot, latching = robot.snapshot, robot.memory.limits.latching
-    timeline, latest, heard = snapshot.timeline, snapshot.dating.latest, [*received]
-    for topic in timeline.topics():
-        last = max(totals.last for totals in timeline.totals(topic).values())
-        # Nobody expects a latched topic or a log to have a message in every hour.
-        is_seldom = latching.is_latched(snapshot, topic) or timeline.is_log(topic)
-        if latest is None or is_seldom or last > latest - _RECENT_NS:
-            heard.append(topic)
-    return {
-        entry: get_close_matches(entry, timeline.topics(), n=2)
-        for entry in selection.entries
-        if snapshot.bags and not any(map(TopicSelection((entry,)).matches, heard))
-    }
-
-
-def check_extras(settings: Settings) -> Iterator[Finding]:
-    """Checks whether the optional packages are installed that the configuration asks for."""
-    server = settings.server
-    for is_on, key, modules in (
-        (server.metrics, "server.metrics", ["prometheus_client"]),
-        (
-            server.traces,
-            "server.traces",
-            ["opentelemetry.sdk", "opentelemetry.exporter.otlp.proto.http"],
-        ),
-    ):
-        missing = ", ".join(filterfalse(_is_installed, modules))
-        if is_on and missing:
-            do = "pip install '.[observability]', or set it to false: the server does not start"
-            yield error(f"{key}=true needs {missing}, which cannot be imported", do)
-        elif is_on:
-            yield ok(f"what {key}=true needs is installed")
-    if server.metrics and server.transport == "stdio":
-        yield error(
-            "server.metrics=true with server.transport=stdio, which has no /metrics",
-            "choose server.transport=sse, or set server.metrics to false",
-        )
-    states = [
-        f"{what} is installed"
-        if _is_installed(module)
-        else f"{what} is not installed: pip install '.[{extra}]' adds it"
-        for what, module, extra in _COMMANDS_OF_EXTRAS
-    ]
-    yield ok("; ".join(states))
-
-
-def _is_installed(module: str) -> bool:
-    """Returns whether a module can be found; imports only the packages above it."""
-    try:
-        return find_spec(module) is not None
-    except (ImportError, ValueError):  # a package above it is missing
-        return False
+    chosen = settings.recording.topics_file
+    written = settings.recording.bag_dir / chosen.name
+    is_shipped = chosen.absolute() == (config_dir(os.environ) / chosen.name).absolute()
+    return written if is_shipped and written.is_file() else chosen
 
 
 def check_server(settings: Settings) -> Iterator[Finding]:
@@ -604,14 +545,7 @@ def check_server(settings: Settings) -> Iterator[Finding]:
     address = f"{server.host} port {server.port}"
     if server.transport == "stdio":
         yield ok("server.transport=stdio: each client starts its own server")
-        with suppress(OSError, http.client.HTTPException, ValueError, EpisodicError):
-            _, reply = read_health(server.host, server.port)  # it may be another program
-            yield ok(
-                f"one that was started otherwise answers on {address}: {reply['status']}",
-                "to examine it, give this command its settings, such as deployment=robot",
-            )
         return
-    start = time.monotonic()
     try:
         token = api_token(os.environ)
         status, reply = read_health(
@@ -625,12 +559,11 @@ def check_server(settings: Settings) -> Iterator[Finding]:
         do = "give the server another port: server.port"
         yield error(f"another program answers on {address}: {problem}", do)
         return
-    duration_ms = (time.monotonic() - start) * 1000
     if status == http.HTTPStatus.UNAUTHORIZED:
         seen = f"the server on {address} takes another token than MEMORY_API_TOKEN"
         yield warning(seen, "give doctor the token that the server was started with")
     elif reply.get("status") == "ok":
-        yield ok(f"ok on {address}, in {duration_ms:.0f} ms")
+        yield ok(f"ok on {address}")
     else:
         problems = reply.get("problems")
         why = "; ".join(map(str, problems)) if isinstance(problems, list) else ""
@@ -651,5 +584,5 @@ _OF_RECORDER: Final = {
     "shipping": check_shipping,
     "topics": check_topics,
 }
-_OF_SETTINGS: Final = {"extras": check_extras, "server": check_server}
+_OF_SETTINGS: Final = {"server": check_server}
 """The checks by their concerns, in the order in which they are printed."""

@@ -6,19 +6,13 @@ from dataclasses import replace
 from functools import cache
 from itertools import chain, islice
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
+from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.options import AsJson, Bags, Times
-from ros2_memory.cli.output import (
-    made_whole,
-    print_json,
-    print_line,
-    print_notes,
-    progress_bar,
-)
+from ros2_memory.cli.output import made_whole, print_json, print_line, print_notes, spinner
 from ros2_memory.core.errors import (
     BagError,
-    ConfigError,
     InvalidArgumentsError,
     NoDataError,
     NoDataReason,
@@ -34,8 +28,6 @@ from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
-
-_REPORT_EVERY: Final = 512
 
 
 def export(
@@ -89,16 +81,16 @@ def export(
         view.notes.add(
             f"{copied} copied from before the window, with the original time: {begins}{none}"
         )
-    messages = _with_progress(chain(earlier, first, within), view, window)
-    files, lacking = 1, ""
-    if mcap is not None:
-        undefined: list[str] = []
-        profile = profile_of(view, topics, window, earlier)
-        count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined), profile)
-        lacking, where = describe_undefined(undefined), f"in {mcap}"
-    elif parquet is not None:
-        count, files, lacking = _write_parquet(parquet, messages, memory, robot)
-        where = f"in {counted(files, 'file')} below {parquet}"
+    messages, files, lacking = chain(earlier, first, within), 1, ""
+    with spinner("exporting"):
+        if mcap is not None:
+            undefined: list[str] = []
+            profile = profile_of(view, topics, window, earlier)
+            count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined), profile)
+            lacking, where = describe_undefined(undefined), f"in {mcap}"
+        elif parquet is not None:
+            count, files, lacking = _write_parquet(parquet, messages, memory, robot)
+            where = f"in {counted(files, 'file')} below {parquet}"
     if lacking:
         view.notes.add(lacking)
     notes = view.notes.sentences()
@@ -246,30 +238,11 @@ def _write_parquet(
     Raises:
         ConfigError: the optional dependency is missing.
     """
-    try:
-        from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
-    except ImportError as error:
-        raise ConfigError(
-            f"Parquet needs the optional part of this package (no {error.name}): "
-            "pip install '.[parquet]'"
-        ) from error
+    require_extra("export --parquet", "parquet", "pyarrow")
+    from ros2_memory.cli.parquet import Dataset  # noqa: PLC0415 - an extra that few install
+
     dataset = Dataset(path, memory.reader, memory.extractor, robot)
     dataset.write(messages)
     types = ", ".join(sorted(dataset.undecoded))
     lacking = f"messages of {types} cannot be decoded: their rows have no value, and "
     return dataset.rows, dataset.files, f"{lacking}`undecodable` says why" if types else ""
-
-
-def _with_progress(
-    messages: Iterator[StoredMessage], view: View, window: TimeWindow
-) -> Iterator[StoredMessage]:
-    """Yields the messages, and shows a progress bar along the window."""
-    bags = view.timeline.overlapping(window)
-    first = max(window.start, min((bag.start for bag in bags), default=0))
-    last = min(window.stop, max((bag.end for bag in bags), default=0) + 1)
-    with progress_bar() as bar:
-        task = bar.add_task("exporting", total=max(last - first, 1))
-        for number, stored in enumerate(messages):
-            if number % _REPORT_EVERY == 0:
-                bar.update(task, completed=max(stored.time - first, 0))
-            yield stored

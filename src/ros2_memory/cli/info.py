@@ -1,7 +1,6 @@
 """`ros2-memory topics`, `info` and `recordings`: what is recorded, how much of it, and by whom."""
 
 import json
-import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -19,30 +18,25 @@ from ros2_memory.cli.output import (
     print_line,
     print_reply,
     stdout_console,
+    with_shorter_lists,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.model import BagFile, BagState, JsonValue, TimeWindow
+from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
-from ros2_memory.history.robots import contradicting_frames, mixed_recordings
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.insights.status import budget_of, nothing_here
 from ros2_memory.queries import list_recorded_topics
-from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE
 from ros2_memory.results import Budget, TopicRow
 
 _TOLD_TWICE: Final = frozenset(
     {"earliest_local", "latest_local", "now_local", "newest_age_s", "silent_topics", "budget"}
 )
-_MOST_ROWS: Final = 10
-"""Of a list that are printed."""
 _MOST_SILENT: Final = 30
-_OWN_LISTS: Final = re.compile(r"data_time_range (?:lists them|says why|has the details)")
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
-_OTHERS: Final = "another recorder"
 _SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
 _RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
@@ -140,28 +134,11 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
 
 
 def _report(settings: Settings, memory: Memory) -> JsonObject:
-    """Returns what is recorded in one bag directory: replies of tools, and what may confuse."""
+    """Returns what is recorded in one bag directory: replies of two tools, and how much it is."""
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
     replies = call_tools(build_dispatcher(settings, memory), tools)
-    snapshot = memory.index.snapshot()
-    overlapping: list[JsonValue] = []
-    for pair, topic in mixed_recordings(memory, Call()):
-        names = dict(zip(("recording", "and"), pair.names, strict=True))
-        times = {"from": unix_from_ns(pair.start), "to": unix_from_ns(pair.end)}
-        overlapping.append({**names, **times, "robots_differ_on": topic})
-    return {
-        **{tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)},
-        "held": _amount_recorded(snapshot),
-        "overlapping_recordings": overlapping,
-        "contradicting_frames": [
-            {"frame": frame.frame, "in_recordings": [*frame.names], "parents": [*frame.parents]}
-            for frame in contradicting_frames(memory, Call())
-        ],
-        "counted_as_active": [
-            {"file": f"{path.parent.name}/{path.name}", "until": unix_from_ns(until)}
-            for path, until in assumed_active(memory, snapshot)
-        ],
-    }
+    shown = {tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)}
+    return {**shown, "held": _amount_recorded(memory.index.snapshot())}
 
 
 def _show(memory: Memory, report: JsonObject) -> None:
@@ -171,22 +148,15 @@ def _show(memory: Memory, report: JsonObject) -> None:
     if not any((snapshot.bags, *aside)):
         _print_nothing(memory)
         return
-    status, ranged, recorded, *lists = report.values()
-    report_shown = {**_object(recorded), **_for_people(status), **_for_people(ranged)}
+    status, ranged, recorded = report.values()
+    shown = {**_object(recorded), **_for_people(status), **_for_people(ranged)}
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
     if budget.most is not None:  # bags that are only looked at have none
-        report_shown["budget"] = describe_budget(budget)
-    left_out: list[str] = []
-    silent = report_shown.get("topics_without_messages")
-    if isinstance(silent, list):
-        report_shown["topics_without_messages"] = listed([*map(str, silent)], at_most=_MOST_SILENT)
-    report_shown |= {name: report[name] for name in [*report][-len(lists) :] if report[name]}
-    for name, rows in report_shown.items():
-        if isinstance(rows, list) and len(rows) > _MOST_ROWS:
-            report_shown[name] = rows[:_MOST_ROWS]
-            left_out.append(f"{len(rows) - _MOST_ROWS} more {name}: --json lists them")
-    notes: JsonObject = {"notes": [*left_out]} if left_out else {}
-    print_reply(report_shown | notes)
+        shown["budget"] = describe_budget(budget)
+    if snapshot.silent_topics:
+        topics = sorted(snapshot.silent_topics)
+        shown["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
+    print_reply(with_shorter_lists(shown, shown))
 
 
 def _object(value: JsonValue) -> JsonObject:
@@ -224,36 +194,10 @@ def _for_people(value: JsonValue) -> JsonObject:
     has_recorder = reply.get("recorder", "") is not None
     left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
     return {
-        key: _without_itself(value)
+        key: value
         for key, value in reply.items()
         if key not in left_out and (value not in ([], 0) or key == "earliest")
     }
-
-
-def _without_itself(value: JsonValue) -> JsonValue:
-    """Returns what a key holds, with this command's own lists where a sentence names the tool."""
-    if isinstance(value, str):
-        return _OWN_LISTS.sub("see below", value)
-    if isinstance(value, list):
-        return [_without_itself(inner) if isinstance(inner, str) else inner for inner in value]
-    return value
-
-
-def assumed_active(memory: Memory, snapshot: Snapshot) -> Iterator[tuple[Path, Ns]]:
-    """Yields the files without an end that count as active only because they changed lately.
-
-    Each comes with the time (wall clock) from which it counts as left open by a crash. Yields
-    nothing while a live recorder reports what it writes.
-    """
-    heartbeat = memory.index.heartbeat()
-    if heartbeat is not None and heartbeat.is_live(memory.clock.now()):
-        return
-    patience = ns_from_unix(SPLITS_OF_PATIENCE * memory.limits.split_duration_s)
-    for bag in snapshot.active:
-        try:
-            yield bag.path, bag.path.stat().st_mtime_ns + patience
-        except OSError:
-            continue  # the file was moved or deleted since the scan
 
 
 def describe_budget(budget: Budget) -> str:
@@ -289,42 +233,29 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     """
     memory = bags.memory()
     snapshot, root = memory.index.snapshot(), memory.index.bag_dir
-    rows, empty = [*_rows(snapshot, root)], [*_empty_rows(snapshot, root)]
+    rows, not_read = [*_rows(snapshot, root)], [*_not_read(snapshot, root)]
+    is_empty = not (rows or snapshot.damaged or snapshot.unread)
     if as_json:
-        print_json([*rows, *empty])
-    elif not rows:
+        print_json([*rows, *not_read])
+    elif is_empty:
         _print_nothing(memory)
     else:
-        read = [row for row in rows if "start" in row]
-        left_out = {"end"}  # there is the length
-        if read and all(row["whose"] == _OTHERS for row in read):
-            left_out.add("whose")
-            print_line(f"whose: {_OTHERS} made all of them")
-        lists: JsonObject = {
-            "recordings": [{key: row[key] for key in row if key not in left_out} for row in read],
-            "not_read": [row for row in rows if "start" not in row],
-            "empty": [*empty],
-        }
+        lists: JsonObject = {"recordings": [*rows], "not_read": [*not_read]}
         print_reply({title: rows for title, rows in lists.items() if rows})
-    return not rows
+    return is_empty
 
 
-def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
+def _rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
+    """Yields the recordings, the oldest first."""
     own = OwnRecordings(root)
-    left = {str(aside.path): aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
-    for path, bags in sorted(
-        recordings_of(snapshot).items(), key=lambda recording: recording[1][0].start
-    ):
-        inside = [left.pop(file) for file in [*left] if file.startswith(f"{path}/")]
+    for path, bags in sorted(recordings_of(snapshot).items(), key=lambda pair: pair[1][0].start):
         start, end = min(bag.start for bag in bags), max(bag.end for bag in bags)
         whose = "saved moment" if Path(path).is_relative_to(root / MOMENTS_FOLDER) else None
         with suppress(OSError):  # where the list cannot be read, nobody knows
-            whose = whose or ("this recorder" if own.owns_bag(bags[0].path) else _OTHERS)
-        is_open = any(bag.state is BagState.ACTIVE for bag in bags)
-        row: JsonObject = {
+            whose = whose or ("this recorder" if own.owns_bag(bags[0].path) else "another recorder")
+        yield {
             "recording": name_of(path, bags, str(root)),
             "start": unix_from_ns(start),
-            "end": None if is_open else unix_from_ns(end),
             "length_s": round(unix_from_ns(end - start), 3),
             "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
             "bags": len(bags),
@@ -333,21 +264,11 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
             "storage": storage_of(bags),
             "whose": whose,
         }
-        if inside:
-            row["not_read"] = len(inside)
-        yield row
-    for file, reason in sorted(left.items()):
-        yield {"recording": file.removeprefix(f"{root}/"), "reason": reason}
 
 
-def _empty_rows(snapshot: Snapshot, root: Path) -> Iterator[dict[str, JsonValue]]:
-    """Yields the recordings without any message; a loose bag file is one."""
-    aside = (*snapshot.active, *snapshot.damaged, *snapshot.unread)
-    folders = {bag.path.parent for bag in snapshot.bags} | {file.path.parent for file in aside}
-    recordings = [path if path.parent == root else path.parent for path in snapshot.empty]
-    for path in dict.fromkeys(path for path in recordings if path not in folders):
-        yield {
-            "recording": str(path).removeprefix(f"{root}/"),
-            "messages": 0,
-            "reason": "no message was recorded",
-        }
+def _not_read(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
+    """Yields the files without any message that is read."""
+    reasons = {aside.path: aside.reason for aside in (*snapshot.damaged, *snapshot.unread)}
+    for path in sorted({*reasons, *snapshot.empty}):
+        reason = reasons.get(path, "no message was recorded")
+        yield {"file": str(path).removeprefix(f"{root}/"), "reason": reason}

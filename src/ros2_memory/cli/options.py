@@ -394,9 +394,9 @@ class Bags:
         """Loads the configuration as `load_to_look` does; `more` are further settings."""
         return load_to_look(self.bag_dir, [*(self.words or ()), *more], self.recording)[0]
 
-    def memory(self) -> "Memory":
-        """Opens the memory of these bags as `open_memory` does."""
-        return open_memory(self.settings(), verbose=self.verbose)
+    def memory(self, *more: str) -> "Memory":
+        """Opens the memory of these bags as `open_memory` does; `more` are further settings."""
+        return open_memory(self.settings(*more), verbose=self.verbose)
 
     def with_topic(self, first: str, command: str) -> tuple[str, Self]:
         """Returns the topic of a command, before which a path may stand, and the bags.

@@ -1,4 +1,4 @@
-"""Prints replies for people: tables for lists, lines for the rest; and a bar for what takes long.
+"""Prints replies for people: tables for lists, lines for the rest; and what it does meanwhile.
 
 And makes the files that a command writes. Recorded text comes from elsewhere: control characters in
 it never reach the terminal.
@@ -11,7 +11,7 @@ import math
 import os
 import re
 import sys
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from itertools import chain
 from typing import TYPE_CHECKING, Final
 
@@ -26,12 +26,11 @@ from ros2_memory.core.timebase import NS_PER_US, local_time
 from ros2_memory.messages.levels import with_level_names
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
-    from rich.progress import Progress
-
     from ros2_memory.core.model import JsonValue
+    from ros2_memory.core.reply import JsonObject
 
 _PIPE_WIDTH: Final = 160
 """Columns where no terminal says how many there are, so that lines in a pipe are not cut."""
@@ -46,6 +45,8 @@ _DAYS_FROM_S: Final = 172_800.0
 _NO_AGE_BELOW_S: Final = 0.05
 _MAX_FLATTENED_KEYS: Final = 8
 _MAX_COLUMNS: Final = 9
+_MOST_ROWS: Final = 10
+"""Of a list that is cut."""
 _ENDLESS: Final = 10_000
 """Characters of a terminal that is wide enough for any table."""
 _TIME_OF_DAY_WIDTH: Final = 15
@@ -115,10 +116,15 @@ def stdout_console() -> Console:
     return console
 
 
-def spinner(activity: str) -> AbstractContextManager[object]:
-    """Shows on a terminal, and nowhere else, what the block is doing."""
+@contextmanager
+def spinner(activity: str) -> Iterator[Callable[[str], None]]:
+    """Shows on a terminal, and nowhere else, what the block is doing; yields what changes that."""
     console = Console(stderr=True)
-    return console.status(activity) if console.is_terminal else nullcontext()
+    if not console.is_terminal:
+        yield lambda _: None
+        return
+    with console.status(escape(activity)) as status:
+        yield lambda text: status.update(escape(text))
 
 
 def print_reply(value: JsonValue, now: float | None = None) -> None:
@@ -131,6 +137,21 @@ def print_reply(value: JsonValue, now: float | None = None) -> None:
         _print_rows(console, rows)
     else:
         console.print(Text(format_value(value) if value else "none"))
+
+
+def with_shorter_lists(reply: JsonObject, names: Iterable[str]) -> JsonObject:
+    """Returns a reply whose lists of these names have the first rows alone; notes say so."""
+    long = {
+        name: rows
+        for name in names
+        if isinstance(rows := reply.get(name), list) and len(rows) > _MOST_ROWS
+    }
+    if not long:
+        return reply
+    notes = reply.get("notes")
+    more = [f"{len(long[name]) - _MOST_ROWS} more {name}: --json prints them" for name in long]
+    shorter: JsonObject = {name: rows[:_MOST_ROWS] for name, rows in long.items()}
+    return reply | shorter | {"notes": [*(notes if isinstance(notes, list) else ()), *more]}
 
 
 def _print_object(console: Console, value: Mapping[str, JsonValue], now: float | None) -> None:
@@ -385,23 +406,4 @@ def escape(text: str) -> str:
     return "".join(
         character if character.isprintable() else character.encode("unicode_escape").decode()
         for character in text
-    )
-
-
-def progress_bar() -> Progress:
-    """Returns a progress bar on stderr, shown on a terminal only, and removed when it ends."""
-    # Imported here, since it takes a while, and few commands show one.
-    from rich.progress import BarColumn, Progress, TextColumn  # noqa: PLC0415
-
-    console = Console(stderr=True)
-    return Progress(
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f}%"),
-        TextColumn("{task.description}", markup=False),
-        console=console,
-        transient=True,
-        disable=not console.is_terminal,
-        # Otherwise what the command prints on stdout would go to the console, which is stderr.
-        redirect_stdout=False,
-        redirect_stderr=False,
     )

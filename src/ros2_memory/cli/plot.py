@@ -12,8 +12,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from datetime import datetime
-from importlib.util import find_spec
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, NamedTuple, TypeAlias
 
@@ -21,7 +19,9 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.app import epilog
+from ros2_memory.cli.cat import extracted
 from ros2_memory.cli.options import AsJson, Bags, Times, as_command, day_of
 from ros2_memory.cli.output import (
     format_duration,
@@ -32,7 +32,8 @@ from ros2_memory.cli.output import (
     print_notes,
     spinner,
 )
-from ros2_memory.core.errors import ConfigError, InvalidArgumentsError, NoDataError, NoDataReason
+from ros2_memory.config_sources import quoted
+from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, NoDataReason
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Polygon
 from ros2_memory.core.spans import united, without
@@ -40,21 +41,19 @@ from ros2_memory.core.text import counted, listed, shortened
 from ros2_memory.core.timebase import NS_PER_S, Ns, ns_from_unix, unix_from_ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import recording_gaps
-from ros2_memory.history.driven_path import robot_body
+from ros2_memory.history.driven_path import resolve_path_topic
 from ros2_memory.history.no_data import (
-    GIVE_TOPIC,
+    no_data_between,
     require_bags,
     resolve_topic,
-    topics_that_show,
     topics_with,
 )
 from ros2_memory.history.scan import pick
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
-from ros2_memory.places.local_map import east_north, fixes_in, local_frame
-from ros2_memory.places.robot_tracks import TrackReader
-from ros2_memory.queries import trajectory_summary
+from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.results import Event, Recap
+from ros2_memory.serving.page.drawn_path import Box, line_in_box
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,8 +61,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 FORMATS: Final = (".svg", ".png", ".pdf")
-_MOST_WAYPOINTS: Final = 4000
-"""Of a path; one of no more poses is drawn through each of them."""
+_PIXEL_M: Final = 0.001
+"""As exactly the path is drawn."""
 _MOST_SAMPLES: Final = 20_000
 """Messages of a signal that are drawn, evenly spaced: some for each column of a wide picture."""
 _MOST_SIGNALS: Final = 6
@@ -120,15 +119,13 @@ Out = Annotated[
 
 
 class DrawnPath(NamedTuple):
-    """A path in a frame: where (m) and when, which points the robot jumped to; a line on it."""
+    """A path in a frame: when, and where (m); which points no line leads to."""
 
     frame: str
     times: Floats
     xs: Floats
     ys: Floats
-    jumps: NDArray[np.bool_]
-    line: str
-    notes: Sequence[str]
+    begins: NDArray[np.bool_]
 
 
 class Asked(NamedTuple):
@@ -172,12 +169,16 @@ def plot_path(
     bags: Bags,
 ) -> None:
     """Draw the driven path in 2D, coloured by time, with named places and standstills."""
-    asked = _checked_request(out, bags, times)
+    chosen = {"data.pose_topic": topic, "data.map_frame": frame}
+    given = [f"{key}={quoted(value)}" for key, value in chosen.items() if value is not None]
+    asked = _checked_request(out, bags, times, *given)
     with spinner("looking for the path"):
-        path, happened = path_in(asked, topic, frame), asked.recap()
-    with _picture(out, f"Path, {asked.title}", path.line, (8.5, 7.0)) as figure:
+        path, happened = path_in(asked), asked.recap()
+    if frame not in (None, path.frame):
+        raise InvalidArgumentsError(f"--frame {frame}: no transform leads there from {path.frame}")
+    with _picture(out, f"Path, {asked.title}", _totals(happened), (8.5, 7.0)) as figure:
         _draw_path(figure.add_subplot(), asked, path, happened)
-    _finish(out, path.notes, as_json=as_json)
+    _finish(out, happened.notes, as_json=as_json)
 
 
 @plot.command("signal", epilog=epilog("plot"))
@@ -250,7 +251,7 @@ def plot_recap(
         rows = event_rows(asked, happened)
         path, why = None, ""
         try:
-            path = path_in(asked, None, None)
+            path = path_in(asked)
         except (InvalidArgumentsError, NoDataError) as error:
             why = f"the path is unknown: {error}"
     with _picture(out, f"Recap, {asked.title}", _totals(happened), (12.0, 8.0)) as figure:
@@ -310,11 +311,10 @@ def _draw_path(axes: "Axes", asked: Asked, path: DrawnPath, happened: Recap) -> 
             middle = ((left + right) / 2, (low + high) / 2)
             axes.annotate(place.name, middle, ha="center", va="center", color="#6b7280", fontsize=8)
     points = np.column_stack([path.xs, path.ys])
-    pieces, jumps = np.stack([points[:-1], points[1:]], axis=1), path.jumps[1:]
-    days = path.times[:-1][~jumps] / _DAY_S
-    lines = LineCollection([*pieces[~jumps]], array=days, cmap="viridis", linewidths=2.0)
+    pieces, are_lines = np.stack([points[:-1], points[1:]], axis=1), ~path.begins[1:]
+    days = path.times[:-1][are_lines] / _DAY_S
+    lines = LineCollection([*pieces[are_lines]], array=days, cmap="viridis", linewidths=2.0)
     axes.add_collection(lines)
-    axes.add_collection(LineCollection([*pieces[jumps]], colors=_GREY, linestyles="dotted"))
     axes.scatter(*points[0], s=60, marker="o", color="#16a34a", zorder=3, label="start")
     axes.scatter(*points[-1], s=60, marker="s", color="#dc2626", zorder=3, label="end")
     stops = [(stop.start, stop.end) for stop in happened.events if stop.kind == "stop" and stop.end]
@@ -363,21 +363,18 @@ def _label_times(axis: "Axis", start: float, end: float) -> None:
     axis.set_major_formatter(DateFormatter(form, tz=zone))
 
 
-def _checked_request(out: Path, bags: Bags, when: Times | str | None) -> Asked:
+def _checked_request(out: Path, bags: Bags, when: Times | str | None, *settings: str) -> Asked:
     """Returns what is asked for, in a window or on a day; checks that it can be drawn.
 
     Raises:
         ConfigError: the optional dependency is missing.
         InvalidArgumentsError: the name has a suffix of no picture.
     """
-    if find_spec("matplotlib") is None:
-        raise ConfigError(
-            "pictures need the optional part of this package (no matplotlib): pip install '.[plot]'"
-        )
+    require_extra("plot", "plot", "matplotlib")
     if out.suffix.lower() not in FORMATS:
         kinds = ", ".join(FORMATS)
         raise InvalidArgumentsError(f"--out {out} is not a picture: its name must end in {kinds}")
-    memory = bags.memory()
+    memory = bags.memory(*settings)
     return asked_in(
         memory, when.window(memory) if isinstance(when, Times) else day_of(memory, when)
     )
@@ -411,76 +408,27 @@ def asked_in(memory: Memory, window: TimeWindow) -> Asked:
     return Asked(view, within)
 
 
-def path_in(asked: Asked, topic: str | None, frame: str | None) -> DrawnPath:
+def path_in(asked: Asked) -> DrawnPath:
     """Returns the path; in the map where transforms lead there.
 
     Without a topic of poses and transforms, that of a satellite receiver.
 
     Raises:
-        InvalidArgumentsError: the topic has no poses, or nothing places them in the frame.
         NoDataError: there is none in this time.
     """
-    view = asked.view
-    receivers = [named.partition(" ")[0] for named in topics_with(view, "geodetic")]
-    if topic is None and not (
-        topics_with(view, "position") or topics_that_show(view) or robot_body(view)
-    ):
-        topic = next(iter(receivers), None)
-    if topic in receivers:
-        return _path_by_fixes(asked, topic)
-    frames = [asked.view.limits.map_frame, None] if frame is None else [frame]
-    for wanted in frames:
-        try:
-            summary = trajectory_summary(
-                asked.view.memory,
-                Call(),
-                TimeRange.over(asked.window),
-                topic=topic,
-                frame_id=wanted,
-                max_waypoints=_MOST_WAYPOINTS,
-            )
-            break
-        except NoDataError as error:
-            detail = error.detail.replace(GIVE_TOPIC, "give --topic")
-            detail = detail.replace("; give topic", "; give --topic")
-            raise NoDataError(error.reason, detail, error.notes) from error
-        except InvalidArgumentsError:
-            if wanted == frames[-1]:
-                raise
-    fastest = summary.trajectory.max_speed
-    line = (
-        f"{summary.trajectory.totals.distance_m:.1f} m in {_lasted(summary.start, summary.end)}"
-        f"{'' if fastest is None else f', at most {fastest:.2f} m/s'}; by {summary.topic}"
-    )
-    vertices = summary.trajectory.waypoints
-    times = np.array([vertex.time for vertex in vertices])
-    xs, ys = (np.array([vertex.position[axis] for vertex in vertices]) for axis in (0, 1))
-    jumps = times[[vertex.jump for vertex in vertices]]
-    if summary.trajectory.poses <= _MOST_WAYPOINTS and not summary.skipped:
-        # Waypoints leave out what is within 5 cm of a line: a curve would have corners.
-        limits = replace(asked.view.limits, pose_topic=summary.topic)
-        view = View(replace(asked.view.memory, limits=limits), Call())
-        poses = TrackReader(view, summary.frame_id).poses(asked.window)
-        placed = np.isfinite(poses.x) & np.isfinite(poses.y)
-        times, xs, ys = poses.times[placed], poses.x[placed], poses.y[placed]
-    if not len(times):
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {summary.topic} has a place")
-    jumped = np.isin(times, jumps)
-    return DrawnPath(summary.frame_id, times / NS_PER_S, xs, ys, jumped, line, summary.notes)
-
-
-def _path_by_fixes(asked: Asked, topic: str) -> DrawnPath:
-    """Returns the path of a satellite receiver, in metres east and north of its first fix."""
-    total, fixes = fixes_in(asked.view, topic, asked.window)
-    if not fixes:
-        raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} has a position")
-    first = fixes[0][1]
-    times = np.array([at for at, _ in fixes]) / NS_PER_S
-    xs, ys = np.array([east_north(first, fix) for _, fix in fixes]).T
-    driven, lasted = np.hypot(np.diff(xs), np.diff(ys)).sum(), format_duration(np.ptp(times))
-    line = f"{driven:.1f} m in {lasted}; by {len(fixes)} of {total} fixes of {topic}"
-    jumps = np.zeros(len(fixes), bool)
-    return DrawnPath(local_frame(first), times, xs, ys, jumps, line, asked.view.notes.sentences())
+    memory, receivers = asked.view.memory, topics_with(asked.view, "geodetic")
+    if receivers and robot_places(asked.view, asked.window) is None:
+        receiver, _, _ = receivers[0].partition(" ")
+        memory = replace(memory, limits=replace(memory.limits, pose_topic=receiver))
+    everywhere = Box(-math.inf, -math.inf, math.inf, math.inf, _PIXEL_M)
+    try:
+        path, line, _ = line_in_box(memory, Call(), asked.window, everywhere)
+    except NoDataError as error:
+        raise NoDataError(error.reason, f"{error.detail}, or give --topic") from error
+    if not len(line.times):
+        view = View(memory, Call())
+        raise no_data_between(view, (resolve_path_topic(view, degrees=True),), asked.window)
+    return DrawnPath(path.frame, line.times / NS_PER_S, line.x, line.y, line.begins)
 
 
 def signals_of(
@@ -494,36 +442,31 @@ def signals_of(
         InvalidArgumentsError: there is no such field, or it holds no number.
         NoDataError: there is no message in this time, or none can be decoded.
     """
-    view, extractor = asked.view, asked.view.memory.extractor
-    total, samples = pick(view, topic, asked.window, _MOST_SAMPLES)
-    picked = [*samples]
-    decoded = ((stored, view.bags.decode(stored)) for stored in picked)
-    readable = [(stored, message) for stored, message in decoded if message is not None]
-    if not readable:
-        what = "can be decoded" if picked else "is in this time"
+    view = asked.view
+    total, picked = pick(view, topic, asked.window, _MOST_SAMPLES)
+    rows = [
+        (time, dict(leaves(value))) for time, value in extracted(view, picked, fields, exact=True)
+    ]
+    if not rows:
+        what = "can be decoded" if total else "is in this time"
         raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no message of {topic} {what}")
-    first, message = readable[0]
-    extractor.shown(message, first.type, fields)  # refuses fields that there are not
+    names = fields or [*dict.fromkeys(name for _, row in rows for name in row)]
+    columns = {name: np.array([_number(row.get(name)) for _, row in rows]) for name in names}
+    known = {name: values[~np.isnan(values)] for name, values in columns.items()}
+    lacking = [name for name, values in known.items() if not len(values)]
+    if lacking and (fields or len(lacking) == len(names)):
+        raise InvalidArgumentsError(f"{lacking[0] or topic} of {topic} holds no number")
     notes = [*view.notes.sentences()]
     if not fields:
-        varying = _varying([extractor.exact(message, first.type) for _, message in readable])
-        fields = varying[:_MOST_SIGNALS]
+        numeric = [name for name in names if len(known[name])]
+        varying = [name for name in numeric if np.ptp(known[name])] or numeric
+        names = varying[:_MOST_SIGNALS]
         if left_out := varying[_MOST_SIGNALS:]:
             notes.append(f"not drawn: {listed(left_out)}; name them with --field")
-    if not fields:
-        raise InvalidArgumentsError(f"{topic} ({first.type}) has no numeric field")
-    if total > len(picked):
-        notes.append(f"{len(picked)} of {total} messages are drawn, evenly spaced")
-    times = np.array([stored.time for stored, _ in readable])
-    signals: dict[str, tuple[Floats, Floats]] = {}
-    for name in fields:
-        values = [
-            _number(extractor.exact_at(message, stored.type, name)) for stored, message in readable
-        ]
-        if np.isnan(values).all():
-            raise InvalidArgumentsError(f"{name} of {topic} holds no number")
-        signals[name] = _with_breaks(times, values)
-    return total, signals, notes
+    if total > len(rows):
+        notes.append(f"{len(rows)} of {total} messages are drawn, evenly spaced")
+    times = np.array([time for time, _ in rows])
+    return total, {name: _with_breaks(times, columns[name]) for name in names}, notes
 
 
 def _number(value: JsonValue) -> float:
@@ -531,22 +474,13 @@ def _number(value: JsonValue) -> float:
     return float(value) if isinstance(value, bool | int | float) else math.nan
 
 
-def _varying(values: Sequence[JsonValue]) -> list[str]:
-    """Returns the numeric fields that change; all of the first value where none does."""
-    found: dict[str, set[float]] = {}
-    for name, inner in chain.from_iterable(map(leaves, values)):
-        if not math.isnan(number := _number(inner)):
-            found.setdefault(name, set()).add(number)
-    return [name for name, numbers in found.items() if len(numbers) > 1] or [*found]
-
-
-def _with_breaks(times: NDArray[np.int64], values: Sequence[float]) -> tuple[Floats, Floats]:
+def _with_breaks(times: NDArray[np.int64], values: Floats) -> tuple[Floats, Floats]:
     """Returns points in seconds, and NaN where there was none for much longer than usual."""
     steps = np.diff(times)
     usual = np.sort(steps)[len(steps) // 2] if len(steps) else 0
     broken = np.flatnonzero(steps > max(_PERIODS * usual, NS_PER_S)) + 1
     shown = np.insert(times, broken, times[broken - 1] + 1) / NS_PER_S
-    return shown, np.insert(np.array(values), broken, math.nan)
+    return shown, np.insert(values, broken, math.nan)
 
 
 def event_rows(asked: Asked, happened: Recap) -> list[Row]:

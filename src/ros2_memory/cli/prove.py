@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Final, NamedTuple, TypeAlias, cast
+from typing import Annotated, Final, TypeAlias, cast
 
 import typer
 
@@ -76,7 +76,7 @@ def prove(
     view = View(memory, Call())
     require_bags(view)
     parts = _parts(view)
-    read, tried = reads.spans(), list[_Proof]()
+    read = reads.spans()
     with TemporaryDirectory(dir=output.parent, prefix=".prove-") as folder:
         for nth, spans in enumerate(_more_and_more(view, read, parts)):
             path = Path(folder) / str(nth) / output.name
@@ -85,16 +85,13 @@ def prove(
             count = _write(path, view, spans, parts, undefined)
             settings, _ = load_to_look(None, [str(path), *looking, *others])
             repeated = _answer(settings, open_memory(settings, verbose=bags.verbose), words)
-            tried.append(_Proof(path, count, undefined, *_differing(expected, repeated)))
-            if not tried[-1].differing and (nth or not tried[-1].beside):
+            beside, differing = _differing(expected, repeated)
+            if not differing:
                 break
-        same = [proof for proof in tried if not proof.differing]
-        proof = min(same, key=lambda one: len(one.beside), default=tried[-1])
-        proof.path.replace(output)
-    beside, differing = proof.beside, proof.differing
-    done = {"path": str(output), "messages": proof.messages, "same": not differing}
+        path.replace(output)
+    done = {"path": str(output), "messages": count, "same": not differing}
     written = json.dumps({**done, "differing": differing, "beside": beside})
-    print_line(written if as_json else f"{counted(proof.messages, 'message')} in {output}")
+    print_line(written if as_json else f"{counted(count, 'message')} in {output}")
     if beside:
         print_notes([f"only the bags themselves give the same {listed(beside)}"])
     verdict = f"the same answer: ros2-memory ask {shlex.join([*words, str(output)])}"
@@ -103,28 +100,14 @@ def prove(
         if len(parts) > 1 and output.suffix == ".mcap":
             verdict += f"; -o {output.with_suffix('')} keeps recordings apart"
     print(verdict, file=sys.stderr)
-    lacking = describe_undefined(proof.undefined)
+    lacking = describe_undefined(undefined)
     print_notes([lacking] if lacking else [])
     rests_on = {name for topic in read for name in view.timeline.types_of(topic)}
-    return bool(differing or not rests_on.isdisjoint(proof.undefined))
+    return bool(differing or not rests_on.isdisjoint(undefined))
 
 
 # What a reader has of one message, or of several.
 _Read: TypeAlias = Callable[..., Record | Iterable[Record | Batch] | None]  # type: ignore[explicit-any]
-
-
-class _Proof(NamedTuple):
-    """A file or folder that was written.
-
-    `undefined`: types without a definition. `beside`, `differing`: keys of the reply over it that
-    differ, those on files and others.
-    """
-
-    path: Path
-    messages: int
-    undefined: list[str]
-    beside: list[str]
-    differing: list[str]
 
 
 class _Reads:
@@ -183,16 +166,15 @@ def _more_and_more(
 ) -> Iterator[dict[str, Spans]]:
     """Yields what an answer may rest on: what was read, then more where that is not all.
 
-    That is what lies between on the topics that were read, these as a whole, and everything. The
-    first and the last message of all say when "now" is, those of each part what was recorded.
+    That is the topics that were read as a whole, and everything. The first and the last message of
+    all say when "now" is, those of each part what was recorded.
     """
     times = sorted(at for _, window in parts for at in (window.start, window.stop - 1))
     whole, ends = ([(at, at + 1) for at in moments] for moments in ((times[0], times[-1]), times))
     topics = view.timeline.topics()
     yield {topic: united([*read.get(topic, ()), *whole]) for topic in topics}
-    between = {topic: [(spans[0][0], spans[-1][1])] for topic, spans in read.items()}
     ever = [(MIN_NS, MAX_NS)]
-    for spans_of in (read, between, dict.fromkeys(read, ever), dict.fromkeys(topics, ever)):
+    for spans_of in (read, dict.fromkeys(read, ever), dict.fromkeys(topics, ever)):
         yield {topic: united([*spans_of.get(topic, ()), *ends]) for topic in topics}
 
 

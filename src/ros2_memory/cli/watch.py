@@ -23,7 +23,6 @@ from ros2_memory.cli.output import (
     format_size,
     format_time,
     print_json,
-    print_line,
     stdout_console,
     with_commands,
 )
@@ -91,8 +90,8 @@ class Observation:
     rates: tuple[TopicRate, ...]
     live: bool
 
-    def head(self, gap: str) -> str:
-        """Returns the recorder's state, and behind a gap how old the newest data is."""
+    def head(self) -> str:
+        """Returns the recorder's state, and how old the newest data is."""
         status, latest = self.status, self.status.latest
         times = f", restarted {counted(status.restarts, 'time')}" if status.restarts else ""
         recorder = "none" if status.recorder is None else f"{status.recorder}{times}"
@@ -105,7 +104,7 @@ class Observation:
             newest = f"{format_duration(age_s)} old"
             if age_s < 0:
                 newest = f"dated {format_duration(-age_s)} ahead of the clock"
-        return f"recorder: {recorder}{gap}newest: {newest}"
+        return f"recorder: {recorder}  newest: {newest}"
 
     @property
     def problems(self) -> list[str]:
@@ -113,11 +112,6 @@ class Observation:
         missing = self.status.missing if self.status.live else ()
         unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
         return [escape(with_commands(line)) for line in (*unoffered, *self.status.problems)]
-
-    @property
-    def not_live(self) -> str:
-        """That rates are not assessed."""
-        return f"no new data; rates not checked for {counted(len(self.rates), 'topic')}"
 
 
 def watch(
@@ -130,8 +124,8 @@ def watch(
     """Show live what is being recorded: the recorder, the newest data, rates compared with usual.
 
     Ages count as in the tools' answers (data.now). Rates are checked only while new data arrives.
-    On a terminal, watch updates a table; elsewhere it prints a line for each update, or a JSON
-    object with --json. Stop it with Ctrl-C.
+    On a terminal, watch updates a table; elsewhere it prints one for each update, or a line of JSON
+    with --json. Stop it with Ctrl-C.
     """
     if not every > 0 or (count is not None and count < 1):
         raise InvalidArgumentsError("--every and --count must be more than 0")
@@ -147,7 +141,7 @@ def watch(
             elif live is not None:
                 live.update(_screen(seen), refresh=True)
             else:
-                print_line(_line(seen))
+                console.print(_screen(seen))
             if number == count:
                 break
             time.sleep(every)
@@ -216,30 +210,13 @@ def _as_object(seen: Observation) -> dict[str, JsonValue]:
     }
 
 
-def _line(seen: Observation) -> str:
-    """Returns an observation in one line, for logs; it names the topics that are not as usual."""
-    parts = [seen.not_live] if seen.rates else []
-    if seen.live:
-        unusual = [rate for rate in seen.rates if rate.assessment != AS_USUAL]
-        usual = len(seen.rates) - len(unusual)
-        parts = [
-            f"{counted(usual, 'topic')} at {'its' if usual == 1 else 'their'} usual rate",
-            *(
-                f"{escape(odd.topic)} {odd.assessment} ({odd.rate:.3g} Hz, usually {odd.usual:.3g})"
-                for odd in unusual
-            ),
-        ]
-    head = seen.head("; ")
-    return f"{format_time(unix_from_ns(seen.now))} {'; '.join([head, *parts, *seen.problems])}"
-
-
 def _screen(seen: Observation) -> Group:
     """Returns an observation as a screen: a headline, a table of topics, and problems."""
     budget = seen.status.budget
     most = "" if budget.most is None else f" of {format_size(budget.most)}"
     head = Text.assemble(
         (format_time(unix_from_ns(seen.now)), "bold"),
-        f"  {seen.head('  ')}  used: {format_size(budget.used)}{most}",
+        f"  {seen.head()}  used: {format_size(budget.used)}{most}",
     )
     table = Table("topic", box=SIMPLE_HEAD, pad_edge=False)
     for name in ("Hz", "usually", "last"):
@@ -255,6 +232,6 @@ def _screen(seen: Observation) -> Group:
         )
     problems = [Text(line, style="red") for line in seen.problems]
     if seen.rates and not seen.live:
-        note = f"{seen.not_live}; the rates are those of the last 10 s of data"
+        note = "no new data: the rates are those of the last 10 s of data, and not checked"
         problems.insert(0, Text(note, style="yellow"))
     return Group(head, table, *problems)

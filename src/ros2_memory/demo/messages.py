@@ -35,12 +35,9 @@ ODOM: Final = "/odom"
 TF: Final = "/tf"
 TF_STATIC: Final = "/tf_static"
 CMD_VEL: Final = "/cmd_vel"
-SCAN: Final = "/scan"
 BATTERY: Final = "/battery_state"
 PATH_CLEAR: Final = "/path_clear"
 SCENE_OBJECTS: Final = "/vision/scene/scene_objects"
-SCENE_DESCRIPTION: Final = "/vision/scene/scene_description"
-FOUND: Final = "/vision/find_object/detections_meta"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +48,6 @@ class Stream:
     type: str
     period: Ns
     latched: bool = False
-    reliable: bool = True
 
 
 STREAMS: Final = (
@@ -59,11 +55,8 @@ STREAMS: Final = (
     Stream(ODOM, "nav_msgs/msg/Odometry", 50 * NS_PER_MS),
     Stream(TF, "tf2_msgs/msg/TFMessage", 50 * NS_PER_MS),
     Stream(CMD_VEL, "geometry_msgs/msg/Twist", 100 * NS_PER_MS),
-    Stream(SCAN, "sensor_msgs/msg/LaserScan", 200 * NS_PER_MS, reliable=False),
     Stream(PATH_CLEAR, "std_msgs/msg/Bool", 500 * NS_PER_MS),
     Stream(SCENE_OBJECTS, "ros2_vision_interfaces/msg/VisionDetectionArray", 500 * NS_PER_MS),
-    Stream(FOUND, "ros2_vision_interfaces/msg/VisionDetectionArray", NS_PER_S),
-    Stream(SCENE_DESCRIPTION, "ros2_vision_interfaces/msg/StampedString", NS_PER_S),
     Stream(BATTERY, "sensor_msgs/msg/BatteryState", NS_PER_S),
 )
 
@@ -119,11 +112,6 @@ class MessageSchedule:
             if message.log_time <= at:
                 yield message
 
-    def count(self, stream: Stream, at: Ns) -> int:
-        """Returns how many messages the recorder has received by `at`."""
-        newest = self.newest(stream, at)
-        return 0 if newest is None else newest.k - self._first(stream) + 1
-
     def _first(self, stream: Stream) -> int:
         return 0 if stream.latched else -((self.t0 - self.start) // stream.period)
 
@@ -140,7 +128,6 @@ VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetectionArray": (
         "std_msgs/Header header\nstring skill\nVisionDetection[] detections\n"
     ),
-    "ros2_vision_interfaces/msg/StampedString": "std_msgs/Header header\nstring data\n",
 }
 _FOCAL_PX: Final = 320.0
 _CENTRE_PX: Final = np.array([320.0, 240.0])
@@ -161,12 +148,6 @@ def payload(message: Message) -> bytes:
 def definition(type_name: str) -> str:
     """Returns the type's ros2msg text with all nested definitions, as bags contain it."""
     return _typestore().generate_msgdef(type_name, ros_version=2)[0]
-
-
-def description(t: float) -> str:
-    """Returns the robot's description of what it sees: "In the hall I see shoes and umbrella."."""
-    labels = [thing.label for thing in robot.seen(t)]
-    return f"In the {robot.place(t)} I see {listed_in_words(labels)}."
 
 
 def listed_in_words(names: Sequence[str]) -> str:
@@ -204,7 +185,7 @@ def _field(form: FieldDesc, value: object) -> object:
     return np.zeros(size, inner[1][0]) if value is None else np.array(value, inner[1][0])
 
 
-def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) -> Body:
+def _detections(message: Message) -> Body:
     detections = [
         {
             "label": thing.label,
@@ -212,9 +193,9 @@ def _detections(message: Message, skill: str, things: Sequence[SimulatedThing]) 
             "point": _xyz(*thing.point),
             "bbox": _bounding_box(thing),
         }
-        for thing in things
+        for thing in robot.seen(message.t)
     ]
-    return {**_headed(message, "base_link"), "skill": skill, "detections": detections}
+    return {**_headed(message, "base_link"), "skill": "scene", "detections": detections}
 
 
 def _headed(message: Message, frame_id: str) -> Body:
@@ -272,19 +253,6 @@ def _odometry(message: Message) -> Body:
     }
 
 
-def _scan(message: Message) -> Body:
-    return {
-        **_headed(message, "laser"),
-        "angle_min": robot.SCAN_START,
-        "angle_max": robot.SCAN_START + (robot.SCAN_BEAMS - 1) * robot.SCAN_STEP,
-        "angle_increment": robot.SCAN_STEP,
-        "scan_time": 0.2,
-        "range_min": 0.05,
-        "range_max": 20.0,
-        "ranges": robot.scan(message.t),
-    }
-
-
 def _battery(message: Message) -> Body:
     unknown = ("temperature", "current", "charge", "capacity", "design_capacity")
     return {
@@ -296,24 +264,13 @@ def _battery(message: Message) -> Body:
     }
 
 
-def _found(message: Message) -> Body:
-    wanted = [thing for thing in robot.seen(message.t) if thing.label == "scissors"]
-    return _detections(message, "find_object", wanted)
-
-
 _BODIES: Final[Mapping[str, Callable[[Message], Body]]] = {
     TF_STATIC: _fixed,
     ODOM: _odometry,
     TF: _moving,
     CMD_VEL: _twist,
-    SCAN: _scan,
     PATH_CLEAR: lambda message: {"data": robot.path_clear(message.t)},
-    SCENE_OBJECTS: lambda message: _detections(message, "scene", robot.seen(message.t)),
-    FOUND: _found,
-    SCENE_DESCRIPTION: lambda message: {
-        **_headed(message, "camera"),
-        "data": description(message.t),
-    },
+    SCENE_OBJECTS: _detections,
     BATTERY: _battery,
 }
 """What the robot publishes in a message of each topic."""

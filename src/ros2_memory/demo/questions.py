@@ -29,13 +29,11 @@ from ros2_memory.demo.messages import (
     BATTERY,
     ODOM,
     PATH_CLEAR,
-    SCENE_DESCRIPTION,
     SCENE_OBJECTS,
     STREAMS,
     Message,
     MessageSchedule,
     Stream,
-    description,
     listed_in_words,
 )
 from ros2_memory.demo.robot import Planar, room_at
@@ -255,22 +253,6 @@ def _time_range(reply: JsonValue, call: CallContext) -> str:
     )
 
 
-def _topics(reply: JsonValue, call: CallContext) -> str:
-    """Judges the list of topics: the type, the count and the newest message of each."""
-    counts: dict[str, int] = {}
-    rows = [(str(_at(row, "topic")), row) for row in _items(reply)]
-    topics = sorted(topic for topic, _ in rows)
-    if topics != sorted(_BY_TOPIC):
-        raise WrongAnswerError(f"expected topics {sorted(_BY_TOPIC)}, not {topics}")
-    for topic, row in rows:
-        stream = _BY_TOPIC[topic]
-        newest = _message_of(_number(row, "last_ts"), call.last_where(stream))
-        counts[topic] = call.timeline.count(stream, newest.log_time)
-        _require(row, {"type": stream.type, "count": counts[topic]})
-    total = sum(counts.values())
-    return f"{total:,} messages on {len(counts)} topics, {counts[ODOM]:,} on /odom."
-
-
 def _of_message(
     candidates: Callable[[CallContext], Sequence[Message]],
     expected: Expected,
@@ -405,39 +387,6 @@ def _camera_in_map(seconds_ago: float) -> Judge:
     return judge
 
 
-def _frames(reply: JsonValue, _call: CallContext) -> str:
-    """Judges the frames, and which of them move."""
-    rows = _items(_at(reply, "transforms"))
-    found = {f"{_at(row, 'parent')} > {_at(row, 'child')}": _at(row, "static") for row in rows}
-    moves = {"map > odom": True, "odom > base_link": False}
-    expected = moves | {f"base_link > {child}": True for child in ("camera", "laser")}
-    if found != expected:
-        raise WrongAnswerError(f"expected frames {expected}, not {found}")
-    return "map > odom > base_link > camera and laser; only base_link moves."
-
-
-def _descriptions(seconds: float, at_most: int) -> Judge:
-    """Judges the descriptions of the last seconds, thinned to a few samples."""
-
-    def judge(reply: JsonValue, call: CallContext) -> str:
-        stream = _BY_TOPIC[SCENE_DESCRIPTION]
-        samples, total = _items(_at(reply, "samples")), int(_number(reply, "total"))
-        if not samples or len(samples) != min(total, at_most):
-            raise WrongAnswerError(f"expected {at_most} samples, not {len(samples)} of {total}")
-        times = [_number(sample, "timestamp") for sample in samples]
-        _within("start", times[0], call.begun(seconds, stream))
-        last = _message_of(times[-1], call.last_where(stream))
-        first = last.k - total + 1
-        between = [call.timeline.message(stream, k) for k in range(first, last.k + 1)]
-        _message_of(times[0], between[:1])
-        words = [description(_message_of(moment, between).t) for moment in times]
-        for sample, right in zip(samples, words, strict=True):
-            _require(sample, {"value": {"value": right}})
-        return " ".join(words[-2:])
-
-    return judge
-
-
 def _nothing_on(topic: str) -> Judge:
     """Judges the reply that a topic was never recorded, which is an answer, too."""
 
@@ -480,7 +429,6 @@ _SCISSORS: Final = {"condition_type": "contains", "value": "scissors"}
 
 QUESTIONS: Final = (
     Question("How far back do you remember?", "data_time_range", {}, _time_range),
-    Question("What do you remember?", "list_recorded_topics", {}, _topics),
     Question(
         "Where was I 10 s ago?",
         "get_position_seconds_ago",
@@ -540,18 +488,11 @@ QUESTIONS: Final = (
         {"parent": "map", "child": "camera", "seconds_ago": 10},
         _camera_in_map(10),
     ),
-    Question("Which frames do you know?", "list_frames", {}, _frames),
     Question(
         "How full was the battery half a minute ago?",
         "get_topic_seconds_ago",
         {"topic": BATTERY, "seconds_ago": 30, "tolerance_s": 1.5, "fields": ["percentage"]},
         _ago(BATTERY, 30, lambda t: {"value": {"percentage": robot.battery(t)}}, "{charge}.", 1e-6),
-    ),
-    Question(
-        "What did you say you saw in the last 20 s?",
-        "get_topic_in_last",
-        {"topic": SCENE_DESCRIPTION, "seconds": 20, "max_samples": 4},
-        _descriptions(20, 4),
     ),
     Question(
         "What did the camera's pictures show?",

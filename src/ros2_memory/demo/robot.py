@@ -180,11 +180,7 @@ _POSES: Final = tuple(
 )
 _DRIVEN: Final = tuple(accumulate((abs(leg.length) for leg in LAP), initial=0.0))
 
-SCAN_BEAMS: Final = 360
-SCAN_START: Final = -math.pi
-SCAN_STEP: Final = 2.0 * math.pi / SCAN_BEAMS
-_BEAMS: Final = SCAN_START + np.arange(SCAN_BEAMS, dtype=np.float64) * SCAN_STEP
-_AHEAD: Final = np.arange(-15, 16, dtype=np.float64) * SCAN_STEP
+_AHEAD: Final = np.radians(np.arange(-15.0, 16.0))
 CLEAR_M: Final = 1.0
 SIGHT_M: Final = 3.0
 SIGHT_HALF_ANGLE: Final = math.radians(40.0)
@@ -236,14 +232,10 @@ def seen(t: float) -> tuple[SimulatedThing, ...]:
     return tuple(sorted(things, key=lambda thing: -thing.score))
 
 
-def scan(t: float) -> NDArray[np.float64]:
-    """Returns the range (m) from the laser to a wall for each beam; the first looks backwards."""
-    return _ranges(t, _BEAMS)
-
-
 def path_clear(t: float) -> bool:
     """Returns whether no wall within 15 degrees of straight ahead is nearer than `CLEAR_M`."""
-    return bool(_ranges(t, _AHEAD).min() > CLEAR_M)
+    laser = pose_in_map(t).then(Planar(LASER[0], LASER[1], 0.0))
+    return bool(wall_distances(laser.x, laser.y, laser.yaw + _AHEAD).min() > CLEAR_M)
 
 
 def battery(t: float) -> float:
@@ -252,11 +244,6 @@ def battery(t: float) -> float:
     driving = LAP_S - _CHARGING_S
     spent = phase / driving if phase < driving else (LAP_S - phase) / _CHARGING_S
     return 0.90 - 0.08 * spent
-
-
-def _ranges(t: float, angles: NDArray[np.float64]) -> NDArray[np.float64]:
-    laser = pose_in_map(t).then(Planar(LASER[0], LASER[1], 0.0))
-    return wall_distances(laser.x, laser.y, laser.yaw + angles)
 
 
 def _leg(t: float) -> tuple[int, float]:

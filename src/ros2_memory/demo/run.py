@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import re
 import shlex
-import socket
 import subprocess
 import sys
 import textwrap
@@ -120,25 +118,6 @@ _LOOKED_AT_S: Final = 0.5
 _LOG_LINES_SHOWN: Final = 8
 
 
-def free_port(wanted: int) -> int:
-    """Returns the port to serve on: `wanted`, or any free one if that is 0.
-
-    Raises:
-        ConfigError: the port cannot be had; says why and what to do.
-    """
-    if not 0 <= wanted <= 65535:
-        raise ConfigError(f"port {wanted} does not exist; give --port a number from 0 to 65535")
-    try:
-        with socket.create_server((HOST, wanted)) as probe:
-            port: int = probe.getsockname()[1]
-            return port
-    except OSError as error:
-        in_use = error.errno == errno.EADDRINUSE
-        why = "is in use by another program" if in_use else f"cannot be opened ({error})"
-        another = "choose another with --port, or --port 0 for any"
-        raise ConfigError(f"port {wanted} on {HOST} {why}; {another}") from error
-
-
 def server_environment(
     environment: Mapping[str, str], bag_dir: Path, port: int, cache: str
 ) -> dict[str, str]:
@@ -161,8 +140,10 @@ def server_environment(
 @contextmanager
 def running_server(
     bag_dir: Path, port: int, say: Callable[[str], object], *, verbose: bool = False
-) -> Iterator[Child]:
-    """Yields a server that answers, and ends it after the block; says what it waits for.
+) -> Iterator[tuple[Child, str]]:
+    """Yields a server that answers, with its address, and ends it after the block.
+
+    Says what it waits for.
 
     Its log goes to stderr where `verbose`; its columns into a folder that is removed at the end: no
     one else uses it. The rooms of the flat are written to `places.yaml` in the bag directory. It
@@ -183,29 +164,29 @@ def running_server(
             stderr=None if verbose else subprocess.STDOUT,
         )
         try:
-            _wait_until_up(server, f"http://{HOST}:{port}/", say)
-            yield server
+            yield server, _address_of(server, say)
         finally:
             end_all([server])
 
 
-def _wait_until_up(server: Child, address: str, say: Callable[[str], object]) -> None:
-    """Waits until a server has printed its address."""
+def _address_of(server: Child, say: Callable[[str], object]) -> str:
+    """Waits until a server has printed its address, and returns that."""
     begun, said, lines = time.monotonic(), False, list[str]()
-    while not any(address in line for line in lines):
+    while not (printed := re.search(rf"http://{HOST}:\d+", "\n".join(lines))):
         status, waited_s, failed = server.exit_status(), time.monotonic() - begun, ""
         lines += server.take_lines()
         if status is not None:
             failed = f"the server ended with exit code {status}"
         elif waited_s > _UP_WITHIN_S:
-            failed = f"the server did not answer at {address} within {_UP_WITHIN_S:g} s"
+            failed = f"the server did not answer within {_UP_WITHIN_S:g} s"
         if failed:
             words = [": its last words are", *lines[-_LOG_LINES_SHOWN:]] if lines else []
             raise EpisodicError("\n  ".join([failed, *words]))
         if waited_s > _SAID_AFTER_S and not said:
             said = True
-            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer at {address}")
+            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer")
         time.sleep(0.05)
+    return printed[0]
 
 
 SPLIT_DURATION_S: Final = 5.0
@@ -260,7 +241,6 @@ def run_demo(
         )
     if bag_dir and bag_dir.exists() and (not bag_dir.is_dir() or any(bag_dir.iterdir())):
         raise ConfigError(f"--bag-dir {bag_dir} is not an empty folder; give a new or an empty one")
-    port = free_port(port)
     tell: Callable[[str], object] = str if as_json else say
     with ExitStack() as stack:
         if bag_dir is None:
@@ -269,8 +249,7 @@ def run_demo(
         bag_dir.mkdir(parents=True, exist_ok=True)
         folder = bag_dir.resolve()
         recorder = stack.enter_context(_recorder(folder, duration_s))
-        server = stack.enter_context(running_server(folder, port, tell, verbose=verbose))
-        url = f"http://{HOST}:{port}"
+        server, url = stack.enter_context(running_server(folder, port, tell, verbose=verbose))
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
             "real\nquery server about it, and each answer is held against the robot's closed form."
@@ -305,8 +284,8 @@ def _recorder(bag_dir: Path, duration_s: float) -> DemoRecorder:
     timeline = MessageSchedule(t0=start - _UNDERWAY_S * NS_PER_S, start=start)
     name = time.strftime("flat_%Y_%m_%d-%H_%M_%S")
     recorder = DemoRecorder(bag_dir / name, timeline, split_duration_s=SPLIT_DURATION_S)
-    recorder.write_until(now)
-    recorder.start()
+    if recorder.failure is not None:
+        raise recorder.failure
     return recorder
 
 

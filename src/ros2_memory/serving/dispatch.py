@@ -97,7 +97,6 @@ _QUERY_MARGIN_S: Final = 0.5
 _IDLE_S: Final = 1.0
 """How long nobody must have asked until work in advance begins."""
 _LONGEST_IN_ADVANCE_S: Final = 120.0
-_REPORTED_WAIT_S: Final = 0.5
 _LONG_S: Final = 0.1
 """An answer that took longer used so much memory that what is free of it goes back."""
 _LOGGED_CHARS: Final = 300
@@ -333,28 +332,26 @@ class Dispatcher:
             BusyError: its turn does not come in time, or too many wait.
             QueryTimeoutError: the time of a call is up.
         """
-        wait = _Wait()
+        begun = threading.Event()
         with anyio.move_on_after(self._call_timeout_s):
-            return await queue.run(client, partial(self._asked, answer, call, wait))
-        raise self._timeout(name, wait)
-
-    def _timeout(self, name: str, wait: _Wait) -> EpisodicError:
-        """Returns why there is no answer when the time of a call is up."""
+            return await queue.run(client, partial(self._asked, answer, call, begun))
         if self._stopping.is_set():
-            return BusyError(STOPPING)
-        if wait.ended_s is None:
-            return BusyError(
+            raise BusyError(STOPPING)
+        if not begun.is_set():
+            raise BusyError(
                 f"{name} waited {self._call_timeout_s:g} s behind other calls and was not "
                 "started; ask again, with fewer at once"
             )
-        return QueryTimeoutError(
-            f"{name} needs more than {self._call_timeout_s:g} s{wait.note()}; "
+        raise QueryTimeoutError(
+            f"{name} needs more than {self._call_timeout_s:g} s; "
             "ask about a shorter window or a single topic"
         )
 
-    def _asked(self, answer: Callable[[], Reply], call: Call, wait: _Wait) -> tuple[str, Reply]:
+    def _asked(
+        self, answer: Callable[[], Reply], call: Call, has_begun: threading.Event
+    ) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""
-        wait.end()
+        has_begun.set()
         begun = time.monotonic()
         try:
             # Around all of it: an error keeps what was read alive until it has become a reply.
@@ -362,8 +359,7 @@ class Dispatcher:
                 try:
                     return "ok", answer()
                 except QueryTimeoutError as error:
-                    noted = QueryTimeoutError(f"{error}{wait.note()}", error.searched_back_to)
-                    failure = BusyError(STOPPING) if self._stopping.is_set() else noted
+                    failure = BusyError(STOPPING) if self._stopping.is_set() else error
                     return failure.code, self._replies.error(failure)
                 except EpisodicError as error:
                     reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
@@ -392,25 +388,6 @@ def _named(name: str, tools: Mapping[str, Tool]) -> Tool:
     near = get_close_matches(name[:_LONGEST_NAME], tools, n=3)
     hint = f"do you mean {' or '.join(near)}?" if near else f"the tools are: {', '.join(tools)}"
     raise InvalidArgumentsError(f"unknown tool {abbreviate(name)}; {hint}")
-
-
-class _Wait:
-    """How long a call waited for its turn."""
-
-    def __init__(self) -> None:
-        self._begun_s = time.monotonic()
-        self.ended_s: float | None = None
-
-    def end(self) -> None:
-        """Ends the wait: the call's turn has come."""
-        self.ended_s = time.monotonic()
-
-    def note(self) -> str:
-        """Returns what the error of a timeout says about the wait; nothing if it was short."""
-        waited = 0.0 if self.ended_s is None else self.ended_s - self._begun_s
-        if waited < _REPORTED_WAIT_S:
-            return ""
-        return f" (it waited {waited:.1f} s of its time behind other calls)"
 
 
 def excess_in_arguments(given: Mapping[str, object]) -> str | None:

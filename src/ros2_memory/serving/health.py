@@ -22,7 +22,7 @@ from ros2_memory.core.errors import BusyError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.reply import JsonObject, moment, seconds
-from ros2_memory.core.text import encodable
+from ros2_memory.core.text import encodable, shortened
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import Call, Memory, short_name
 from ros2_memory.history.coverage import recording_gaps
@@ -248,8 +248,7 @@ def _status(version: str, problems: list[str], shown: JsonObject) -> JsonObject:
 
 
 def _short(text: str) -> str:
-    text = encodable(text)
-    return text if len(text) <= _MAX_CHARS else f"{text[: _MAX_CHARS - 3]}..."
+    return shortened(encodable(text), _MAX_CHARS)
 
 
 def read_health(host: str, port: int, token: str = "") -> tuple[int, dict[str, JsonValue]]:

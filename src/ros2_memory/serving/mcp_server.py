@@ -8,10 +8,7 @@ client, and what it asks further goes through the client.
 from __future__ import annotations
 
 import itertools
-import json
-import time
 from contextlib import suppress
-from dataclasses import dataclass
 from importlib import resources
 from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
@@ -27,16 +24,11 @@ from mcp.shared.exceptions import MCPError
 from mcp.types import (
     INVALID_PARAMS,
     CallToolResult,
-    Completion,
-    CompletionArgument,
-    CompletionContext,
     GetPromptResult,
     Prompt,
     PromptMessage,
-    PromptReference,
     Resource,
     ResourceTemplate,
-    ResourceTemplateReference,
     TextContent,
     ToolAnnotations,
 )
@@ -115,7 +107,6 @@ _LISTS: Final[tuple[CacheableMethod, ...]] = (
     "resources/list",
     "resources/templates/list",
 )
-_MAX_COMPLETED: Final = 100
 PROGRESS_EVERY_S: Final = 1.0
 
 _SCHEMA_PREFIX: Final = "episodic://schema/"
@@ -134,13 +125,10 @@ MOMENT: Final = ResourceTemplate(
     mime_type=_JSON,
 )
 _TEMPLATES: Final = {
-    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type", "list_recorded_topics"),
-    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment", "list_moments"),
+    _SCHEMA_PREFIX: (SCHEMA, "describe_type", "type"),
+    _MOMENT_PREFIX: (MOMENT, "show_moment", "moment"),
 }
-"""By prefix: the template, the tool whose reply is the text, and its argument.
-
-And the tool whose rows have, under the same name, the values that it can have.
-"""
+"""By prefix: the template, the tool whose reply is the text, and its argument."""
 
 
 class EpisodicServer(MCPServer[object]):
@@ -169,7 +157,6 @@ class EpisodicServer(MCPServer[object]):
             cache_hints=dict.fromkeys(_LISTS, LISTS_CACHED),
             extensions=[Apps()],
         )
-        self.completion()(self._complete)  # type: ignore[no-untyped-call]  # of the SDK
         self._progress = progress
         self.dispatcher = dispatcher
         self._listed = [_listed(tool) for tool in dispatcher.tools]
@@ -217,12 +204,13 @@ class EpisodicServer(MCPServer[object]):
 
     async def _report_progress(self, report: _Report) -> None:
         """Reports the seconds of a call, and how far the store is filled, until cancelled."""
-        filling = Storing(self._progress)
         for elapsed_s in itertools.count(1):
             await anyio.sleep(PROGRESS_EVERY_S)
-            message = await anyio.to_thread.run_sync(filling.sentence, abandon_on_cancel=True)
+            progress = None
+            if self._progress is not None:
+                progress = await anyio.to_thread.run_sync(self._progress, abandon_on_cancel=True)
             with suppress(anyio.ClosedResourceError, anyio.BrokenResourceError):
-                await report(elapsed_s, None, message)
+                await report(elapsed_s, None, _stored(progress))
 
     async def list_resources(self) -> list[Resource]:
         """Returns the resources that have no parameter."""
@@ -251,7 +239,7 @@ class EpisodicServer(MCPServer[object]):
 
     def _resource_call(self, uri: str) -> tuple[str, dict[str, JsonValue]]:
         """Returns the tool of a resource, and its arguments."""
-        for prefix, (_, tool, argument, _) in self._templates.items():
+        for prefix, (_, tool, argument) in self._templates.items():
             if uri.startswith(prefix) and uri != prefix:
                 return tool, {argument: unquote(uri.removeprefix(prefix))}
         tools = {resource.uri: tool for tool, resource in self._resources.items()}
@@ -260,29 +248,6 @@ class EpisodicServer(MCPServer[object]):
         shown = uri if len(uri) <= _LONGEST_URI else f"{uri[:_LONGEST_URI]}..."
         uris = ", ".join([*tools, *(row[0].uri_template for row in self._templates.values())])
         raise ResourceNotFoundError(f"unknown resource {shown}; the resources are: {uris}")
-
-    async def _complete(
-        self,
-        reference: PromptReference | ResourceTemplateReference,
-        argument: CompletionArgument,
-        _context: CompletionContext | None,
-    ) -> Completion | None:
-        """Returns what a template's parameter can be, as far as it has been typed."""
-        uri = reference.uri if isinstance(reference, ResourceTemplateReference) else ""
-        sources = {
-            template.uri_template: (key, tool)
-            for template, _, key, tool in self._templates.values()
-        }
-        if uri not in sources:
-            return None
-        key, tool = sources[uri]
-        reply = json.loads((await self.dispatcher.answer(tool, {}, for_resource=True)).text)
-        rows = reply.get("moments", ()) if isinstance(reply, dict) else reply
-        typed = argument.value.casefold()
-        values = sorted({str(row[key]) for row in rows if typed in str(row[key]).casefold()})
-        return Completion(
-            values=values[:_MAX_COMPLETED], total=len(values), has_more=len(values) > _MAX_COMPLETED
-        )
 
     async def list_prompts(self) -> list[Prompt]:
         """Returns the one prompt."""
@@ -308,25 +273,12 @@ class EpisodicServer(MCPServer[object]):
         )
 
 
-@dataclass
-class Storing:
-    """How far the store of columns is filled, and at what rate it was during one call."""
-
-    _progress: Callable[[], Progress] | None
-    _monotonic: Callable[[], float] = time.monotonic
-    _first: tuple[float, int] | None = None
-
-    def sentence(self) -> str | None:
-        """Returns e.g. `40 % of the bags stored, about 20 s left`; None where none waits."""
-        now = None if self._progress is None else self._progress()
-        if now is None or not now.waiting:
-            return None
-        at_s = self._monotonic()
-        begun_s, waited = self._first = self._first or (at_s, now.waiting)
-        done = f"{100 * (now.closed - now.waiting) // max(now.closed, 1)} % of the bags stored"
-        if now.waiting >= waited:
-            return done
-        return f"{done}, about {(at_s - begun_s) * now.waiting / (waited - now.waiting):.0f} s left"
+def _stored(progress: Progress | None) -> str | None:
+    """Returns e.g. `40 % of the bags stored`; None where none waits."""
+    if progress is None or not progress.waiting:
+        return None
+    done = progress.closed - progress.waiting
+    return f"{100 * done // max(progress.closed, 1)} % of the bags stored"
 
 
 def _http_request(context: object) -> Request | None:

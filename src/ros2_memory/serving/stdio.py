@@ -6,9 +6,9 @@ and the client would wait for ever.
 
 from __future__ import annotations
 
-import re
+import json
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import anyio
 from mcp.server.stdio import stdio_server
@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from mcp.shared._stream_protocols import ReadStream, WriteStream
-
-_TOKENS: Final = re.compile(r'"(?:[^"\\]|\\.)*+"?|[\[\]{}]')
-_ID: Final = re.compile(r'\s*:\s*(?:(-?\d{1,18})|"([\w.:/+-]{1,100})")\s*[,}]', re.ASCII)
 
 
 @asynccontextmanager
@@ -61,9 +58,9 @@ def refusal_of(error: Exception) -> JSONRPCError | None:
         is_blank = not inputs[0].strip()
         return None if is_blank else _refusal(request_id(inputs[0]), PARSE_ERROR, reason)
     # The errors say of each kind of message what is missing; some have the whole line as input.
-    known = [given["id"] for given in inputs if isinstance(given, dict) and "id" in given]
-    number = known[0] if known and isinstance(known[0], int | str) else None
-    return _refusal(number, INVALID_REQUEST, reason)
+    known = (given["id"] for given in inputs if isinstance(given, dict) and "id" in given)
+    number = next(known, None)
+    return _refusal(number if isinstance(number, int | str) else None, INVALID_REQUEST, reason)
 
 
 def _refusal(number: int | str | None, code: int, reason: str) -> JSONRPCError:
@@ -72,11 +69,10 @@ def _refusal(number: int | str | None, code: int, reason: str) -> JSONRPCError:
 
 
 def request_id(text: str) -> int | str | None:
-    """Returns the id in a JSON-RPC request that no parser takes; None where none is found."""
-    depth = 0
-    for token in _TOKENS.finditer(text):
-        found = _ID.match(text, token.end()) if depth == 1 and token[0] == '"id"' else None
-        if found:
-            return found[2] if found[1] is None else int(found[1])
-        depth += (token[0] in "[{") - (token[0] in "]}")
-    return None
+    """Returns the id in a JSON-RPC request that the SDK does not take; None where none is found."""
+    try:
+        message: object = json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+    number = message.get("id") if isinstance(message, dict) else None
+    return number if isinstance(number, int | str) else None

@@ -62,24 +62,16 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     `recording.exclude_when` cannot be evaluated: nothing is served then of what is recorded, or it
     is served against the rule. Other topics that are offered and not recorded are in `degraded`.
     """
-    shown_recorder = report.get("recorder")
-    recorder = shown_recorder if isinstance(shown_recorder, dict) else {}
-    failing = recorder.get("failing_rules")
-    required = recorder.get("required_missing")
-    recording = (
-        recorder.get("live") is True
-        and recorder.get("state") == "recording"
-        and not failing
-        and not required
-    )
+    told = report.get("recorder")
+    recorder = told if isinstance(told, dict) else {}
+    faults = {key: recorder.get(key) or [] for key in ("failing_rules", "required_missing")}
+    is_live, state = recorder.get("live", False), recorder.get("state")
+    recording = is_live is True and state == "recording" and not any(faults.values())
     shown: JsonObject = {"recording": recording}
     if all_of_it:
-        shown["recorder"] = recorder.get("state")
-        shown["recorder_alive"] = recorder.get("live", False)
-        shown["waiting_for"] = recorder.get("waiting_for")
-        shown["failing_rules"] = failing or []
-        shown["required_missing"] = required or []
-        shown["degraded"] = recorder.get("degraded") or []
+        shown |= {"recorder": state, "recorder_alive": is_live}
+        shown |= {"waiting_for": recorder.get("waiting_for"), **faults}
+        shown |= {"degraded": recorder.get("degraded") or []}
     return JSONResponse(shown, _OK if recording else _UNAVAILABLE)
 
 

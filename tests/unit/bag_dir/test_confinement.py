@@ -279,8 +279,7 @@ class TestDeletions:
         cut.write_bytes(cut.read_bytes()[:-100])
         (outside / "rec_9.mcap").touch()
         before = contents(outside)
-        lines: list[str] = []
-        recover_files(bags, lines.append, force=True)
+        recover_files(bags, force=True)
         assert contents(outside) == before
 
     def test_recover_through_a_linked_directory_is_refused_and_names_the_path_itself(
@@ -293,7 +292,7 @@ class TestDeletions:
         before = contents(outside)
         for path in (bags / "linked", bags / "linked/rec_0.mcap", bags / "linked/rec_9.mcap"):
             with pytest.raises(RecorderError, match="symbolic link") as refused:
-                recover_files(path, lambda _: None, force=True)
+                recover_files(path, force=True)
             assert str(path.resolve()) in str(refused.value)
             if path.suffix:
                 with pytest.raises(BagError, match="behind a symbolic link"):

@@ -147,7 +147,10 @@ class TestConfig:
         monkeypatch.setenv("ROS_VISION_INTERFACES_PATH", str(bag_dir))
         head, *rows = exits(0, "config show --sources server.port=9300").out.splitlines()
         assert head.startswith("# files are those of ")
-        told = {key: rest.lstrip() for key, _, rest in (each.partition(" ") for each in rows)}
+        told = {
+            key: f"{rest} "
+            for key, _, rest in (" ".join(row.split()).partition(" ") for row in rows)
+        }
         for key, who in (
             ("deployment", "by MEMORY_DEPLOYMENT "),
             ("storage", "deployment/robot.yaml "),

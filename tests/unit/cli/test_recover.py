@@ -36,9 +36,8 @@ def left_open(path: Path) -> Path:
 def recovered(
     path: Path, *, seconds_later: int = 60, force: bool = False
 ) -> tuple[RecoveryOutcome, list[str]]:
-    printed: list[str] = []
-    outcome = recover_files(path, printed.append, force=force, clock=later(seconds_later))
-    return outcome, printed
+    outcome = recover_files(path, force=force, clock=later(seconds_later))
+    return outcome, outcome.lines
 
 
 def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> None:
@@ -55,7 +54,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     metadata = f"{tmp_path}/a/metadata.yaml: written to match the files"
-    assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, str(outcome)]
+    assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, outcome.summary(dry_run=False)]
 
 
 class TestMetadata:
@@ -168,30 +167,27 @@ def test_bags_of_other_kinds_are_counted_and_left_alone(tmp_path: Path) -> None:
     assert printed[0].startswith("1 bag file of another kind was left alone")
 
 
-def test_a_terminal_sees_how_far_it_is_and_then_a_clean_line(
+def test_a_terminal_sees_which_file_is_repaired_and_then_a_clean_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("a/a_0.mcap", "a/a_1.mcap"):
-        left_open(tmp_path / name)
+    left_open(tmp_path / "a/a_0.mcap")
     terminal = io.StringIO()
     monkeypatch.setattr(
         output, "Console", partial(Console, file=terminal, force_terminal=True, width=100)
     )
-    recover_files(tmp_path, lambda _: None, clock=later(60))
+    recovered(tmp_path)
     shown = terminal.getvalue()
-    assert " 50% a/a_0.mcap" in shown
-    assert "100% a/a_1.mcap" in shown
-    assert "\x1b[2K" in shown.rpartition("%")[2]
+    assert "repairing a/a_0.mcap (1 of 1)" in shown
+    assert "\x1b[2K" in shown.rpartition("repairing")[2]
 
 
 def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path) -> None:
     left_open(tmp_path / "rec/rec_0.mcap")
     (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
     before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    printed: list[str] = []
-    outcome = recover_files(tmp_path, printed.append, dry_run=True, clock=later(60))
+    outcome = recover_files(tmp_path, dry_run=True, clock=later(60))
     assert (outcome.repaired, outcome.removed) == (1, 1)
-    repaired, removed, metadata, *_, last = printed
+    repaired, removed, metadata, *_, last = outcome.lines
     assert repaired.startswith("rec/rec_0.mcap: would be repaired")
     assert removed == "rec/rec_1.mcap: empty, would be removed"
     assert metadata.endswith("metadata.yaml: would be written to match the files")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from ros2_memory import bootstrap_fleet, cli
+from ros2_memory import bootstrap, bootstrap_fleet, cli
 from ros2_memory.cli.maintenance import ship as ship_module
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import LakeError
@@ -169,25 +169,9 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     assert "has no bag yet" in found()["lake warning"][0]
     assert not lake.exists()
     ship(0, robots)
-    with writing_alone(lake / ".ros2-memory"):
-        told = found()
+    told = found()
     assert [*told] == ["lake ok"]
     assert "its newest commit is from" in told["lake ok"][0]
-    assert f"process {os.getpid()} on " in told["lake ok"][1]
-    assert found()["lake ok"][1] == "no process writes into it now"
-    can = os.access
-    own = tmp_path / "hall" / ".episodic"
-    monkeypatch.setattr(
-        os, "access", lambda path, mode: own not in Path(path).parents and can(path, mode)
-    )
-    [told_of] = found()["robot warning"]
-    assert "hall: " in told_of
-    assert "can never work" in told_of
-    # What was recorded of its files is in the folder of another machine.
-    shutil.copytree(lake / ".ros2-memory", tmp_path / "state")
-    (tmp_path / "state" / "written.jsonl").unlink()
-    [told_of] = found(f"lake.state_dir={tmp_path}/state")["lake warning"]
-    assert "another machine" in told_of
     shutil.rmtree(lake / "ros2_memory")
     assert "looking into the lake failed" in found()["lake error"][0]
 
@@ -195,7 +179,7 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
 def test_without_the_extra_it_names_the_extra(ship: Ship, monkeypatch: pytest.MonkeyPatch) -> None:
     found = importlib.util.find_spec
     monkeypatch.setattr(
-        bootstrap_fleet, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
+        bootstrap, "find_spec", lambda name: None if name == "pyiceberg" else found(name)
     )
     assert "pip install '.[lake]'" in ship(2).err
 

@@ -87,8 +87,7 @@ def test_they_are_scanned_repaired_read_for_definitions_and_removed(
     assert reading_of(settings, {})
     assert len(build_memory(settings).index.snapshot().bags) == 1
     keeper_of(bags).apply()
-    lines: list[str] = []
-    assert recover_files(bags, lines.append).whole == 1
+    assert recover_files(bags).whole == 1
     put(bags, bag, 3, "shallow")
     (bags / "link").symlink_to(tmp_path)
     directories.remove(bags)

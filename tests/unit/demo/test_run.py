@@ -12,19 +12,13 @@ from pathlib import Path
 import pytest
 
 from ros2_memory.core.errors import ConfigError, EpisodicError
-from ros2_memory.demo.questions import QUESTIONS, Exchange, Question
+from ros2_memory.demo.questions import QUESTIONS, Exchange
 from ros2_memory.demo.run import format_exchange, run_demo, running_server
 
 REPLY = json.dumps(
     {"samples": [{"timestamp": 1_800_000_000.25 + k, "value": "in the hall"} for k in range(40)]},
     separators=(",", ":"),
 )
-
-
-@pytest.mark.parametrize("question", QUESTIONS, ids=lambda question: question.words)
-def test_every_line_fits_a_hundred_columns(question: Question) -> None:
-    exchange = Exchange(question, REPLY, "It was in the hall. " * 12, right=True)
-    assert all(len(line) <= 100 for line in format_exchange(12, exchange).splitlines())
 
 
 def test_the_call_is_shown_as_it_was_made() -> None:

@@ -271,7 +271,7 @@ def test_an_engine_has_the_settings_of_its_group_and_is_named_with_its_extra(
     assert load_settings(["deployment=fleet", "fleet.robots={r: /r}"], {}).lake.engine is None
     known = importlib.util.find_spec
     monkeypatch.setattr(
-        "ros2_memory.bootstrap_fleet.find_spec",
+        "ros2_memory.bootstrap.find_spec",
         lambda name: None if name == "duckdb" else known(name),
     )
     with pytest.raises(ConfigError, match=r"lake: .*pip install '\.\[lake\]"):

@@ -408,8 +408,7 @@ class TestAdopt:
         assert cli.main(["adopt", "a", "b"]) == 1
         output = capsys.readouterr().out
         assert "there are no bag files" in output
-        for link in ("a/x_0.mcap", "a/y_0.mcap", "b/old"):
-            assert f"{link} is a symbolic link, which is not followed" in output
+        assert "links are not followed" in output
         assert "adopted" not in output
         (tmp_path / "old" / "y_0.mcap").symlink_to(tmp_path / "nowhere")
         assert cli.main(["adopt", "old", "a"]) == 0

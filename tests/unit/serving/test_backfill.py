@@ -75,15 +75,6 @@ def stored(memory: Memory) -> list[str]:
     return sorted(memory.scanner.store.paths())
 
 
-def test_when_all_is_stored_nothing_waits(tmp_path: Path) -> None:
-    for number in range(3):
-        bag(tmp_path, number)
-    _, backfill = storing(tmp_path)
-    assert backfill.progress() == Progress(3, 0, 3)
-    assert fill_store(backfill) == Progress(3, 3)
-    assert fill_store(storing(tmp_path)[1]) == Progress(3, 3)
-
-
 def test_a_bag_that_cannot_be_stored_is_told_of_and_not_tried_for_ever(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,12 +215,3 @@ def test_where_no_store_can_be_written_the_command_says_so(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / OWN_FOLDER))
     assert main(["index"]) == 2
     assert "XDG_CACHE_HOME" in capsys.readouterr().err
-
-
-@pytest.mark.usefixtures("own_logging")
-def test_a_missing_bag_directory_is_what_the_command_names(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    assert main(["index", "--bag-dir", str(tmp_path / "gone")]) == 2
-    assert "the bag directory does not exist" in capsys.readouterr().err

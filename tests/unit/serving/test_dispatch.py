@@ -193,17 +193,6 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
 
 
-async def test_tools_are_listed_while_queries_run_and_wait() -> None:
-    held = Held()
-    stuck = tool("stuck", held.ask)
-    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
-        for _ in range(2 * QUICK_AT_ONCE):
-            tasks.start_soon(client.call_tool, "stuck", {})
-        await anyio.wait_all_tasks_blocked()
-        assert len((await client.list_tools()).tools) == 1
-        held.released.set()
-
-
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
     held = Held()
     slow, quick = tool("slow", held.ask, blocking=True), tool("quick", lambda _call: value(2))
@@ -369,17 +358,6 @@ async def test_the_next_place_goes_to_whoever_has_the_fewest() -> None:
     assert gates.begun == ["a0", "a1", "a2", "b0", "a3"]
     gates.release()
     await asyncio.gather(*tasks)
-
-
-async def test_a_question_whose_caller_leaves_gives_its_place_in_the_queue_back() -> None:
-    queue, gates = FairQueue("test", 1), Gates()
-    tasks = started(queue, gates, "a", 3)
-    await until(lambda: queue.waiting == 2)
-    tasks[1].cancel()
-    await until(lambda: queue.waiting == 1)
-    gates.release()
-    assert await tasks[2] == "a2"
-    assert gates.begun == ["a0", "a2"]
 
 
 @pytest.mark.parametrize("has_turn", [True, False])

@@ -13,8 +13,6 @@ from mcp.server.apps import APP_MIME_TYPE, EXTENSION_ID
 from mcp.shared.exceptions import MCPError
 from mcp.types import (
     INVALID_PARAMS,
-    PromptReference,
-    ResourceTemplateReference,
     TextContent,
     TextResourceContents,
 )
@@ -182,21 +180,6 @@ async def test_one_moment_is_a_resource(tmp_path: Path) -> None:
     assert name in refused["detail"]
 
 
-async def test_parameters_of_templates_are_completed(tmp_path: Path) -> None:
-    write_run(tmp_path)
-    name = keep(tmp_path, "spilled coffee")
-    schema = ResourceTemplateReference(uri="episodic://schema/{type}")
-    moment = ResourceTemplateReference(uri="episodic://moments/{id}")
-    other = PromptReference(name="use_memory")
-    async with Client(server(tmp_path)) as client:
-        typed = await client.complete(schema, {"name": "type", "value": "odom"})
-        assert typed.completion.values == ["nav_msgs/msg/Odometry"]
-        assert (typed.completion.total, typed.completion.has_more) == (1, False)
-        kept = await client.complete(moment, {"name": "id", "value": ""})
-        assert kept.completion.values == [name]
-        assert (await client.complete(other, {"name": "x", "value": ""})).completion.values == []
-
-
 async def test_a_client_that_asks_for_progress_receives_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -228,7 +211,7 @@ async def test_a_client_that_asks_for_progress_receives_it(
             )
     assert [each[0] for each in reported[:2]] == [1, 2]
     assert reported[0][2] == "40 % of the bags stored"
-    assert str(reported[1][2]).startswith("60 % of the bags stored, about ")
+    assert reported[1][2] == "60 % of the bags stored"
 
 
 async def test_a_moment_can_be_saved_only_where_something_records(tmp_path: Path) -> None:

@@ -12,11 +12,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial import KDTree  # type: ignore[import-untyped]
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 
-from ros2_memory.analysis.motion.robot_track import RobotTrack, cut, track_of
+from ros2_memory.analysis.motion.robot_track import cut, track_of
 from ros2_memory.bag_dir.moment_file import (
     SavedMoment,
     SaveRequest,
@@ -32,7 +31,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.dispatch import Dispatcher, QuestionLog
 from ros2_memory.serving.page import drawn_path, span
-from ros2_memory.serving.page.drawn_path import Box, path_in_box
+from ros2_memory.serving.page.drawn_path import Box, Line, path_in_box
 from ros2_memory.serving.page.recordings import Recordings
 from ros2_memory.serving.page.routes import (
     box_asked,
@@ -42,7 +41,7 @@ from ros2_memory.serving.page.routes import (
     warm_up,
     window_asked,
 )
-from ros2_memory.serving.page.span import MOST_POINTS, driven_cells, span_shown, thinned
+from ros2_memory.serving.page.span import MOST_POINTS, span_shown
 from ros2_memory.serving.page.topics import labels_shown, topics_shown
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.replies import Replies
@@ -266,19 +265,17 @@ def test_a_track_that_is_cut_is_where_the_whole_one_is(
         assert found.times[0] == window.start
 
 
-@given(st.integers(0, 5_000), st.integers(0, 2**32 - 1))
-def test_a_thinned_path_is_bounded_and_reaches_as_far_to_every_side(count: int, seed: int) -> None:
+@given(st.integers(1, 5_000), st.floats(0, 1), st.integers(0, 2**32 - 1))
+def test_points_of_a_long_path_are_bounded_and_reach_from_its_first_to_its_last(
+    count: int, pieces: float, seed: int
+) -> None:
     random = np.random.default_rng(seed)
     x, y = random.normal(size=(2, count)).cumsum(axis=1)
     times = BEGIN + np.cumsum(random.integers(1, 10**9, count))
-    kept = thinned(x, y, times)
+    kept = Line(times, x, y, random.random(count) < pieces).simplified(0.05, MOST_POINTS).tolist()
     assert len(kept) <= MOST_POINTS
-    assert all(one < other for one, other in pairwise(kept.tolist()))
-    if count:
-        assert {0, count - 1} <= set(kept.tolist())
-        for column in (x, y):
-            assert column[kept].min() == column.min()
-            assert column[kept].max() == column.max()
+    assert all(one < other for one, other in pairwise(kept))
+    assert {0, count - 1} <= {*kept}
 
 
 def answered(tool: str) -> Answered:
@@ -431,26 +428,6 @@ async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes
         assert "remember_moment writes" in refused["detail"]
         for arguments in ("[]", "{", "[" * 100):
             assert (await asked("data_time_range", arguments)).status_code == 400
-
-
-@given(seed=st.integers(0, 2**32), size=st.sampled_from([1.0, 50.0, 5_000.0]))
-def test_the_cells_of_a_long_path_are_those_that_it_passes(seed: int, size: float) -> None:
-    """Every point between two poses of a piece is within a cell of one."""
-    draw = np.random.default_rng(seed)
-    count = 60
-    begins = draw.random(count) < 0.1
-    begins[0] = True
-    x, y = draw.random((2, count)) * size
-    times = BEGIN + np.arange(count, dtype=np.int64) * S
-    found: Any = driven_cells(RobotTrack(times, x, y, np.zeros(count), begins))
-    side = found["size"]
-    cells = (np.array([found["x"], found["y"]]).T + 0.5) * side
-    share = np.linspace(0, 1, 40)[:, None, None]
-    ends = np.stack([x, y], axis=1)
-    driven = (ends[:-1] + (ends[1:] - ends[:-1]) * share)[:, ~begins[1:]].reshape(-1, 2)
-    away, _ = KDTree(cells).query(driven, p=np.inf)
-    assert away.max(initial=0) <= 1.51 * side
-    assert len(cells) <= 8_000
 
 
 def topics(memory: Memory, query: str) -> Any:

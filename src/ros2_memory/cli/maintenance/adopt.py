@@ -1,14 +1,12 @@
 """`ros2-memory adopt`: lists recordings of other programs as the recorder's own."""
 
 import os
-from collections.abc import Iterable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from ros2_memory.bag_dir.layout import bag_kind, bags_in, is_kept_apart
+from ros2_memory.bag_dir.layout import bags_in, is_kept_apart
 from ros2_memory.bag_dir.lock import BagDirLock
 from ros2_memory.bag_dir.own_recordings import OwnRecordings, folders_with_bags, is_regular
 from ros2_memory.cli.options import MB, AsJson, BagDir, Sets, load_for, require_recorder
@@ -17,9 +15,6 @@ from ros2_memory.core.directories import identity_of
 from ros2_memory.core.errors import InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.retention.delete import size_of
-
-_MAX_LINKS_NAMED = 5
-_INSTEAD = "move or mount the bags into the bag directory"
 
 
 def adopt(
@@ -74,10 +69,9 @@ def adopt(
     if not all(map(is_kept_apart, new)):
         print_line("retention deletes them from now on, by its limits, oldest first")
     if not bags_by_name:
-        print_line("there are no bag files")
-        for link in islice(_links(given), _MAX_LINKS_NAMED):
-            name = str(link.relative_to(root))
-            print_line(f"{name} is a symbolic link, which is not followed: {_INSTEAD}")
+        print_line(
+            "there are no bag files: links are not followed, so move or mount the bags there"
+        )
     return not bags_by_name
 
 
@@ -102,13 +96,3 @@ def _below(root: Path, directory: Path) -> Path:
     raise InvalidArgumentsError(
         f"{directory} is not a directory below {root}: move the bags there, then adopt them"
     )
-
-
-def _links(directories: Iterable[Path]) -> Iterator[Path]:
-    """Yields the symbolic links that may lead to bags."""
-    for directory in directories:
-        for folder, folders, files in os.walk(directory):
-            for name in sorted((*folders, *filter(bag_kind, files))):
-                path = Path(folder, name)
-                if path.is_symlink() and not name.startswith("."):
-                    yield path

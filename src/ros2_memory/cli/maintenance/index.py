@@ -26,7 +26,7 @@ from ros2_memory.cli.options import (
     load_given,
     open_robot,
 )
-from ros2_memory.cli.output import print_json, progress_bar
+from ros2_memory.cli.output import print_json, spinner
 from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
@@ -43,7 +43,6 @@ _BATCH: Final = 4096
 _FOLLOWED: Final = 256
 """Bags stored before what follows from them is made."""
 _CACHE_MB: Final = 32
-_BAR_WIDTH: Final = 40
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
 
@@ -99,13 +98,8 @@ def _fill_for_people(settings: Settings, robot: str, *, verbose: bool) -> Progre
             "columns can be stored neither beside the bags nor in the cache folder: "
             "set XDG_CACHE_HOME to a writable folder"
         )
-    with progress_bar() as bar:
-        task = bar.add_task("", total=None)
-
-        def show(progress: Progress) -> None:
-            bar.update(task, completed=progress.stored, total=progress.closed)
-
-        return _filled(backfill, show)
+    with spinner("storing columns") as show:
+        return _filled(backfill, lambda progress: show(describe_progress(progress)))
 
 
 def _fill_for_server(settings: Settings, server: int) -> None:
@@ -174,11 +168,9 @@ def _garbage_collected_rarely() -> Iterator[None]:
 
 def describe_progress(progress: Progress) -> str:
     """Returns how many bags are stored, in one line."""
-    share = progress.stored / progress.closed if progress.closed else 1.0
-    bar = "#" * int(share * _BAR_WIDTH)
     bags = counted(progress.closed, "bag is", "bags are")
     refused = f", {progress.refused} cannot be" if progress.refused else ""
-    return f"[{bar:<{_BAR_WIDTH}}] {progress.stored} of {bags} stored{refused}"
+    return f"{progress.stored} of {bags} stored{refused}"
 
 
 def _end_with_parent(parent: int) -> bool:

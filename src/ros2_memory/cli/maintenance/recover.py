@@ -4,10 +4,9 @@ A recorder does the same when it starts. The command is for files that it does n
 that another recorder wrote, copies on a laptop, files so large that a recorder would start late.
 """
 
-from collections.abc import Callable
+from collections.abc import Collection
 from contextlib import suppress
-from dataclasses import asdict, dataclass
-from itertools import accumulate
+from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -20,7 +19,7 @@ from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.cli.options import AsJson
-from ros2_memory.cli.output import print_json, print_line, progress_bar
+from ros2_memory.cli.output import print_json, print_line, spinner
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError, InvalidArgumentsError, RecorderError
 from ros2_memory.core.text import counted, listed
@@ -57,29 +56,36 @@ def recover(
     if not (yes or dry_run) and (others := foreign_unfinished(path)):
         if as_json:
             raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
-        recover_files(path, print_line, force=force, dry_run=True)
+        for line in recover_files(path, force=force, dry_run=True).lines:
+            print_line(line)
         why = "was not made by this recorder" if len(others) == 1 else "were not made by it"
         typer.confirm(f"{listed([*map(str, others)])} {why}. Change this?", abort=True)
-    lines: list[str] = []
-    report = lines.append if as_json else print_line
-    outcome = recover_files(path, report, force=force, dry_run=dry_run)
+    outcome = recover_files(path, force=force, dry_run=dry_run)
     if as_json:
-        print_json({**asdict(outcome), "lines": lines[:-1]})
+        print_json(asdict(outcome))
+    else:
+        print_line("\n".join(outcome.lines))
     return outcome.failed > 0
 
 
 @dataclass(slots=True)
 class RecoveryOutcome:
-    """How many files were whole, repaired, removed or not repaired."""
+    """How many files were whole, repaired, removed or not repaired; and a line on each change."""
 
     whole: int = 0
     repaired: int = 0
     removed: int = 0
     failed: int = 0
     messages: int = 0
+    lines: list[str] = field(default_factory=list, compare=False)
 
-    def __str__(self) -> str:
+    def summary(self, *, dry_run: bool) -> str:
         """Returns one line for people."""
+        if dry_run:
+            return (
+                f"nothing was changed: of the MCAP files {self.whole} are whole, {self.repaired} "
+                f"would be repaired, {self.removed} removed, and {self.failed} not repaired"
+            )
         return (
             f"MCAP files: {self.whole} whole, {self.repaired} repaired "
             f"({counted(self.messages, 'message')}), "
@@ -88,18 +94,12 @@ class RecoveryOutcome:
 
 
 def recover_files(
-    path: Path,
-    report: Callable[[str], None],
-    *,
-    force: bool = False,
-    dry_run: bool = False,
-    clock: Clock | None = None,
+    path: Path, *, force: bool = False, dry_run: bool = False, clock: Clock | None = None
 ) -> RecoveryOutcome:
     """Repairs one file, or every MCAP file below a directory.
 
     Args:
         path: the file or directory.
-        report: takes a line for each file that was not whole, and one at the end.
         force: also repairs what changed in the last half minute.
         dry_run: changes nothing, and reports what would be changed.
         clock: the wall clock.
@@ -109,38 +109,23 @@ def recover_files(
     """
     clock = clock or WallClock()
     files, others = _files_below(path, clock)
-    sizes = [size_of(file) for file in files]
-    recovery = _Recovery(clock, force, build_repairer(), dry_run=dry_run)
-    with progress_bar() as bar:
-        task = bar.add_task("", total=max(sum(sizes), 1))
-        for file, done in zip(files, accumulate(sizes, initial=0), strict=False):
+    recovery = _Recovery(clock, build_repairer(), force=force, dry_run=dry_run)
+    done = recovery.outcome
+    with spinner("repairing") as show:
+        for nth, file in enumerate(files, start=1):
             name = str(file if file == path else file.relative_to(path))
-            bar.update(task, completed=done, description=name)
-
-            def show(read: int, done: int = done) -> None:
-                bar.update(task, completed=done + read)
-
-            line = recovery.recover(file, show)
+            show(f"repairing {name} ({nth} of {len(files)})")
+            line = recovery.recover(file)
             if line is None and file == path:
                 line = "whole already: there is nothing to repair"
             if line is not None:
-                bar.stop()  # or the line would be printed into the bar
-                report(f"{name}: {line}")
-                bar.start()
-    for folder in sorted(recovery.changed):
-        if line := recovery.correct_metadata(folder):
-            report(line)
+                done.lines.append(f"{name}: {line}")
+    done.lines += filter(None, map(recovery.correct_metadata, sorted(recovery.changed)))
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
-        report(f"{left} left alone: only MCAP files are repaired")
-    seen = recovery.outcome
-    report(
-        f"nothing was changed: of the MCAP files {seen.whole} are whole, {seen.repaired} would "
-        f"be repaired, {seen.removed} removed, and {seen.failed} not repaired"
-        if dry_run
-        else str(seen)
-    )
-    return seen
+        done.lines.append(f"{left} left alone: only MCAP files are repaired")
+    done.lines.append(done.summary(dry_run=dry_run))
+    return done
 
 
 def foreign_unfinished(path: Path) -> tuple[Path, ...]:
@@ -163,43 +148,43 @@ def foreign_unfinished(path: Path) -> tuple[Path, ...]:
     return tuple(foreign)
 
 
+@dataclass
 class _Recovery:
     """Repairs one file after the other, and counts what became of them.
 
     `changed` holds the folders in which a file was repaired or removed.
     """
 
-    def __init__(self, clock: Clock, force: bool, repairer: Repairer, *, dry_run: bool) -> None:
-        self._clock = clock
-        self._dry_run = dry_run
-        self._force = force
-        self._repairer = repairer
-        self._open_files = open_files()
-        self.outcome = RecoveryOutcome()
-        self.changed: set[Path] = set()
+    clock: Clock
+    repairer: Repairer
+    _: KW_ONLY
+    force: bool
+    dry_run: bool
+    opened: Collection[tuple[int, int]] = field(default_factory=open_files)
+    outcome: RecoveryOutcome = field(default_factory=RecoveryOutcome)
+    changed: set[Path] = field(default_factory=set)
 
-    def recover(self, file: Path, on_read: Callable[[int], None]) -> str | None:
+    def recover(self, file: Path) -> str | None:
         """Repairs a file, and returns what was done; None where it was whole."""
         outcome = self.outcome
         try:
-            if self._repairer.is_whole(file):
+            if self.repairer.is_whole(file):
                 outcome.whole += 1
                 return None
             self._require_unused(file)
             size = size_of(file)
-            rewritten = None
-            if not self._dry_run and (repaired := self._repairer.repair(file, on_read)):
-                rewritten = repaired.rewritten
+            repaired = None if self.dry_run else self.repairer.repair(file)
         except BagVanishedError:
             outcome.failed += 1
             return "NOT REPAIRED: it is not there any more"
         except BagError as error:
             outcome.failed += 1
             return f"NOT REPAIRED: {error.reason}"
+        rewritten = None if repaired is None else repaired.rewritten
         self.changed.add(file.parent)
-        if rewritten is None and not (self._dry_run and size):
+        if rewritten is None and not (self.dry_run and size):
             outcome.removed += 1
-            return f"empty, {'would be ' if self._dry_run else ''}removed"
+            return f"empty, {'would be ' if self.dry_run else ''}removed"
         outcome.repaired += 1
         if rewritten is None:
             return f"would be repaired ({counted(size, 'byte')})"
@@ -214,12 +199,12 @@ class _Recovery:
         """Makes metadata.yaml describe the files of the recording; returns what was done."""
         path = folder / METADATA_FILE
         existed = size_of(path) > 0
-        if self._dry_run:
+        if self.dry_run:
             verb = "corrected" if existed else "written"
             is_written = existed or is_named_by_rosbag2(folder)
             return f"{path}: would be {verb} to match the files" if is_written else None
         try:
-            if self._repairer.correct_metadata(folder):
+            if self.repairer.correct_metadata(folder):
                 return f"{path}: {'rewritten' if existed else 'written'} to match the files"
         except BagError as error:
             return f"{path} NOT CORRECTED: {error.path}: {error.reason}"
@@ -239,7 +224,7 @@ class _Recovery:
             BagError: something does or may write it, or its name is not that of an MCAP file.
             BagVanishedError: it is gone.
         """
-        now = self._clock.now()
+        now = self.clock.now()
         for folder in file.absolute().parents:
             heartbeat = read_heartbeat(folder).heartbeat
             if heartbeat is None or not heartbeat.is_live(now):
@@ -253,10 +238,10 @@ class _Recovery:
             raise BagVanishedError(str(file), "it is not there any more") from error
         if not status.st_size and file.suffix != _MCAP:
             raise BagError(str(file), f"it is empty, and its name does not end in {_MCAP}")
-        if (status.st_dev, status.st_ino) in self._open_files:
+        if (status.st_dev, status.st_ino) in self.opened:
             raise BagError(str(file), "a process has it open; end that first")
         age = now - status.st_mtime_ns
-        if abs(age) < RECENT_NS and not self._force:
+        if abs(age) < RECENT_NS and not self.force:
             since = f"{unix_from_ns(abs(age)):.0f} s ago"
             reason = f"it changed {since}; if nothing writes it any more, try again with --force"
             raise BagError(str(file), reason)

@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import SILENCE_NS
 from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, RobotTrack, cut
 from ros2_memory.core.errors import NoDataError, NoDataReason, QueryTimeoutError
 from ros2_memory.core.geometry import simplified
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, unix_from_ns
+from ros2_memory.history.no_data import GIVE_TOPIC, resolve_pose_topic
 from ros2_memory.history.view import View
+from ros2_memory.messages.to_json import evenly
 from ros2_memory.places.local_map import local_track
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import TrackReader
@@ -33,6 +36,7 @@ MOST_POINTS: Final = 20_000
 _MOST_PIXELS: Final = 20_000_000
 """A path that passes more, as where it jumps far, is not searched for what it repeats."""
 _QUICK_S: Final = 2.0
+_WHERE_LISTED: Final = "; list_recorded_topics lists all"
 _TOGETHER_NS: Final = 5 * NS_PER_S
 """A robot that leaves the box for less is read on: reading begins anew for each stretch."""
 
@@ -47,13 +51,68 @@ class Box(NamedTuple):
     pixel_m: float
 
 
-class _Line(NamedTuple):
+class Line(NamedTuple):
     """Points of a path in order of time; `begins`: whether no line leads to a point."""
 
     times: NDArray[np.int64]
     x: NDArray[np.float64]
     y: NDArray[np.float64]
     begins: NDArray[np.bool_]
+
+    def some(self, kept: NDArray[np.intp]) -> Line:
+        """Returns the points with these indices."""
+        return Line(self.times[kept], self.x[kept], self.y[kept], self.begins[kept])
+
+    def simplified(self, tolerance_m: float, at_most: int) -> NDArray[np.intp]:
+        """Returns the indices of at most so many points, from whose lines no other is farther."""
+        count = len(self.times)
+        if count < 3:
+            return np.arange(count)
+        are_ends = self.begins | np.append(self.begins[1:], [True])
+        are_ends[0] = True
+        ends = np.flatnonzero(are_ends)
+        points = np.stack([self.x, self.y, np.zeros(count)], axis=1)
+        clock = (self.times - self.times[0]) / NS_PER_S
+        must = ends[evenly(len(ends), at_most)]
+        kept, _ = simplified(points, clock, must, tolerance_m=tolerance_m, at_most=at_most)
+        return kept
+
+
+class RobotPath(NamedTuple):
+    """The robot's track in a window, in a frame.
+
+    `is_whole`: whether there was time for all of it. `reader` has each pose; None where it is of a
+    satellite receiver.
+    """
+
+    frame: str
+    track: RobotTrack
+    is_whole: bool
+    reader: TrackReader | None
+
+    @property
+    def line(self) -> Line:
+        """The points of the track."""
+        track = self.track
+        return Line(track.times, track.x, track.y, track.begins)
+
+
+def robot_path(view: View, window: TimeWindow) -> RobotPath | None:
+    """Returns the robot's path in the map, else in the frame of odometry, or by its receiver.
+
+    None where no topic places it.
+
+    Raises:
+        QueryTimeoutError: the call's time is over before any of it is known.
+    """
+    places = robot_places(view, window)
+    if places is None:
+        local = local_track(view, view.pose_topic, window)
+        return None if local is None else RobotPath(*local, is_whole=True, reader=None)
+    reader = TrackReader(view, places.map_frame)
+    # With what was just before, to know whether the path goes on from there.
+    known = reader.over(TimeWindow(window.start - SILENCE_NS, window.stop))
+    return RobotPath(places.map_frame, cut(known.track, window), known.since is None, reader)
 
 
 def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> JsonObject:
@@ -63,30 +122,10 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
         NoDataError: no topic places the robot.
         QueryTimeoutError: the call's time is over before its track is known.
     """
-    view = View(memory, call.within(_QUICK_S), window.stop)
-    places, tracks = robot_places(view, window), None
-    if places is not None:
-        tracks = TrackReader(view, places.map_frame)
-        frame, track = places.map_frame, tracks.over(window).track
-    elif (local := local_track(view, view.pose_topic, window)) is not None:
-        frame, track = local
-    else:
-        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, "no topic places the robot")
-    track = cut(track, window)
-    stretches = [*stretches_inside(track, box)]
-    lines: list[_Line] = []
-    is_exact = tracks is None or box.pixel_m >= TOLERANCE_M
-    if tracks is not None and not is_exact:
-        lines = [*_every_pose(tracks, track, stretches)]
-        is_exact = len(lines) == len(stretches)
-    older = []
-    for first, last in stretches[: len(stretches) - len(lines)]:
-        part = slice(first, last + 1)
-        begins = np.arange(last + 1 - first) == 0
-        older.append(_Line(track.times[part], track.x[part], track.y[part], begins))
-    line = _drawn(_joined([*older, *lines[::-1]]), box.pixel_m)
+    path, line, is_exact = line_in_box(memory, call, window, box)
+    track = path.track
     return {
-        "frame": frame,
+        "frame": path.frame,
         "exact": is_exact,
         "until": unix_from_ns(int(track.times[-1])) if len(track.times) else None,
         "t": np.round(line.times / NS_PER_S, 3).tolist(),
@@ -94,6 +133,40 @@ def path_in_box(memory: Memory, call: Call, window: TimeWindow, box: Box) -> Jso
         "y": np.round(line.y, 4).tolist(),
         "begins": np.flatnonzero(line.begins).tolist(),
     }
+
+
+def line_in_box(
+    memory: Memory, call: Call, window: TimeWindow, box: Box
+) -> tuple[RobotPath, Line, bool]:
+    """Returns the robot's path, it as drawn in a box, and whether every pose there counted.
+
+    Raises:
+        NoDataError: no topic places the robot.
+        QueryTimeoutError: the call's time is over before its track is known.
+    """
+    view = View(memory, call.within(_QUICK_S), window.stop)
+    path = robot_path(view, window)
+    if path is None:
+        raise NoDataError(NoDataReason.TOPIC_NOT_RECORDED, why_no_path(view))
+    stretches = [*stretches_inside(path.track, box)]
+    lines: list[Line] = []
+    is_exact = path.reader is None or box.pixel_m >= TOLERANCE_M
+    if path.reader is not None and not is_exact:
+        lines = [*_every_pose(path.reader, path.track, stretches)]
+        is_exact = len(lines) == len(stretches)
+    older = []
+    for first, last in stretches[: len(stretches) - len(lines)]:
+        begins = np.arange(last + 1 - first) == 0
+        older.append(path.line.some(np.arange(first, last + 1))._replace(begins=begins))
+    return path, _drawn(_joined([*older, *lines[::-1]]), box.pixel_m), is_exact
+
+
+def why_no_path(view: View) -> str:
+    """Returns why no topic places the robot, and which setting gives a path."""
+    try:
+        return f"{resolve_pose_topic(view)} has no poses"
+    except NoDataError as error:
+        return error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
 
 
 def stretches_inside(track: RobotTrack, box: Box) -> Iterator[tuple[int, int]]:
@@ -117,7 +190,7 @@ def _bounds(values: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[n
 
 def _every_pose(
     tracks: TrackReader, track: RobotTrack, stretches: Sequence[tuple[int, int]]
-) -> Iterator[_Line]:
+) -> Iterator[Line]:
     """Yields a line through each pose of a stretch, the newest stretch first, while time lasts."""
     for first, last in reversed(stretches):
         start, stop = int(track.times[first]), int(track.times[last]) + 1
@@ -128,40 +201,29 @@ def _every_pose(
         fine = np.isfinite(poses.x) & np.isfinite(poses.y)
         times, at = np.unique(poses.times[fine], return_index=True)
         begins = np.arange(len(times)) == 0
-        yield _Line(times, poses.x[fine][at], poses.y[fine][at], begins)
+        yield Line(times, poses.x[fine][at], poses.y[fine][at], begins)
 
 
-def _joined(lines: Sequence[_Line]) -> _Line:
+def _joined(lines: Sequence[Line]) -> Line:
     if not lines:
-        return _Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
-    return _Line(*(np.concatenate(column) for column in zip(*lines, strict=True)))
+        return Line(np.zeros(0, np.int64), np.zeros(0), np.zeros(0), np.zeros(0, np.bool_))
+    return Line(*(np.concatenate(column) for column in zip(*lines, strict=True)))
 
 
-def _drawn(line: _Line, pixel_m: float) -> _Line:
+def _drawn(line: Line, pixel_m: float) -> Line:
     """Returns a line without what lies within half a pixel of it, or was drawn already.
 
     Of a path that takes too many points for that, it is as many pixels as it must be.
     """
     while True:
-        few = _without_repeats(_simple(line, pixel_m / 2), pixel_m)
+        simple = line.some(line.simplified(pixel_m / 2, max(len(line.times), 1)))
+        few = _without_repeats(simple, pixel_m)
         if len(few.times) <= MOST_POINTS:
             return few
         pixel_m *= 2
 
 
-def _simple(line: _Line, tolerance_m: float) -> _Line:
-    count = len(line.times)
-    if count < 2:
-        return line
-    ends = np.append(line.begins[1:], [True])
-    points = np.stack([line.x, line.y, np.zeros(count)], axis=1)
-    clock = (line.times - line.times[0]) / NS_PER_S
-    must = np.flatnonzero(line.begins | ends)
-    kept, _ = simplified(points, clock, must, tolerance_m=tolerance_m, at_most=count)
-    return _Line(line.times[kept], line.x[kept], line.y[kept], line.begins[kept])
-
-
-def _without_repeats(line: _Line, pixel_m: float) -> _Line:
+def _without_repeats(line: Line, pixel_m: float) -> Line:
     """Returns a line without the steps of which each pixel was drawn by others."""
     if len(line.times) <= MOST_POINTS:
         return line
@@ -179,5 +241,4 @@ def _without_repeats(line: _Line, pixel_m: float) -> _Line:
     drawn[part[first]] = True
     kept = np.append(drawn, [False]) | np.append([False], drawn)
     # A line leads to a point alone where that step is drawn.
-    begins = ~np.append([False], drawn)
-    return _Line(line.times[kept], line.x[kept], line.y[kept], begins[kept])
+    return line._replace(begins=~np.append([False], drawn)).some(np.flatnonzero(kept))

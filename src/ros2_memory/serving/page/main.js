@@ -277,7 +277,7 @@ function continued(view, reply) {
     const from = first < 0 ? older : Math.min(first, older);
     const column = (name) => [...view.path[name].slice(from, older), ...path[name]];
     const isNew = older === from || !path.continues;
-    next.path = { ...path, cells: view.path.cells, t: column("t"), x: column("x"), y: column("y"), yaw: column("yaw"),
+    next.path = { ...path, t: column("t"), x: column("x"), y: column("y"), yaw: column("yaw"),
       begins: [...new Set([0, ...view.path.begins.filter((each) => each > from && each < older)
         .map((each) => each - from),
       ...path.begins.slice(isNew ? 0 : 1).map((each) => each + older - from)])] };

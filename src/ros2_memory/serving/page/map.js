@@ -157,7 +157,7 @@ class RobotMap {
   /* Puts it where an answer has it: between points of a long path it is not known. */
   correct(answer) {
     const [path] = this.paths;
-    if (!answer.robot || this.isApart || !path || !path.cells || answer.frame !== path.frame
+    if (!answer.robot || this.isApart || !path || answer.frame !== path.frame
       || (this.moment && this.moment.isExact)) return;
     this.moment = { x: answer.robot.x, y: answer.robot.y, yaw: answer.robot.yaw_deg };
     this.draw();
@@ -218,7 +218,7 @@ class RobotMap {
     let best = { t: null };
     let least = NEAR_PX;
     for (const path of this.paths.map((each) => this.shapeOf(each))) for (let n = 0; n < path.t.length; n++) {
-      const last = n + 1 === path.t.length || path.starts.has(n + 1) || path.cells;
+      const last = n + 1 === path.t.length || path.starts.has(n + 1);
       const to = last ? n : n + 1;
       const [ax, ay] = [this.px(path.x[n]), this.py(path.y[n])];
       const [dx, dy] = [this.px(path.x[to]) - ax, this.py(path.y[to]) - ay];
@@ -424,8 +424,7 @@ class RobotMap {
       c.beginPath();
       const exact = this.exactly(path);
       if (exact) this.trace(c, exact, 0);
-      else this.drawCells(c, path.cells, colour(ofPath(index)));
-      const until = exact ? exact.until : path.cells ? path.cells.until : null;
+      const until = exact ? exact.until : null;
       const newer = until === null ? 0 : lastBefore(path.t, until + SAME_S) + 1;
       // It goes on from where the exact one ends: a line from a pose before that would cut corners.
       const [end, last] = exact && exact.t.length ? [exact, exact.t.length - 1] : [path, newer - 1];
@@ -441,14 +440,6 @@ class RobotMap {
       if (path.starts.has(n) || (n === first && !before)) c.moveTo(x, y);
       else c.lineTo(x, y);
     }
-  }
-  /* Of a long time, where the path was: lines between some of its points would cut corners. */
-  drawCells(c, cells, fill) {
-    if (!cells) return;
-    const wide = Math.max(cells.size * this.scale + 0.5, 2);
-    c.fillStyle = fill;
-    cells.x.forEach((x, n) => c.fillRect(this.px(x * cells.size),
-      this.py(cells.y[n] * cells.size) - wide, wide, wide));
   }
   drawStops(c) {
     c.fillStyle = colour("stood");

@@ -23,8 +23,6 @@ from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.serving.page.span import path_in
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
     from ros2_memory.core.reply import JsonObject
     from ros2_memory.history.context import Call, Memory
@@ -73,7 +71,7 @@ class Recordings:
         """Returns a path for each robot, where recordings are plainly of several; else none.
 
         Each is of one recording, or of a folder of recordings that do not overlap each other.
-        Of more than `MOST_PATHS` those that overlap are there, then the newest; in order of name.
+        Of more than `MOST_PATHS` the newest are there; in order of name.
         """
         names = _robots(chosen, call, window)
         robot_paths: list[JsonValue] = []
@@ -122,45 +120,29 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
 def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
     """Returns the names under which the robots of a window are found, if there are several.
 
-    Some of their recordings overlap in time, or have frames of other robots.
+    Some of their recordings overlap in time, or have frames of other robots. Each folder is one; of
+    one folder each recording. The newest come first.
     """
-    mixed = [mix.pair for mix in mixed_recordings(memory, call) if mix.topic is not None]
-    root = str(memory.index.bag_dir)
-    names: dict[str, str] = {}
-    ends: dict[str, Ns] = {}
+    root, ends = str(memory.index.bag_dir), dict[str, Ns]()
     for path, bags in recordings_of(memory.index.snapshot()).items():
         if any(bag.reaches_into(window) for bag in bags):
-            names[path] = name_of(path, bags, root)
-            ends[names[path]] = max(bag.end for bag in bags)
-    unlike = _folders_with_unlike_frames(memory, call, {*map(_folder, names.values())})
-    if not unlike and not any(window.overlaps(pair.start, pair.end) for pair in mixed):
-        return []
-    pairs = [
-        tuple(names[path] for path in map(str, (pair.first, pair.second)) if path in names)
-        for pair in mixed
-    ]
-    folders = [{*map(_folder, pair)} for pair in pairs if len(pair) == 2]
-    split = {folder for pair in folders if len(pair) == 1 for folder in pair}
-    overlapping = {name for pair in pairs for name in pair}
-    overlapping |= {name for name in ends if any(_folder(name) in folders for folders in unlike)}
-    robots: dict[str, tuple[bool, Ns]] = {}
-    for name, end in ends.items():
-        robot = name if _folder(name) in split else _folder(name)
-        is_mixed, newest = robots.get(robot, (False, end))
-        robots[robot] = (is_mixed or name in overlapping, max(newest, end))
-    return sorted(robots, key=lambda robot: (*robots[robot], robot), reverse=True)
-
-
-def _folders_with_unlike_frames(
-    memory: Memory, call: Call, present: Collection[str]
-) -> list[set[str]]:
-    """Returns the sets of folders whose recordings contradict each other; all are `present`."""
-    root = str(memory.index.bag_dir)
-    contradicting = [
+            ends[name_of(path, bags, root)] = max(bag.end for bag in bags)
+    folders = {*map(_folder, ends)}
+    unlike = (
         {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
         for contradiction in contradicting_frames(memory, call)
-    ]
-    return [folders for folders in contradicting if len(folders) > 1 and folders.issubset(present)]
+    )
+    are_mixed = any(
+        mixed.topic is not None and window.overlaps(mixed.pair.start, mixed.pair.end)
+        for mixed in mixed_recordings(memory, call)
+    )
+    if not are_mixed and not any(len(pair) > 1 and pair <= folders for pair in unlike):
+        return []
+    robots: dict[str, Ns] = {}
+    for name, end in ends.items():
+        robot = _folder(name) if len(folders) > 1 else name
+        robots[robot] = max(end, robots.get(robot, end))
+    return sorted(robots, key=lambda robot: (robots[robot], robot), reverse=True)
 
 
 def _folder(name: str) -> str:

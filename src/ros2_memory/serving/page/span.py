@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.analysis.motion.robot_track import RobotTrack, cut
 from ros2_memory.core.errors import (
     EpisodicError,
     InvalidArgumentsError,
@@ -49,15 +47,12 @@ from ros2_memory.core.timebase import (
     ns_from_unix,
     unix_from_ns,
 )
-from ros2_memory.history.no_data import GIVE_TOPIC, resolve_pose_topic
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.insights.recap import recap
 from ros2_memory.insights.saved_moments import list_moments
 from ros2_memory.insights.status import memory_status
-from ros2_memory.places.local_map import local_track
-from ros2_memory.places.pose_frames import robot_places
-from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.queries import data_time_range
+from ros2_memory.serving.page.drawn_path import RobotPath, robot_path, why_no_path
 from ros2_memory.serving.page.topics import Signal, signal_in
 from ros2_memory.things.find import find_things
 
@@ -66,6 +61,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.analysis.motion.robot_track import RobotTrack
     from ros2_memory.columns.fill import Progress
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.index.snapshot import Snapshot
@@ -79,7 +75,6 @@ MOST_GAPS: Final = 500
 LAST_S: Final = 3600.0
 MOST_QUESTIONS: Final = 30
 
-_EXTREMES: Final = 5  # of a bin: the first pose, and those farthest west, east, south and north
 _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
 """How long each part of an answer may take; of a patient one the latter, of a first one all of them
@@ -87,9 +82,6 @@ the former. The page shows what there is, and asks again for the rest."""
 _OF_WHOLE: Final = ("events", "things")
 """Parts that are of the whole span; `whole_ms` is their processor time, so that a live page knows
 how often it may ask for them."""
-_WHERE_LISTED: Final = "; list_recorded_topics lists all"
-_CELLS_ACROSS: Final = 400
-_MOST_CELLS: Final = 8_000
 _NEWEST_BAGS: Final = 3
 _NEWEST_NS: Final[Ns] = 600 * NS_PER_S
 
@@ -323,47 +315,22 @@ def _gaps(ranged: DataTimeRange) -> list[JsonValue]:
 
 
 def _path(memory: Memory, call: Call, window: TimeWindow, latest: Ns) -> Shown:
-    """Returns the path in the map, or in the frame of odometry, and where the robot was last."""
+    """Returns the path, and where the robot was last; else why there is none."""
     view = View(memory, call, window.stop)
-    places = robot_places(view, window)
-    if places is None:
-        return _path_by_fixes(view, window, latest)
-    tracks = TrackReader(view, places.map_frame)
-    # With what was just before, to know whether the path goes on from there.
-    tracked = tracks.over(TimeWindow(window.start - SILENCE_NS, window.stop))
-    track = cut(tracked.track, window)
-    newest = track
-    if window.stop <= latest or not len(track.times):
-        newest = tracks.over(TimeWindow(latest - _NEWEST_NS, latest + 1)).track
-    path = _drawn(track, places.map_frame, is_whole=tracked.since is None)
-    named: list[JsonValue] = [
-        _place_outline(place)
-        for place in memory.limits.places
-        if place.frame_id == places.map_frame
-    ]
-    shown: JsonObject = {"path": path, "robot": _newest_pose(newest), "places": named}
-    notes = [*view.notes.sentences()]
-    if tracked.since is not None:
-        notes.append("the path is not complete yet: older bags are still being read")
-    return Shown(shown, tuple(notes))
-
-
-def _path_by_fixes(view: View, window: TimeWindow, latest: Ns) -> Shown:
-    """Returns the path where `data.pose_topic` is a satellite receiver; else why there is none."""
-    local = local_track(view, view.pose_topic, window)
-    if local is None:
-        try:
-            why = f"{resolve_pose_topic(view)} has no poses"
-        except NoDataError as error:  # names the setting or tool that gives a path
-            why = error.detail.replace(f", or {GIVE_TOPIC}", "").removesuffix(_WHERE_LISTED)
+    path = newest = robot_path(view, window)
+    if path is None:
+        why = why_no_path(view)
         return Shown({"path": None, "robot": None, "no_path": why}, (why,))
-    frame, track = local
-    robot = None
-    if newest := local_track(view, view.pose_topic, TimeWindow(latest - _NEWEST_NS, latest + 1)):
-        _, newest_track = newest
-        robot = _newest_pose(newest_track)
-    shown: JsonObject = {"path": _drawn(track, frame, is_whole=True), "robot": robot, "places": []}
-    return Shown(shown, view.notes.sentences())
+    if window.stop <= latest or not len(path.track.times):
+        newest = robot_path(view, TimeWindow(latest - _NEWEST_NS, latest + 1))
+    named: list[JsonValue] = [
+        _place_outline(place) for place in memory.limits.places if place.frame_id == path.frame
+    ]
+    robot = None if newest is None else _newest_pose(newest.track)
+    notes = [*view.notes.sentences()]
+    if not path.is_whole:
+        notes.append("the path is not complete yet: older bags are still being read")
+    return Shown({"path": _drawn(path), "robot": robot, "places": named}, tuple(notes))
 
 
 def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None:
@@ -372,81 +339,25 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
     Raises:
         QueryTimeoutError: it is not known within the time of a quick answer.
     """
-    view = View(memory, call.within(_QUICK_S), window.stop)
-    places = robot_places(view, window)
-    if places is None:
-        return None
-    tracked = TrackReader(view, places.map_frame).over(window)
-    return _drawn(cut(tracked.track, window), places.map_frame, is_whole=tracked.since is None)
+    path = robot_path(View(memory, call.within(_QUICK_S), window.stop), window)
+    return None if path is None else _drawn(path)
 
 
-def _drawn(track: RobotTrack, frame_id: str, *, is_whole: bool) -> JsonObject:
-    kept = thinned(track.x, track.y, track.times)
-    cells: JsonObject = {"cells": driven_cells(track)} if len(kept) < len(track.times) else {}
+def _drawn(path: RobotPath) -> JsonObject:
+    """Returns a path by `MOST_POINTS` points at most."""
+    track = path.track
+    kept = np.arange(len(track.times))
+    if len(kept) > MOST_POINTS:
+        kept = path.line.simplified(0.0, MOST_POINTS)
     return {
-        **cells,
-        "frame": frame_id,
+        "frame": path.frame,
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
         "x": np.round(track.x[kept], 2).tolist(),
         "y": np.round(track.y[kept], 2).tolist(),
         "yaw": [degrees(heading) for heading in track.heading[kept].tolist()],
         "begins": _begins(track, kept),
         "continues": bool(len(kept)) and not bool(track.begins[0]),
-        "whole": is_whole,
-    }
-
-
-def thinned(
-    x: NDArray[np.float64], y: NDArray[np.float64], times: NDArray[np.int64]
-) -> NDArray[np.intp]:
-    """Returns the indices of at most `MOST_POINTS` points of a path, in order.
-
-    Of each of many equal times the first point is kept and the farthest to each side: what is left
-    out lies between points that are drawn. The last one is kept, too.
-    """
-    count = len(times)
-    if count <= MOST_POINTS:
-        return np.arange(count)
-    bins = (MOST_POINTS - 1) // _EXTREMES
-    edges = np.linspace(times[0], times[-1] + 1, bins + 1)
-    starts = np.searchsorted(times, edges[:-1])
-    lengths = np.diff(np.append(starts, count))
-    starts = starts[lengths > 0]
-    part = np.repeat(np.arange(len(starts)), lengths[lengths > 0])
-    kept = [starts, np.array([count - 1])]
-    for values in (x, -x, y, -y):
-        order = np.lexsort((values, part))
-        kept.append(order[starts])
-    return np.unique(np.concatenate(kept))
-
-
-def driven_cells(track: RobotTrack) -> JsonObject:
-    """Returns the cells of a grid that a long track passes: a line between far times cuts corners.
-
-    `size` is in metres; a cell `x`, `y` begins there times the size. `until`: Unix seconds.
-    """
-    dx, dy = np.diff(track.x), np.diff(track.y)
-    lengths = np.where(track.begins[1:], 0.0, np.hypot(dx, dy))
-    size = max(float(np.ptp(track.x)), float(np.ptp(track.y)), 1.0) / _CELLS_ACROSS
-    while True:
-        counts = np.ceil(lengths / size).astype(np.int64)
-        part = np.repeat(np.arange(len(counts)), counts)
-        nth = np.arange(len(part)) - np.repeat(np.cumsum(counts) - counts, counts)
-        share = nth / counts[part]
-        at = np.stack([track.x[part] + dx[part] * share, track.y[part] + dy[part] * share])
-        passed = np.floor(at / size).astype(np.int64)
-        low = passed.min(axis=1, initial=0)
-        # As one number each: distinct columns take ten times as long.
-        height = int(passed[1].max(initial=0) - low[1]) + 1
-        numbers = np.unique((passed[0] - low[0]) * height + passed[1] - low[1])
-        if len(numbers) <= _MOST_CELLS:
-            break
-        size *= 1.5
-    return {
-        "size": size,
-        "x": (numbers // height + low[0]).tolist(),
-        "y": (numbers % height + low[1]).tolist(),
-        "until": _unix_s(int(track.times[-1])),
+        "whole": path.is_whole,
     }
 
 
