@@ -110,10 +110,10 @@ class Housekeeper:
     """
 
     def repair(self) -> None:
-        """Repairs what a crash left. Called once, before anything is recorded.
+        """Notes what a crash cut short. Called once, before anything is recorded.
 
         Raises:
-            EpisodicError: the bag directory cannot be repaired.
+            EpisodicError: that cannot be noted.
             OSError: the bag directory cannot be read.
         """
 

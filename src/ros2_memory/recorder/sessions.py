@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
+from ros2_memory.bag_dir.handover_file import write_handover
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
@@ -21,6 +22,7 @@ from ros2_memory.recorder.handover import (
     Step,
     give_up,
     settle_handover,
+    taking_over,
     unsettled_handovers,
 )
 from ros2_memory.recorder.policies import ClockReading, describe_death
@@ -130,8 +132,6 @@ class RecordingSessions:
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
         self.running: tuple[RecordingSession, ...] = ()
-        # By the old recording's name, until that has ended.
-        self._completed: dict[str, HandoverTransfer] = {}
         # Old and new recordings whose sidecars may have to change.
         self._unsettled: list[tuple[Path, Path]] = []
         self._is_recovered = False
@@ -250,22 +250,17 @@ class RecordingSessions:
             self.settle_handovers()
         return deaths
 
-    def end_all(self, now: ClockReading) -> None:
+    def end_all(self) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
-        handover = self.handover
-        if handover is not None:
-            with self._reporting_failures(handover.old):
-                # Else the old one counts up to its end, and the new one from there.
-                if handover.complete(now):
-                    self._completed[handover.old.name] = handover
-            self._unsettled.append(handover.directories)
+        if self.handover is not None:
+            self._unsettled.append(self.handover.directories)
         for session in self.running:
             session.end()
         self.current, self.handover = None, None
 
     def stop(self, now: ClockReading) -> None:
         """Ends all sessions, and waits for that within the patience of the children."""
-        self.end_all(now)
+        self.end_all()
         for child in end_all([session.child for session in self.running]):
             self._events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
         self.collect_ended(now)
@@ -352,8 +347,8 @@ class RecordingSessions:
                 "gone, or were not discovered in time",
                 recording=handover.new.name,
             )
-        handover.complete(now)
-        self._completed[handover.old.name] = handover
+        splits = handover.new.splits
+        write_handover(splits.directory, taking_over(handover.old.name, now.wall, splits.seen))
         self._unsettled.append(handover.directories)
         handover.old.end()
         self.current, self.handover = handover.new, None
@@ -417,10 +412,6 @@ class RecordingSessions:
         session.state = SessionState.ENDED
         self.running = tuple(other for other in self.running if other is not session)
         self._observe_session(session, now)
-        handover = self._completed.pop(session.name, None)
-        if handover is not None:
-            with self._reporting_failures(session):
-                handover.add_late_splits()
         self._update_list(session)
         self._events.ended(session.name)
         splits = session.splits

@@ -113,19 +113,6 @@ class TestRotation:
         world.supervisor.stop()
         assert_each_counts_once(world)
 
-    def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
-        self, tmp_path: Path
-    ) -> None:
-        world = World(tmp_path, session_duration_s=20).started()
-        world.recorders[0].obeys_after = 40
-        world.run(40)
-        old = read_handover(world.recorders[0].directory).handover
-        assert old.end is not None
-        last = f"{world.recorders[0].directory.name}_{world.recorders[0].splits}.mcap"
-        assert last in old.end.files
-        world.supervisor.stop()
-        assert_each_counts_once(world)
-
     def test_a_rotation_that_cannot_begin_is_tried_again(self, tmp_path: Path) -> None:
         world = World(tmp_path, session_duration_s=20).started(19)
         world.refuse = "no more processes"
@@ -406,26 +393,6 @@ class TestWaiting:
         ).started(40)
         assert world.heartbeat()["state"] == "waiting"
         assert expected in world.heartbeat()["waiting_for"]
-
-
-def test_every_topic_that_may_be_of_an_unknown_type_is_named(tmp_path: Path) -> None:
-    world = World(tmp_path, expected=("/bumper", "/door", "/grip", "/arm")).started(2)
-    world.recorders[0].lines.append(UNKNOWN)
-    [reported] = world.logged(30, "topics_not_recorded")
-    assert "not recorded: /arm;" in reported["reason"]
-    assert "of those that a glob selects, others of the same type" in reported["reason"]
-    assert reported["reason"].endswith("nor these, if anybody offers them: /grip")
-
-
-def test_a_topic_of_an_unknown_type_that_is_dropped_is_no_fault(tmp_path: Path) -> None:
-    world = World(tmp_path / "bags", expected=("/bumper", "/door", "/arm", "/never")).started(2)
-    world.recorders[0].lines.append(UNKNOWN)
-    world.run(20)
-    world.topics_path.write_text("topics: [/bumper, /door]\n")
-    with capture_logs() as logs:
-        world.run(15)
-    assert events(logs, "topics_changed")
-    assert not events(logs, "topics_not_recorded")
 
 
 def test_what_is_said_of_a_topic_is_not_why_a_recorder_died(tmp_path: Path) -> None:

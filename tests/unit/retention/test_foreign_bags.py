@@ -238,7 +238,6 @@ class TestRepair:
         before = cut.read_bytes()
         house = keeper_of(tmp_path, keeps_foreign=True)
         for _ in range(2):
-            house.repair()
             house.apply()
             assert cut.read_bytes() == before
             assert empty.exists()
@@ -247,7 +246,7 @@ class TestRepair:
             own.begin(A)
             own.complete(A)
         own_all(tmp_path)
-        house.repair()
+        house.apply()
         assert cut.read_bytes() != before
         assert not empty.exists()
 
