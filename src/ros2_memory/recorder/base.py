@@ -109,7 +109,7 @@ class Housekeeper:
     continue in the background.
     """
 
-    def repair(self) -> None:
+    def prepare(self) -> None:
         """Notes what a crash cut short. Called once, before anything is recorded.
 
         Raises:

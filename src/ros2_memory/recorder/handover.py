@@ -43,7 +43,7 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
-from ros2_memory.bag_dir.state_files import NOTHING_WITHHELD, read_withheld
+from ros2_memory.bag_dir.state_files import read_withheld
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
@@ -53,12 +53,12 @@ from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator
+    from collections.abc import Collection, Iterable, Iterator
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
+    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.session import RecordingSession
-    from ros2_memory.recorder.sessions import Orders
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
@@ -120,16 +120,16 @@ class HandoverTransfer:
         old: the session that records.
         new: the session that takes over.
         began: the time just before the new recorder was started.
-        orders: what to record.
+        topics: what to record.
 
     Attributes:
         directories: the old and the new recording.
     """
 
     def __init__(
-        self, old: RecordingSession, new: RecordingSession, began: ClockReading, orders: Orders
+        self, old: RecordingSession, new: RecordingSession, began: ClockReading, topics: TopicsFile
     ) -> None:
-        self._orders = orders
+        self._topics = topics
         self.old = old
         self.new = new
         self.directories = old.splits.directory, new.splits.directory
@@ -153,7 +153,7 @@ class HandoverTransfer:
     @property
     def missing(self) -> frozenset[str]:
         """Topics that the old recorder has subscribed to, and the new one has still to."""
-        is_listed = self._orders.topics.selection.matches
+        is_listed = self._topics.selection.matches
         return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
@@ -170,7 +170,7 @@ class HandoverTransfer:
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
-        if self.missing and age_s < self._orders.subscribe_timeout_s:
+        if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
             self._both_since_s = None
@@ -280,7 +280,7 @@ def _begin_of(new: Path, logged: Ns, reader: BagReader) -> Overlap:
 
     `logged` is the last log time of the old one.
     """
-    bags = bags_of(new, reader)
+    bags = _bags_of(new, reader)
     first = min((bag.start for bag in bags.values()), default=logged)
     until = min(logged + JITTER_NS, first + LONGEST_NS)
     later = {name for name, bag in bags.items() if bag.start >= until}
@@ -302,22 +302,25 @@ def _end_of(recording: Path, reader: BagReader) -> _End | None:
 
     Those may be published long before, and received at any time.
     """
-    files = bags_of(recording, reader)
-    ends = [
-        (topic.last, name)
-        for name, bag in files.items()
-        for topic in bag.topics
-        if not topic.latched
-    ]
-    if not ends:
+    files = sorted(_bag_files(recording, reader), key=lambda path: path.stat().st_mtime_ns)
+    newest = next(
+        (
+            (path, lasts)
+            for path, bag in _summaries(reversed(files), reader)
+            if (lasts := {topic.topic: topic.last for topic in bag.topics if not topic.latched})
+        ),
+        None,
+    )
+    if newest is None:
         return None
-    logged, name = max(ends)
-    topics = [topic.topic for topic in files[name].topics if not topic.latched]
-    newest = TimeWindow(logged - FRESH_NS, logged + 1)
+    path, lasts = newest
+    logged = max(lasts.values())
     # A publish time of 0 means that there is none.
     times = [
         (record.publish_time or record.log_time, record.log_time)
-        for record in _readable(reader.records(recording / name, topics, newest))
+        for record in _readable(
+            reader.records(path, lasts, TimeWindow(logged - FRESH_NS, logged + 1))
+        )
     ]
     is_by_log = bool(times) and all(published == logged for published, logged in times)
     return _End(
@@ -395,7 +398,7 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
         old_cut = Handover(counts_until=before.counts_until, end=before.end)
     new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
     old_side, new_side = (
-        _Side(path, cut, bags_of(path, reader, only_closed=path in written))
+        _Side(path, cut, _bags_of(path, reader, only_closed=path in written))
         for path, cut in ((old, old_cut), (new, new_cut))
     )
     ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
@@ -475,7 +478,7 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
             yield record
 
 
-def bags_of(
+def _bags_of(
     recording: Path, reader: BagReader, *, only_closed: bool = False
 ) -> dict[str, BagSummary]:
     """Returns the bag files that can be read and are not empty, by name.
@@ -486,14 +489,21 @@ def bags_of(
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
-    summaries: dict[str, BagSummary] = {}
-    withheld = read_withheld(recording.parent) if only_closed else NOTHING_WITHHELD
-    for path in _bag_files(recording, reader):
+    files = _bag_files(recording, reader)
+    if only_closed:
+        withheld = read_withheld(recording.parent)
+        files = [path for path in files if not withheld.holds(recording.name, path.name)]
+    summaries = _summaries(files, reader, only_closed=only_closed)
+    return {path.name: bag for path, bag in summaries}
+
+
+def _summaries(
+    files: Iterable[Path], reader: BagReader, *, only_closed: bool = False
+) -> Iterator[tuple[Path, BagSummary]]:
+    """Yields those bag files that can be read and are not empty, with their summaries."""
+    for path in files:
         try:
-            if only_closed and (
-                withheld.holds(recording.name, path.name)
-                or reader.closing(path) is not Closing.CLOSED
-            ):
+            if only_closed and reader.closing(path) is not Closing.CLOSED:
                 continue
             summary = reader.summarize(path)
         except BagUnreachableError:
@@ -501,8 +511,7 @@ def bags_of(
         except BagError:
             continue
         if not summary.empty:
-            summaries[path.name] = summary
-    return summaries
+            yield path, summary
 
 
 def _bag_files(recording: Path, reader: BagReader) -> list[Path]:

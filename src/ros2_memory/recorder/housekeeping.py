@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30
-"""A larger file would delay recording by minutes; `ros2-memory recover` repairs it."""
+"""A larger file would delay deletion by minutes; `ros2-memory recover` repairs it."""
 
 _MB: Final = 10**6
 _MCAP: Final = ".mcap"
@@ -157,7 +157,7 @@ class Housekeeping(Housekeeper):
         self._lock = threading.Lock()
         self._unwritten: list[Loss] = []
 
-    def repair(self) -> None:
+    def prepare(self) -> None:
         """Notes that an earlier run was cut short, and removes what it began without a byte.
 
         Nothing may be recording.
@@ -235,14 +235,23 @@ class Housekeeping(Housekeeper):
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def _save_moments(self) -> None:
-        self._moments.open()
-        restarted = self._triggers is not None and bool(self._triggers.restarts)
-        if restarted or self._moments.has_work():
-            with self._index.undisturbed() as snapshot:
+    def _save_moments(self, *, in_pass: bool = False) -> None:
+        """Saves the moments that were asked for, and those of rules.
+
+        Rules look before each pass, and at once where a recording began anew.
+        """
+        if not in_pass:
+            self._moments.open()
+        looks = self._triggers is not None and (in_pass or bool(self._triggers.restarts))
+        if not (in_pass or looks or self._moments.has_work()):
+            return
+        with self._index.undisturbed() as snapshot:
+            if self._moments.has_work():
                 self._moments.keep(snapshot)
-                if restarted and self._triggers is not None:
-                    self._triggers.look(snapshot)
+            if in_pass:
+                self._moments.relink_sidecars()
+            if self._triggers is not None and looks:
+                self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
         """Records that a recording ended unexpectedly, and another one begins."""
@@ -316,7 +325,11 @@ class Housekeeping(Housekeeper):
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
-        self._update_moments()
+        try:
+            self._save_moments(in_pass=True)
+        except (EpisodicError, OSError) as error:
+            # Only reported: if it stopped the deletion, the disk would fill.
+            _log.error("moments_not_minded", reason=str(error))
         self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
@@ -408,21 +421,6 @@ class Housekeeping(Housekeeper):
             "raise retention.max_total_gb",
         )
 
-    def _update_moments(self) -> None:
-        """Saves what was asked for and updates sidecars, before anything is deleted.
-
-        A fault is only reported: if it stopped the deletion, the disk would fill.
-        """
-        try:
-            with self._index.undisturbed() as snapshot:
-                if self._moments.has_work():
-                    self._moments.keep(snapshot)
-                self._moments.relink_sidecars()
-                if self._triggers is not None:
-                    self._triggers.look(snapshot)
-        except (EpisodicError, OSError) as error:
-            _log.error("moments_not_minded", reason=str(error))
-
     def _needed_by_rules(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: all where the disk does not tell.
 
@@ -440,7 +438,6 @@ class Housekeeping(Housekeeper):
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        paths += [path for path in snapshot.empty if has_own_name(path.parent.name)]
         # Live or not.
         named = {self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings}
         repaired = 0

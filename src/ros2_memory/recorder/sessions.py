@@ -17,7 +17,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
-    SUBSCRIBE_TIMEOUT_S,
     HandoverTransfer,
     Step,
     give_up,
@@ -71,7 +70,6 @@ class Orders:
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
-        subscribe_timeout_s: how long a handover waits for topics (see `handover`).
     """
 
     bag_dir: Path
@@ -88,7 +86,6 @@ class Orders:
     required: Sequence[Required] = ()
     simulated: bool = False
     advice: Callable[[], str] = str
-    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
 
 
 SETTLE_S: Final = 5.0
@@ -172,7 +169,7 @@ class RecordingSessions:
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
-        self.handover = HandoverTransfer(old, new, now, self._orders)
+        self.handover = HandoverTransfer(old, new, now, self._orders.topics)
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:

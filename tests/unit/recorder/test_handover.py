@@ -171,7 +171,7 @@ DOUBLED = st.frozensets(st.integers(60, 180), max_size=6)
     depth=st.integers(1, 30),
     ends_after=st.floats(0, 1),
     doubled=DOUBLED,
-    kind=st.sampled_from(["complete", "stopped", "void"]),
+    kind=st.sampled_from(["complete", "stopped", "void", "new one died"]),
 )
 def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
     tmp_path_factory: pytest.TempPathFactory,
@@ -187,6 +187,7 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
         "complete": (7 + ends_after, 13.0),
         "stopped": (6 + ends_after, 6.5),
         "void": (13.0, 6 + ends_after),
+        "new one died": (8.0, 6 + ends_after),
     }[kind]
     published = publications(13, doubled)
     Recorder(0, old_stop, stalls[0], depth, splits[0]).writes(bag_dir / "a", published)
@@ -195,6 +196,10 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
         write_handover(bag_dir / "b", void("a"))
     else:
         interrupted(bag_dir / "a", bag_dir / "b")
+    if kind == "new one died":
+        files = [path.name for path in bag_dir.glob("b/*")]
+        write_handover(bag_dir / "b", taking_over("a", T0 + 6 * S, files))
+        settle_handover(bag_dir / "a", bag_dir / "b", READER, running=["a"])
     assert settle_handover(bag_dir / "a", bag_dir / "b", READER)
     assert_union(bag_dir)
 

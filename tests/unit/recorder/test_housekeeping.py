@@ -441,7 +441,7 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     keeper = keeper_of(tmp_path, clock=later(0))
     with pytest.MonkeyPatch.context() as full:
         full.setattr("ros2_memory.bag_dir.json_files.append_durably", failing(errno.ENOSPC))
-        keeper.repair()
+        keeper.prepare()
     keeper.apply()
     keeper.wait()
     assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found

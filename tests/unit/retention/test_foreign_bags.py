@@ -224,7 +224,7 @@ class TestRepair:
         for name in (A, B):
             (tmp_path / name).mkdir()
             (tmp_path / name / f"{name}_0.mcap").touch()
-        keeper_of(tmp_path, keeps_foreign=True).repair()
+        keeper_of(tmp_path, keeps_foreign=True).prepare()
         assert not (tmp_path / A).exists()
         assert (tmp_path / B / f"{B}_0.mcap").exists()
 
