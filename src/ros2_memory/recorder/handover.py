@@ -33,7 +33,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
     Counting,
-    CutClock,
     Handover,
     MessageList,
     Overlap,
@@ -265,10 +264,9 @@ def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
     cut = end.published + 1
     after = replace(
         counts,
-        clock=end.clock,
         counts_from=cut,
         begin=_begin_of(new, end.logged, reader),
-        notes=(LOG_CLOCK_NOTE,) * (end.clock is CutClock.LOG),
+        notes=(LOG_CLOCK_NOTE,) * end.is_by_log,
         compared=False,
     )
     settled = replace(before, counts_until=cut, end=Overlap(None, None, ()))
@@ -294,7 +292,7 @@ class _End(NamedTuple):
 
     published: Ns
     logged: Ns
-    clock: CutClock
+    is_by_log: bool
 
 
 def _end_of(recording: Path, reader: BagReader) -> _End | None:
@@ -322,11 +320,10 @@ def _end_of(recording: Path, reader: BagReader) -> _End | None:
             reader.records(path, lasts, TimeWindow(logged - FRESH_NS, logged + 1))
         )
     ]
-    is_by_log = bool(times) and all(published == logged for published, logged in times)
     return _End(
         max((published for published, _ in times), default=logged),
         logged,
-        CutClock.LOG if is_by_log else CutClock.PUBLISH,
+        is_by_log=bool(times) and all(published == logged for published, logged in times),
     )
 
 
