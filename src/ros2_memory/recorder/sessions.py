@@ -386,8 +386,7 @@ class RecordingSessions:
     def settle_handovers(self) -> None:
         """Completes handovers whose recordings have ended, and compares the two where they can be.
 
-        What fails, as on a full disk, is reported and tried again with the next call: until then
-        the messages of the new recording do not count.
+        What fails, as on a full disk, is reported and tried again with the next call.
         """
         running = {session.name for session in self.running}
         for old, new in [*self._unsettled]:
@@ -405,7 +404,7 @@ class RecordingSessions:
         self._interrupted(session.grew_at, "died")
 
     def _finalize(self, session: RecordingSession, now: ClockReading) -> None:
-        """Reads what an ended session left, completes its sidecar, and makes it durable."""
+        """Reads what an ended session left, and makes it durable."""
         session.state = SessionState.ENDED
         self.running = tuple(other for other in self.running if other is not session)
         self._observe_session(session, now)
