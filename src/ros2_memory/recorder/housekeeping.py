@@ -33,7 +33,7 @@ from ros2_memory.retention.delete import remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
-from ros2_memory.retention.repair import Repaired, Repairer, open_files
+from ros2_memory.retention.repair import Repairer, open_files
 from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
@@ -453,10 +453,16 @@ class Housekeeping(Housekeeper):
             if self._links.is_saved(str(path)) or not self._may_repair(path, status):
                 continue
             opened = open_files() if opened is None else opened
-            if (status.st_dev, status.st_ino) not in opened:
-                self._tried.add(state)
-                with suppress(OSError):
-                    repaired += self._repair_file(path)
+            if (status.st_dev, status.st_ino) in opened:
+                continue
+            self._tried.add(state)
+            if status.st_size > MOST_REPAIRED_BYTES:
+                size = f"{status.st_size} bytes are too many to repair while recording"
+                reason = f"{size}: run ros2-memory recover {path}"
+                _log.error("bag_not_repaired", path=str(path), reason=reason)
+                continue
+            with suppress(OSError):
+                repaired += self._repair_file(path)
         return repaired
 
     def _may_repair(self, path: Path, status: os.stat_result) -> bool:
@@ -473,7 +479,7 @@ class Housekeeping(Housekeeper):
         """Repairs one file and reports the result; returns whether it was not whole."""
         begun = time.perf_counter_ns()
         try:
-            repaired = self._repair_if_small(path)
+            repaired = self._repairer.repair(path)
         except (BagVanishedError, FileNotFoundError):
             return False
         except BagError as error:
@@ -498,12 +504,3 @@ class Housekeeping(Housekeeper):
             duration_ms=ms_since(begun),
         )
         return True
-
-    def _repair_if_small(self, path: Path) -> Repaired | None:
-        size = path.lstat().st_size
-        if size > MOST_REPAIRED_BYTES:
-            remedy = f"run ros2-memory recover {path}"
-            raise BagError(
-                str(path), f"{size} bytes are too many to repair while recording: {remedy}"
-            )
-        return self._repairer.repair(path)
