@@ -5,11 +5,10 @@ from __future__ import annotations
 import re
 import signal
 import subprocess
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
-import yaml
 from mcap.reader import make_reader
-from mcap.records import Channel, McapRecord, Message, Metadata
+from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
 from tests.support.processes import PATIENCE_S
@@ -25,14 +24,12 @@ if TYPE_CHECKING:
 class Recording:
     """A running `ros2 bag record`; what it says is in a file beside its directory."""
 
-    def __init__(
-        self, env: Mapping[str, str], directory: Path, *options: str, ignore_sigint: bool = False
-    ) -> None:
+    def __init__(self, env: Mapping[str, str], directory: Path, *options: str) -> None:
         self.directory = directory
         self._log = directory.with_name(f"{directory.name}.log")
         self._log.parent.mkdir(parents=True, exist_ok=True)
         # Whatever this process inherited.
-        signals = "--ignore-signal=INT" if ignore_sigint else "--default-signal=INT,HUP"
+        signals = "--default-signal=INT,HUP"
         argv = ["env", signals, "ros2", "bag", "record", "-s", "mcap", "-o", str(directory)]
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
@@ -84,7 +81,9 @@ def in_file(split: Path) -> list[tuple[str, int, int, bytes]]:
     """The same of one file."""
     topics: dict[int, str] = {}
     found: list[tuple[str, int, int, bytes]] = []
-    for record in records(split, emit_chunks=False):
+    with split.open("rb") as stream:
+        records = list(StreamReader(stream).records)
+    for record in records:
         if isinstance(record, Channel):
             topics[record.id] = record.topic
         elif isinstance(record, Message):
@@ -93,27 +92,11 @@ def in_file(split: Path) -> list[tuple[str, int, int, bytes]]:
     return found
 
 
-def records(file: Path, *, emit_chunks: bool) -> list[McapRecord]:
-    with file.open("rb") as stream:
-        return list(StreamReader(stream, emit_chunks=emit_chunks).records)
-
-
 def summary_of(file: Path) -> Summary:
     with file.open("rb") as stream:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     return summary
-
-
-def embedded(file: Path) -> list[Any]:
-    """The metadata in the file: that of its beginning and that of its end."""
-    texts = [r.metadata for r in records(file, emit_chunks=True) if isinstance(r, Metadata)]
-    return [yaml.safe_load(text["serialized_metadata"]) for text in texts]
-
-
-def metadata(directory: Path) -> Any:
-    text = (directory / "metadata.yaml").read_text("utf-8")
-    return yaml.safe_load(text)["rosbag2_bagfile_information"]
 
 
 def is_closed(file: Path) -> bool:

@@ -140,12 +140,6 @@ class TestInheritance:
         finished(child)
         assert child.take_lines() == [str(sorted(ENV))]
 
-    def test_arguments_reach_it_as_they_are(self, tmp_path: Path, started: list[Child]) -> None:
-        odd = ["^(/a|/b)$", "$(touch x)", "a b", "", "'\"`;&"]
-        child = start(started, program(tmp_path, "print(sys.argv[1:])"), *odd)
-        finished(child)
-        assert child.take_lines() == [str(odd)]
-
     def test_no_signal_is_ignored_or_blocked_though_they_are_here(
         self, tmp_path: Path, started: list[Child]
     ) -> None:
@@ -285,10 +279,6 @@ class TestStart:
         assert finished(child) == 127
         assert child.take_lines() == ["/nowhere/ros2: No such file or directory"]
 
-    def test_more_arguments_than_the_system_takes_are_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(RecorderError, match="cannot be started"):
-            Child.start([program(tmp_path, ""), "x" * (1 << 22)], ENV)
-
     def test_another_thread_than_the_main_one_may_not_start_it(self, tmp_path: Path) -> None:
         caught: list[BaseException] = []
         path = program(tmp_path, "idle()")
@@ -338,11 +328,6 @@ def test_a_parent_that_died_before_is_noticed(tmp_path: Path) -> None:
 
 
 class TestRunBounded:
-    def test_it_gives_status_and_both_streams(self, tmp_path: Path) -> None:
-        body = "print('out'); sys.stderr.write('err'); sys.exit(5)"
-        finished = run_bounded([program(tmp_path, body)], ENV, PATIENCE_S)
-        assert (finished.returncode, finished.stdout, finished.stderr) == (5, b"out\n", b"err")
-
     def test_it_kills_what_takes_too_long_with_all_it_started(self, tmp_path: Path) -> None:
         body = (
             "p = subprocess.Popen([sys.executable, '-IS', '-c', 'import time; time.sleep(600)'])\n"

@@ -5,7 +5,6 @@ One suite holds both, so that it fails where the double differs.
 
 from __future__ import annotations
 
-import re
 import signal
 import subprocess
 import time
@@ -13,21 +12,17 @@ from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING
 
 import pytest
 
 from tests.integration.ros_recordings import (
     Recording,
-    embedded,
     in_file,
     is_closed,
     messages,
-    metadata,
-    records,
 )
-from tests.support.processes import PATIENCE_S, until
+from tests.support.processes import PATIENCE_S
 from tests.support.ros_processes import (
     RECORDERS,
     installation,
@@ -35,8 +30,7 @@ from tests.support.ros_processes import (
     ros_environment,
     wait_for,
 )
-from tests.support.shared_bags import RECORDED, needs_recorded
-from tests.timing import each_in_time, in_time
+from tests.timing import each_in_time
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -46,31 +40,12 @@ if TYPE_CHECKING:
 SECOND = 10**9
 
 
-TWICE = (signal.SIGTERM, signal.SIGINT)
-THRICE = (signal.SIGINT, signal.SIGTERM, signal.SIGINT)
-EVERY_SECOND = ("-e", "/odom", "-d", "1")
 # Name: options. They all begin at once, since each takes its time to begin.
 STARTED = {
     "sigint": ("-e", "/odom|/bumper"),
     "sigterm": ("-e", "/odom|/bumper"),
-    **dict.fromkeys(
-        ("twice", "thrice", "sighup", "sigkill", "ignoring", "stalled", "moved", "thinned"),
-        EVERY_SECOND,
-    ),
+    "stalled": ("-e", "/odom", "-d", "1"),
 }
-
-
-# All that `ros2 bag record --help` of Jazzy lists.
-JAZZY_OPTIONS = """
-    --help --output --storage --topics --services --topic-types --all --all-topics --all-services
-    --regex --exclude-regex --exclude-topic-types --exclude-topics --exclude-services
-    --include-unpublished-topics --include-hidden-topics --no-discovery --polling-interval
-    --ignore-leaf-topics --qos-profile-overrides-path --serialization-format --max-bag-size
-    --max-bag-duration --max-cache-size --disable-keyboard-controls --start-paused --use-sim-time
-    --node-name --custom-data --snapshot-mode --log-level --storage-config-file
-    --storage-preset-profile --compression-queue-size --compression-threads
-    --compression-threads-priority --compression-mode --compression-format
-"""
 # Overrides of a profile, and what they are refused with; None: they are taken.
 OVERRIDES = {
     "{reliability: reliable, durability: transient_local}": (
@@ -109,9 +84,7 @@ def started(
     folder = tmp_path_factory.mktemp("started")
     with ExitStack() as stack:
         yield {
-            name: stack.enter_context(
-                Recording(env, folder / name, *options, ignore_sigint=name == "ignoring")
-            )
+            name: stack.enter_context(Recording(env, folder / name, *options))
             for name, options in STARTED.items()
         }
 
@@ -133,63 +106,6 @@ def test_a_signal_ends_the_recording_cleanly(
     assert is_closed(recording.splits()[0])
     assert (recording.directory / "metadata.yaml").is_file()
     assert f"signal_handler(signum={number.value})" in recording.said
-
-
-@pytest.mark.parametrize("name", ["twice", "thrice"])
-def test_repeated_signals_change_nothing(started: dict[str, Recording], name: str) -> None:
-    numbers = TWICE if name == "twice" else THRICE
-    recording = started[name]
-    recording.await_splits(2)
-    # All are there before it gets to see the first.
-    for number in (signal.SIGSTOP, *numbers):
-        recording.process.send_signal(number)
-    assert recording.stop(signal.SIGCONT) == 0
-    assert all(is_closed(split) for split in recording.splits())
-    assert (recording.directory / "metadata.yaml").is_file()
-
-
-@pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGKILL])
-def test_other_signals_leave_the_recording_open(
-    started: dict[str, Recording], number: signal.Signals
-) -> None:
-    recording = started[number.name.lower()]
-    recording.await_splits(2)
-    wait_for(lambda: is_closed(recording.splits()[0]), "the first split's footer")
-    assert recording.stop(number) == -number
-    assert is_closed(recording.splits()[0])
-    assert recording.splits()[-1].stat().st_size == 0
-    assert not (recording.directory / "metadata.yaml").exists()
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_at_the_very_beginning_kills_it_before_it_has_a_directory(
-    env: dict[str, str], tmp_path: Path, number: signal.Signals
-) -> None:
-    in_time(lambda: kill_at_once(env, Path(mkdtemp(dir=tmp_path)), number))
-
-
-def kill_at_once(env: dict[str, str], folder: Path, number: signal.Signals) -> None:
-    with Recording(env, folder / "a", "-e", "/odom") as recording:
-        # As these tests may, where they run in the background of a shell.
-        until(lambda: not ignores(recording.process.pid, number))
-        # 1: SIGINT came while CPython imported `site`, which it takes for a fatal error.
-        assert recording.stop(number) in {-number, 1 if number == signal.SIGINT else -number}
-    assert not recording.directory.exists()
-
-
-def ignores(pid: int, number: signal.Signals) -> bool:
-    status = Path(f"/proc/{pid}/status").read_text()
-    (mask,) = [line.split()[1] for line in status.splitlines() if line.startswith("SigIgn:")]
-    return bool(int(mask, 16) >> (number - 1) & 1)
-
-
-def test_a_sigint_that_was_ignored_before_it_began_ends_it_all_the_same(
-    started: dict[str, Recording],
-) -> None:
-    recording = started["ignoring"]
-    recording.await_subscribed("/odom")
-    assert recording.stop() == 0
-    assert "signal_handler(signum=2)" in recording.said
 
 
 @pytest.mark.parametrize("text", ["/od", "^(/odom)$"])
@@ -230,50 +146,6 @@ def test_of_what_comes_while_it_is_stopped_only_the_newest_messages_are_kept(
 
 def _is_past(moment: int) -> bool:
     return time.time_ns() > moment
-
-
-def test_its_help_exits_with_0_and_an_unknown_option_with_2(quiet: dict[str, str]) -> None:
-    record = ["ros2", "bag", "record"]
-    asked = subprocess.run([*record, "--help"], env=quiet, capture_output=True, check=False)
-    assert (asked.returncode, asked.stderr) == (0, b"")
-    listed = re.findall(r"^  (?:-\w.*, )?(--[\w-]+)", asked.stdout.decode(), re.MULTILINE)
-    assert set(listed) == set(JAZZY_OPTIONS.split())
-    wrong = subprocess.run([*record, "--wrong"], env=quiet, capture_output=True, check=False)
-    assert wrong.returncode == 2
-
-
-@each_in_time
-def test_a_directory_that_exists_is_refused(quiet: dict[str, str], tmp_path: Path) -> None:
-    (tmp_path / "a").mkdir()
-    with Recording(quiet, tmp_path / "a", "-e", "/odom") as recording:
-        assert recording.process.wait(timeout=PATIENCE_S) == 1
-    said = f"[ERROR] [ros2bag]: Output folder '{tmp_path / 'a'}' already exists.\n"
-    assert recording.said == said
-
-
-@each_in_time
-def test_parents_of_the_directory_are_created(quiet: dict[str, str], tmp_path: Path) -> None:
-    deep = tmp_path / "bags" / "of" / "a"
-    with Recording(quiet, deep, "-e", "/odom") as recording:
-        recording.await_said("Recording...")
-        assert recording.stop() == 0
-    assert [split.name for split in recording.splits()] == ["a_0.mcap"]
-
-
-@needs_recorded
-@each_in_time
-def test_a_recording_of_nothing_is_as_the_real_one(quiet: dict[str, str], tmp_path: Path) -> None:
-    with Recording(quiet, tmp_path / "never", "-e", "/never") as recording:
-        recording.await_said("Recording...")
-        assert recording.stop() == 0
-    real = RECORDED / "extra" / "never"
-    assert metadata(recording.directory) == metadata(real)
-    assert embedded(recording.splits()[0]) == embedded(real / "never_0.mcap")
-    own, same = (
-        [type(record) for record in records(file, emit_chunks=True)]
-        for file in (recording.splits()[0], real / "never_0.mcap")
-    )
-    assert own == same
 
 
 @each_in_time
@@ -361,26 +233,6 @@ def test_publishers_that_cannot_meet_what_was_asked_are_not_recorded_and_warned_
     assert plain.said.count("has unknown type") == 1
 
 
-def test_a_directory_that_vanishes_aborts_it_at_the_next_split(
-    started: dict[str, Recording],
-) -> None:
-    recording = started["moved"]
-    recording.await_subscribed("/odom")
-    recording.directory.rename(recording.directory.with_name("elsewhere"))
-    assert recording.process.wait(timeout=PATIENCE_S) == -signal.SIGABRT
-
-
-def test_closed_splits_that_vanish_do_not_disturb_it(started: dict[str, Recording]) -> None:
-    recording = started["thinned"]
-    recording.await_splits(2)
-    first = recording.splits()[0]
-    wait_for(lambda: is_closed(first), "the first split's footer")
-    first.unlink()
-    recording.await_splits(2)
-    assert recording.stop() == 0
-    assert metadata(recording.directory)["relative_file_paths"][0] == first.name
-
-
 @each_in_time
 def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
     env: dict[str, str], tmp_path: Path
@@ -398,7 +250,7 @@ def test_a_full_disk_is_no_error_and_it_goes_on_once_there_is_room(
         ballast = disk / "ballast"
         ballast.write_bytes(bytes(60 * 1024))
         # What it says lies beside the disk, which has no room for it; the last -o counts.
-        options = (*EVERY_SECOND, "-o", str(disk / "a"))
+        options = (*STARTED["stalled"], "-o", str(disk / "a"))
         with Recording(env, tmp_path / "a", *options) as recording:
             recording.directory = disk / "a"
             recording.await_splits(3)

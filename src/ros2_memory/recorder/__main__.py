@@ -131,9 +131,9 @@ def _record(settings: Settings) -> None:
         if clear:
             _clear(bag_dir, own if settings.retention.foreign == "keep" else None)
         try:
-            housekeeper.repair()
+            housekeeper.prepare()
         except (EpisodicError, OSError) as error:
-            _log.error("not_prepared", task="repair", reason=str(error))
+            _log.error("not_prepared", task="prepare", reason=str(error))
     except BaseException:
         lock.release()
         raise

@@ -109,11 +109,11 @@ class Housekeeper:
     continue in the background.
     """
 
-    def repair(self) -> None:
-        """Repairs what a crash left. Called once, before anything is recorded.
+    def prepare(self) -> None:
+        """Notes what a crash cut short. Called once, before anything is recorded.
 
         Raises:
-            EpisodicError: the bag directory cannot be repaired.
+            EpisodicError: that cannot be noted.
             OSError: the bag directory cannot be read.
         """
 

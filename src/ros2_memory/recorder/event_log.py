@@ -20,8 +20,8 @@ _INFORM = frozenset({LineKind.READY, LineKind.SUBSCRIBED, LineKind.STOPPED})
 _ADVICE = {
     LineKind.QOS_REFUSED: ("messages of this publisher are not recorded: its QoS does not fit"),
     LineKind.UNKNOWN_TYPE: (
-        "the topic is not recorded: name the workspace that defines its type in "
-        "recorder.setup_files"
+        "the topic is not recorded, nor are others of its type, which ros2 bag record does not "
+        "name: name the workspace that defines the type in recorder.setup_files"
     ),
     LineKind.SEVERAL_TYPES: "the topic is not recorded: publishers disagree on its type",
     LineKind.TOPIC_LOST: "messages were lost: the disk is too slow for what is recorded",

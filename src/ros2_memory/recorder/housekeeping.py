@@ -1,13 +1,10 @@
 """Keeps the bag directory in order for a recorder: repairs what crashes left, deletes by limits.
 
-Before anything is recorded, only recordings that a crash must have left are examined: those that
-were being written, and those without a complete metadata.yaml. Other unfinished files are repaired
-later, when the index finds them and nothing writes them.
+What a crash left is repaired when the index finds it, and nothing writes it.
 """
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from contextlib import suppress
@@ -16,11 +13,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE, has_own_name
+from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, append_losses
-from ros2_memory.core import directories
+from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagState
@@ -32,14 +29,15 @@ from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
-from ros2_memory.retention.delete import left_by_repair, remove_emptied, size_of
+from ros2_memory.retention.delete import remove_emptied
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.latched_carry import Carrier
 from ros2_memory.retention.recorded_time import RecordedTime
-from ros2_memory.retention.repair import Repaired, Repairer, open_files
+from ros2_memory.retention.repair import Repairer, open_files
 from ros2_memory.retention.saved_moments import MomentKeeper
 
 if TYPE_CHECKING:
+    import os
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
@@ -52,7 +50,7 @@ if TYPE_CHECKING:
 
 REFRESH_S: Final = 60.0
 MOST_REPAIRED_BYTES: Final = 1 << 30
-"""A larger file would delay recording by minutes; `ros2-memory recover` repairs it."""
+"""A larger file would delay deletion by minutes; `ros2-memory recover` repairs it."""
 
 _MB: Final = 10**6
 _MCAP: Final = ".mcap"
@@ -66,8 +64,8 @@ class Housekeeping(Housekeeper):
     """Repairs and deletes in one bag directory, which its caller has locked.
 
     What takes a while is done in the background: the first scan of a week of bags takes from
-    seconds to minutes, in which the recorder must continue. Only `repair` waits, since nothing is
-    recorded yet. What is still under way is not begun again.
+    seconds to minutes, in which the recorder must continue. What is still under way is not begun
+    again.
 
     Args:
         bag_dir: the bag directory.
@@ -159,8 +157,10 @@ class Housekeeping(Housekeeper):
         self._lock = threading.Lock()
         self._unwritten: list[Loss] = []
 
-    def repair(self) -> None:
-        """Repairs what a crash left in recordings of this program. Nothing may be recording.
+    def prepare(self) -> None:
+        """Notes that an earlier run was cut short, and removes what it began without a byte.
+
+        Nothing may be recording.
 
         Raises:
             OSError: the bag directory, or the list of the recorder's own recordings, cannot be
@@ -175,21 +175,11 @@ class Housekeeping(Housekeeper):
                 self._note_interruption(last_alive, now, "unclean")
             elif heartbeat.state is RecorderState.PAUSED:
                 self._note_interruption(min(heartbeat.since, now), now, "paused")
-        named = _named_in_heartbeat(self._bag_dir)
-        for directory in sorted(self._bag_dir.iterdir()):
-            if directory.is_symlink() or not directory.is_dir():
-                continue
-            if self._limits.keeps_foreign:
-                is_own = self._own.owns(directory)
-                if not is_own and self._own.began(directory):
-                    # Killed before it was listed as a directory: nothing shows whose it is.
+        if self._limits.keeps_foreign:
+            for directory in filter(is_folder, self._bag_dir.iterdir()):
+                # Killed before it was listed as a directory: nothing shows whose it is.
+                if self._own.began(directory):
                     remove_if_empty(directory)
-            else:
-                is_own = directory in named or has_own_name(directory.name)
-            # It was never written, or the disk was full at that time.
-            is_unfinished = not size_of(directory / METADATA_FILE)
-            if is_own and (directory in named or is_unfinished):
-                self._repair_recording(directory)
         self._clear_memory()
 
     def _clear_memory(self) -> None:
@@ -245,14 +235,23 @@ class Housekeeping(Housekeeper):
         if self._repair_unfinished(self._index.snapshot()):
             self._index.refresh()
 
-    def _save_moments(self) -> None:
-        self._moments.open()
-        restarted = self._triggers is not None and bool(self._triggers.restarts)
-        if restarted or self._moments.has_work():
-            with self._index.undisturbed() as snapshot:
+    def _save_moments(self, *, in_pass: bool = False) -> None:
+        """Saves the moments that were asked for, and those of rules.
+
+        Rules look before each pass, and at once where a recording began anew.
+        """
+        if not in_pass:
+            self._moments.open()
+        looks = self._triggers is not None and (in_pass or bool(self._triggers.restarts))
+        if not (in_pass or looks or self._moments.has_work()):
+            return
+        with self._index.undisturbed() as snapshot:
+            if self._moments.has_work():
                 self._moments.keep(snapshot)
-                if restarted and self._triggers is not None:
-                    self._triggers.look(snapshot)
+            if in_pass:
+                self._moments.relink_sidecars()
+            if self._triggers is not None and looks:
+                self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
         """Records that a recording ended unexpectedly, and another one begins."""
@@ -326,7 +325,11 @@ class Housekeeping(Housekeeper):
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:
         begun = time.perf_counter_ns()
-        self._update_moments()
+        try:
+            self._save_moments(in_pass=True)
+        except (EpisodicError, OSError) as error:
+            # Only reported: if it stopped the deletion, the disk would fill.
+            _log.error("moments_not_minded", reason=str(error))
         self._clear_memory()
         before, collected = self._collected, self._collect(free_bytes_wanted)
         self._collected = collected
@@ -418,21 +421,6 @@ class Housekeeping(Housekeeper):
             "raise retention.max_total_gb",
         )
 
-    def _update_moments(self) -> None:
-        """Saves what was asked for and updates sidecars, before anything is deleted.
-
-        A fault is only reported: if it stopped the deletion, the disk would fill.
-        """
-        try:
-            with self._index.undisturbed() as snapshot:
-                if self._moments.has_work():
-                    self._moments.keep(snapshot)
-                self._moments.relink_sidecars()
-                if self._triggers is not None:
-                    self._triggers.look(snapshot)
-        except (EpisodicError, OSError) as error:
-            _log.error("moments_not_minded", reason=str(error))
-
     def _needed_by_rules(self, snapshot: Snapshot) -> frozenset[str]:
         """Returns the bags that rules may still need: all where the disk does not tell.
 
@@ -445,28 +433,14 @@ class Housekeeping(Housekeeper):
         except OSError:  # which was reported when moments were minded
             return frozenset(bag.file for bag in snapshot.bags)
 
-    def _repair_recording(self, directory: Path) -> None:
-        try:
-            with directories.opened(self._bag_dir, directory) as opened:
-                names = sorted(os.listdir(opened))  # noqa: PTH208 - a descriptor has no path
-                for name in filter(left_by_repair, names):
-                    os.unlink(name, dir_fd=opened)
-            for name in names:
-                path = directory / name
-                is_bag = name.endswith(_MCAP) and not left_by_repair(name)
-                if is_bag and (not self._limits.keeps_foreign or self._own.owns_bag(path)):
-                    self._repair_file(path)
-            # In case all splits of the recording were empty.
-            remove_emptied(self._bag_dir, directory)
-        except OSError as error:
-            _log.error("not_repaired", path=str(directory), reason=error.strerror or str(error))
-
     def _repair_unfinished(self, snapshot: Snapshot) -> int:
         """Repairs files that the index found unfinished and nothing writes; returns how many."""
         paths = [bag.path for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]
         paths += [aside.path for aside in snapshot.damaged]
         paths += [aside.path for aside in snapshot.active if aside.reason == HELD_BACK]
-        named, repaired = _named_in_heartbeat(self._bag_dir), 0
+        # Live or not.
+        named = {self._bag_dir / name for name in read_heartbeat(self._bag_dir).recordings}
+        repaired = 0
         opened: Collection[tuple[int, int]] | None = None
         for path in paths:
             try:
@@ -479,10 +453,16 @@ class Housekeeping(Housekeeper):
             if self._links.is_saved(str(path)) or not self._may_repair(path, status):
                 continue
             opened = open_files() if opened is None else opened
-            if (status.st_dev, status.st_ino) not in opened:
-                self._tried.add(state)
-                with suppress(OSError):
-                    repaired += self._repair_file(path)
+            if (status.st_dev, status.st_ino) in opened:
+                continue
+            self._tried.add(state)
+            if status.st_size > MOST_REPAIRED_BYTES:
+                size = f"{status.st_size} bytes are too many to repair while recording"
+                reason = f"{size}: run ros2-memory recover {path}"
+                _log.error("bag_not_repaired", path=str(path), reason=reason)
+                continue
+            with suppress(OSError):
+                repaired += self._repair_file(path)
         return repaired
 
     def _may_repair(self, path: Path, status: os.stat_result) -> bool:
@@ -499,7 +479,7 @@ class Housekeeping(Housekeeper):
         """Repairs one file and reports the result; returns whether it was not whole."""
         begun = time.perf_counter_ns()
         try:
-            repaired = self._repair_if_small(path)
+            repaired = self._repairer.repair(path)
         except (BagVanishedError, FileNotFoundError):
             return False
         except BagError as error:
@@ -509,6 +489,8 @@ class Housekeeping(Housekeeper):
             return False
         if repaired.rewritten is None:
             _log.warning("empty_split_removed", path=str(path))
+            # In case all splits of the recording were empty.
+            remove_emptied(self._bag_dir, path.parent)
             return True
         _log.warning(
             "bag_repaired",
@@ -522,17 +504,3 @@ class Housekeeping(Housekeeper):
             duration_ms=ms_since(begun),
         )
         return True
-
-    def _repair_if_small(self, path: Path) -> Repaired | None:
-        size = path.lstat().st_size
-        if size > MOST_REPAIRED_BYTES:
-            remedy = f"run ros2-memory recover {path}"
-            raise BagError(
-                str(path), f"{size} bytes are too many to repair while recording: {remedy}"
-            )
-        return self._repairer.repair(path)
-
-
-def _named_in_heartbeat(bag_dir: Path) -> frozenset[Path]:
-    """Returns the recordings that the last heartbeat names, live or not."""
-    return frozenset(bag_dir / name for name in read_heartbeat(bag_dir).recordings)

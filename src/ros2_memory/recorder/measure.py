@@ -12,8 +12,6 @@ from itertools import pairwise
 from statistics import fmean, median_low
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
-import yaml
-
 from ros2_memory.bag_dir.state_files import Loss
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns, ns_from_unix
@@ -315,8 +313,9 @@ MESSAGE_BYTES: Final = 256
 """What a queued message takes besides its payload, in bytes: sample, change and allocation."""
 
 # Enumerations are numbers up to Iron (rmw/types.h), names since.
-_RELIABLE: Final = frozenset({"reliable", 1})
-_LATCHED: Final = frozenset({"transient_local", 1})
+_RELIABLE: Final = frozenset({"reliable", "1"})
+_LATCHED: Final = frozenset({"transient_local", "1"})
+_POLICY: Final = re.compile(r"\b(reliability|durability): *(\w+)")
 
 
 class OfferedQos(NamedTuple):
@@ -359,21 +358,18 @@ def offered_by_all(texts: Collection[str]) -> OfferedQos | None:
     Best effort if any publisher is, volatile if any is; None where the texts list no publisher, as
     those of other programs.
     """
-    profiles: list[Mapping[str, object]] = []
-    for text in texts:
-        try:
-            listed: object = yaml.safe_load(text)
-        except yaml.YAMLError:
-            return None
-        if not isinstance(listed, list) or not all(isinstance(profile, dict) for profile in listed):
-            return None
-        profiles += listed
-    if not profiles:
+    # Parsing YAML takes longer than all else that is measured.
+    policies = [policy for text in texts for policy in _POLICY.findall(text)]
+    reliability, durability = (
+        [value for name, value in policies if name == wanted]
+        for wanted in ("reliability", "durability")
+    )
+    if not reliability:
         return None
     return OfferedQos(
-        reliable=all(profile.get("reliability") in _RELIABLE for profile in profiles),
-        latched=all(profile.get("durability") in _LATCHED for profile in profiles),
-        publishers=len(profiles),
+        reliable=_RELIABLE.issuperset(reliability),
+        latched=len(durability) == len(reliability) and _LATCHED.issuperset(durability),
+        publishers=len(reliability),
     )
 
 

@@ -190,8 +190,6 @@ class Ros2BagRecorder(Recorder):
             storage_file=storage_file,
             node_name=node_name(name),
             cache_bytes=self._queue_bytes,
-            # Below the limit at which recording pauses, so it ends only if it was not paused.
-            min_free_bytes=self._orders.min_free_bytes // 2,
             use_sim_time=self._orders.simulated,
             repeat_latched=self._repeat_latched,
             known_options=self._ros.options,

@@ -55,7 +55,6 @@ class TopicWatch:
         self.shortfall = Shortfall()
         self._offered = set[str]()
         self._named_missing = frozenset[str]()
-        self._named_unknown = frozenset[str]()
         self._unheard_from_s: float | None = None
         self._began_s: float | None = None
         # Since when each topic is offered.
@@ -71,8 +70,6 @@ class TopicWatch:
         self._look_for_messages(now, sessions)
         if current is None:
             return
-        if current.age_s(now) >= TYPES_S:
-            self._name_unknown_types(current)
         if current.age_s(now) >= WAITING_S and sessions.handover is None:
             self._name_absent(current, sessions)
         before, after = self.shortfall, self._current_shortfall(now, current, sessions)
@@ -141,27 +138,6 @@ class TopicWatch:
         if others and (not session.subscribed or session.subscribed & OWN_TOPICS):
             return False
         return bool(splits.messages or splits.bytes_written)
-
-    def _name_unknown_types(self, current: RecordingSession) -> None:
-        """Names every topic that is not recorded, where some are of a type that is not known.
-
-        `ros2 bag record` names the first topic of each unknown type, and no other.
-        """
-        # The list may have changed since the child was started.
-        unknown = frozenset(filter(self._topics.selection.matches, current.of_unknown_type))
-        if unknown <= self._named_unknown:
-            return
-        self._named_unknown = unknown
-        others = sorted({*self._topics.selection.exact} - unknown - current.subscribed)
-        listed_too = f", nor these, if anybody offers them: {', '.join(others)}"
-        self._events.warn(
-            "topics_not_recorded",
-            f"not recorded: {', '.join(sorted(unknown))}; ros2 bag record does not know the "
-            "type: name the workspace that defines it in recorder.setup_files. It names one "
-            "topic of each type: of those that a glob selects, others of the same type are "
-            f"not recorded either{listed_too if others else ''}",
-            recording=current.name,
-        )
 
     def _name_absent(self, current: RecordingSession, sessions: RecordingSessions) -> None:
         """Names topics that no publisher offers: none did since the start, or none does any more.

@@ -27,9 +27,9 @@ from ros2_memory.retention.policy import (
     DirContents,
     RetentionLimits,
     StoredBag,
-    ages,
     by_hours,
     plan_deletions,
+    too_old,
 )
 from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
 
@@ -284,19 +284,16 @@ class GarbageCollector:
             places={path: order[name] for path, name in names.items() if name in order},
             unshipped=missing,
         )
-        old = ages(contents, limits)
+        old = too_old(contents, limits, limits.max_age_ns)
         # Asking starts a program, so only where it matters.
-        if old.by_dates != old.by_recording or self._recorded.asks_for_clock():
-            self._ask_clock(run)
-        synchronised = bool(run.synchronised)
-        run.result.held = len(old.held(synchronised=synchronised) - missing)
-        return replace(contents, synchronised=synchronised)
-
-    def _ask_clock(self, run: _Pass) -> None:
-        if run.synchronised is None:
+        asks = self._recorded.asks_for_clock() or self._cutter is not None
+        if run.synchronised is None and (old[True] != old[False] or asks):
             run.synchronised = self._is_synchronised()
             if run.synchronised:
                 self._recorded.confirm_clock()
+        synchronised = bool(run.synchronised)
+        run.result.held = 0 if synchronised else len(old[True] - old[False])
+        return replace(contents, synchronised=synchronised)
 
     def _cut_topics(
         self, contents: DirContents, limits: RetentionLimits, snapshot: Snapshot, run: _Pass
@@ -304,14 +301,9 @@ class GarbageCollector:
         """Cuts topics with a shorter life out of bags that stay."""
         if self._cutter is None:
             return
-        self._ask_clock(run)
-        contents = replace(
-            contents,
-            synchronised=bool(run.synchronised),
-            bags=[bag for bag in contents.bags if bag.path not in run.deleted],
-        )
+        left = [bag for bag in contents.bags if bag.path not in run.deleted]
         try:
-            run.result.cut = self._cutter.cut(contents, limits, snapshot)
+            run.result.cut = self._cutter.cut(replace(contents, bags=left), limits, snapshot)
         except OSError as error:
             _log.error("topics_not_cut", reason=error.strerror or str(error))
 

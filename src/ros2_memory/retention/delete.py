@@ -46,23 +46,6 @@ def beside(path: Path) -> Iterator[Path]:
             new.unlink(missing_ok=True)
 
 
-def left_by_repair(name: str) -> bool:
-    """Whether a file was left by a repair that was interrupted."""
-    left = _LEFTOVER.fullmatch(name)
-    return left is not None and bag_kind(left["bag"] or "") is not None
-
-
-def goes_with_bags(name: str) -> bool:
-    """Whether a file of a recording has no meaning without its bags.
-
-    Those are the recorder's sidecars, and what a crash left of files being written.
-    """
-    left = _LEFTOVER.fullmatch(name)
-    if left is not None:
-        return left["target"] in RECORDING_FILES or left_by_repair(name)
-    return name in RECORDING_FILES or is_journal(name)
-
-
 def is_journal(name: str) -> bool:
     """Whether a file is one that SQLite writes beside a bag."""
     return _JOURNAL.fullmatch(name) is not None
@@ -127,7 +110,16 @@ def beside_bags(recording: Path) -> int:
 
 
 def _is_sidecar(entry: os.DirEntry[str]) -> bool:
-    return goes_with_bags(entry.name) and entry.is_file(follow_symlinks=False)
+    """Whether an entry of a recording is a file that has no meaning without its bags.
+
+    Those are the recorder's sidecars, and what a crash left of files being written.
+    """
+    left = _LEFTOVER.fullmatch(entry.name)
+    if left is None:
+        goes = entry.name in RECORDING_FILES or is_journal(entry.name)
+    else:
+        goes = left["target"] in RECORDING_FILES or bag_kind(left["bag"] or "") is not None
+    return goes and entry.is_file(follow_symlinks=False)
 
 
 def size_of(path: Path) -> int:

@@ -24,11 +24,10 @@ import hashlib
 import json
 import os
 import time
-from bisect import bisect_left
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -42,6 +41,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, TimeWindow
+from ros2_memory.core.spans import Spans, overlaps_any, united
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 from ros2_memory.retention.delete import beside
 from ros2_memory.retention.disk import FailingFiles
@@ -135,14 +135,14 @@ def latched_message(record: Record, frames: Collection[str]) -> Latched:
 
 def worth_carrying(
     messages: Iterable[Latched],
-    recorded_in: Callable[[Ns, Ns], bool],
+    kept: Spans,
     repeated: Mapping[MessageIdentity, Ns],
 ) -> set[Latched]:
     """Returns those of the messages that are still needed when their bags are deleted.
 
     Args:
         messages: all that would be gone, including those carried before, in any order.
-        recorded_in: whether anything is kept that was recorded in `[start, stop)`.
+        kept: when what is kept was recorded.
         repeated: late messages in kept bags, and their earliest log time there.
     """
     # Of the copies of a message the earliest comes last, and remains.
@@ -162,7 +162,7 @@ def worth_carrying(
         # A static transform is valid before it was received, too.
         since = MIN_NS if frame else of_subject[0].log_time
         for message, following in pairwise(of_subject):
-            if message not in needed and recorded_in(since, following.log_time):
+            if message not in needed and overlaps_any(kept, since, following.log_time - 1):
                 needed.add(message)
             since = following.log_time
     return needed
@@ -236,7 +236,9 @@ class Carrier:
         for bag in with_messages:
             origins.update(self._latched_in(snapshot, bag, topics))
         wanted = worth_carrying(
-            origins, _recorded_in(kept), self._repeated(snapshot, topics, to_delete)
+            origins,
+            united((bag.start, bag.end + 1) for bag in kept),
+            self._repeated(snapshot, topics, to_delete),
         )
         chosen = {message.copy: _merged_origin(message, origins, remaining) for message in wanted}
         if chosen == {message.copy: origin for message, origin in carried.items()}:
@@ -419,15 +421,3 @@ def _merged_origin(
     ]
     first, *others = origin_of_wanted.recordings
     return origin_of_wanted._replace(recordings=(first, *sorted({*others, *copies} - {first})))
-
-
-def _recorded_in(bags: Sequence[BagFile]) -> Callable[[Ns, Ns], bool]:
-    """Returns a function: whether any of these bags, in order, was recorded in `[start, stop)`."""
-    starts = [bag.start for bag in bags]
-    reach = list(accumulate((bag.end for bag in bags), max))
-
-    def recorded_in(start: Ns, stop: Ns) -> bool:
-        begun = bisect_left(starts, stop)
-        return begun > 0 and reach[begun - 1] >= start
-
-    return recorded_in

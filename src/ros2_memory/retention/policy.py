@@ -168,20 +168,6 @@ class DirContents:
     unshipped: frozenset[str] = frozenset()
 
 
-class Ages(NamedTuple):
-    """The bags that are too old by their dates, and by the time that was recorded after them.
-
-    A bag with doubtful dates is too old by both, or by none.
-    """
-
-    by_dates: frozenset[str]
-    by_recording: frozenset[str]
-
-    def held(self, *, synchronised: bool) -> frozenset[str]:
-        """Returns the bags that would be deleted if the clock were known to be right."""
-        return frozenset() if synchronised else self.by_dates - self.by_recording
-
-
 class DeletionPlan(NamedTuple):
     """The deletions that the limits require.
 
@@ -200,16 +186,15 @@ class DeletionPlan(NamedTuple):
     newest: str = ""
 
 
-def ages(contents: DirContents, limits: RetentionLimits) -> Ages:
-    """Returns the bags that are too old by either clock."""
-    contents = _with_consistent_dates(contents, limits)
-    return _ages_in_periods(contents, _periods(contents, limits), limits.max_age_ns)
+def too_old(
+    contents: DirContents, limits: RetentionLimits, max_age_ns: Ns
+) -> dict[bool, frozenset[str]]:
+    """Returns the bags that age could delete if it were so much.
 
-
-def older_than(max_age_ns: Ns, contents: DirContents, limits: RetentionLimits) -> frozenset[str]:
-    """Returns the bags that age could delete if it were so much, by the clock that is right."""
+    By whether the clock is synchronised, or not.
+    """
     contents = _with_consistent_dates(contents, limits)
-    return _deleted_by_age(contents, _periods(contents, limits), max_age_ns)
+    return _too_old(contents, _periods(contents, limits), max_age_ns)
 
 
 def plan_deletions(contents: DirContents, limits: RetentionLimits) -> DeletionPlan:
@@ -236,7 +221,7 @@ def _plan_and_free_bytes(
     left = _Remaining(contents)
     total = left.total
     periods = _periods(contents, limits)
-    aged = _deleted_by_age(contents, periods, limits.max_age_ns)
+    aged = _too_old(contents, periods, limits.max_age_ns)[contents.synchronised]
     if not aged and left.fits(limits):
         return DeletionPlan((), total, fits=True), left.free
     order = _oldest_first(contents, limits, periods[-1] if periods else [])
@@ -391,20 +376,15 @@ def _credibly_dated(contents: DirContents, limits: RetentionLimits) -> list[Stor
     ]
 
 
-def _deleted_by_age(
+def _too_old(
     contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns
-) -> frozenset[str]:
-    old = _ages_in_periods(contents, periods, max_age_ns)
-    aged = old.by_dates if contents.synchronised else old.by_recording
-    return aged - contents.needed - contents.unshipped
-
-
-def _ages_in_periods(contents: DirContents, periods: Sequence[_Period], max_age_ns: Ns) -> Ages:
+) -> dict[bool, frozenset[str]]:
     old = {name for name, since in contents.recorded_since.items() if since > max_age_ns}
     by_recording = frozenset(bag.path for bag in contents.bags if bag.recording in old)
     doubtful = {bag.path for bag in contents.bags if bag.recording in contents.doubtful}
-    by_dates = _too_old_by_dates(contents, periods, max_age_ns) - doubtful | by_recording & doubtful
-    return Ages(frozenset(by_dates), by_recording)
+    by_dates = frozenset(_too_old_by_dates(contents, periods, max_age_ns)) - doubtful
+    stays = contents.needed | contents.unshipped
+    return {True: (by_dates | by_recording & doubtful) - stays, False: by_recording - stays}
 
 
 def _too_old_by_dates(

@@ -11,7 +11,6 @@ queue until it is answered. What a moment needs and whether it fits are decided 
 from __future__ import annotations
 
 import os
-import re
 from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
-    MOMENT_FILE,
     MOMENTS_FOLDER,
     is_carried,
     is_thinned,
@@ -42,7 +40,7 @@ from ros2_memory.bag_dir.moment_file import (
 from ros2_memory.core import directories
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import overlaps_any
+from ros2_memory.core.spans import overlaps_any, united, without
 from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Clock, Ns, iso_local
 from ros2_memory.retention.delete import size_of
 from ros2_memory.retention.policy import GB
@@ -63,7 +61,6 @@ SHORTEST_HOLE_NS: Final[Ns] = 2 * NS_PER_S
 """A shorter time without a bag is not worth a sentence."""
 
 _SHARE: Final = "retention.max_moments_gb"
-_OWN_FOLDER: Final = re.compile(r"\d{8}T\d{6}Z-[a-z0-9-]+(_\d+)?")
 
 _log = get_logger(__name__)
 
@@ -71,43 +68,27 @@ _log = get_logger(__name__)
 class NeededBags(NamedTuple):
     """The bags of a moment that can be kept now, in order of time; `waits`: more may come."""
 
+    window: TimeWindow
     bags: tuple[BagFile, ...]
     waits: bool
 
 
-def window_of(request: SaveRequest) -> TimeWindow:
-    """Returns the window of a moment, both ends included."""
-    return TimeWindow(request.start, min(request.end + 1, MAX_NS))
-
-
-def needed_bags(
-    window: TimeWindow,
-    asked: Ns,
-    bags: Iterable[BagFile],
-    open_files: Iterable[TimeWindow | None],
-    now: Ns,
-) -> NeededBags:
-    """Chooses the bags that a moment needs.
-
-    Args:
-        window: when the moment was.
-        asked: when it was asked for.
-        bags: those that answer queries.
-        open_files: when what is still being written may have been recorded; None if unknown.
-        now: the present time.
-    """
+def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
+    """Chooses the bags that a moment needs, whose window includes both of its ends."""
+    window = TimeWindow(moment.start, min(moment.end + 1, MAX_NS))
+    open_files = (snapshot.unread_spans[aside] for aside in snapshot.active)
     waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
     ready = []
-    for bag in bags:
+    for bag in snapshot.timeline.overlapping(window):
         is_derived = is_carried(bag.file) or is_thinned(bag.file)
         if not bag.reaches_into(window) or is_derived:
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
-        if unfinished and now - asked < REPAIRED_WITHIN_NS:
+        if unfinished and now - moment.asked < REPAIRED_WITHIN_NS:
             waits = True
         else:
             ready.append(bag)
-    return NeededBags(tuple(ready), waits and abs(now - asked) < LONGEST_WAIT_NS)
+    return NeededBags(window, tuple(ready), waits and abs(now - moment.asked) < LONGEST_WAIT_NS)
 
 
 @dataclass(slots=True)
@@ -157,14 +138,12 @@ class Share:
 
 def unrecorded(window: TimeWindow, bags: Iterable[BagFile]) -> tuple[str, ...]:
     """Returns a sentence on each part of a window that no bag reaches into."""
-    sentences = []
-    reached = window.start
-    for start, end in (*sorted((bag.start, bag.end) for bag in bags), (window.stop, window.stop)):
-        if start - reached > SHORTEST_HOLE_NS:
-            hole = f"{iso_local(reached)} to {iso_local(start)}"
-            sentences.append(f"nothing is recorded from {hole}")
-        reached = max(reached, end)
-    return tuple(sentences)
+    recorded = united((bag.start, bag.end) for bag in bags)
+    return tuple(
+        f"nothing is recorded from {iso_local(start)} to {iso_local(stop)}"
+        for start, stop in without([(window.start, window.stop)], recorded)
+        if stop - start > SHORTEST_HOLE_NS
+    )
 
 
 class MomentKeeper:
@@ -280,14 +259,14 @@ class MomentKeeper:
 
     def _read_moments(self) -> dict[str, StoredMoment]:
         """Returns the moments by the names of their folders."""
-        self._remove_unbegun()
         return {moment.folder.name: moment for moment in stored_moments_in(self._bag_dir)}
 
     def _begin_moment(
         self, begun: SavedMoment, stored: dict[str, StoredMoment], snapshot: Snapshot
     ) -> StoredMoment | str:
         """Begins a moment and adds it to `stored`, or returns why it is refused."""
-        need, window = self._bags_needed_by(begun.request, snapshot), window_of(begun.request)
+        need = needed_bags(begun.request, snapshot, self._clock.now())
+        window = need.window
         group = self._group(begun, stored)
         if len(group) >= MAX_MOMENTS // (1 + len(self._rule_bytes)):
             return (
@@ -332,7 +311,7 @@ class MomentKeeper:
 
         Where the disk refuses a link, as when it is full, the moment waits and it is tried again.
         """
-        need = self._bags_needed_by(before.moment.request, snapshot)
+        need = needed_bags(before.moment.request, snapshot, self._clock.now())
         share = self._share_of(before.moment, self._group(before.moment, stored))
         try:
             after = _with_links(before, need, *self._link_bags(before.folder, need.bags, share))
@@ -371,12 +350,6 @@ class MomentKeeper:
         if rule is not None:
             return Share(self._rule_bytes[rule], f"max_gb of the rule {rule}", stored)
         return Share(max(self._share - sum(self._rule_bytes.values()), 0), _SHARE, stored)
-
-    def _bags_needed_by(self, moment: SaveRequest, snapshot: Snapshot) -> NeededBags:
-        window = window_of(moment)
-        open_files = [snapshot.unread_spans[aside] for aside in snapshot.active]
-        bags = snapshot.timeline.overlapping(window)
-        return needed_bags(window, moment.asked, bags, open_files, self._clock.now())
 
     def _link_bags(
         self, folder: Path, bags: Sequence[BagFile], share: Share
@@ -419,15 +392,6 @@ class MomentKeeper:
             flush(parent)
         return missing, linked
 
-    def _remove_unbegun(self) -> None:
-        """Removes files of a moment that a crash interrupted before it started."""
-        with suppress(OSError):
-            for folder in (self._bag_dir / MOMENTS_FOLDER).iterdir():
-                if _OWN_FOLDER.fullmatch(folder.name) and not (folder / MOMENT_FILE).exists():
-                    (folder / f".{MOMENT_FILE}.tmp").unlink(missing_ok=True)
-                    with suppress(OSError):
-                        folder.rmdir()
-
 
 def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
     """Whether what was recorded in one window may lie in the other; yes if unknown."""
@@ -467,7 +431,7 @@ def _with_links(
     moment, holes = before.moment, tuple[str, ...]()
     # Of a rule's moment for which no bag is to come: what was never recorded of it.
     if moment.rule is not None and not need.waits:
-        holes = unrecorded(window_of(moment.request), need.bags)
+        holes = unrecorded(need.window, need.bags)
     missing = dict.fromkeys((*moment.missing, *missing, *holes))
     after = replace(moment, pending=need.waits, missing=tuple(missing))
     return StoredMoment(before.folder, after, {**before.files, **linked})

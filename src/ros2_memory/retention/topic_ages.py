@@ -27,7 +27,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
-from ros2_memory.retention.policy import DirContents, RetentionLimits, older_than
+from ros2_memory.retention.policy import DirContents, RetentionLimits, too_old
 from ros2_memory.retention.repair import left_in, rewritten
 
 if TYPE_CHECKING:
@@ -84,9 +84,10 @@ def plan_cuts(
             for topic in match_topics(timeline.topics(), topic_age.topics)
             if topic not in static_topics and not timeline.is_transient_state(topic)
         ]
-        old = older_than(topic_age.max_age_ns, contents, limits) if topics else ()
-        for path in alone.intersection(old):
-            going[path].update(topics)
+        if topics:
+            old = too_old(contents, limits, topic_age.max_age_ns)[contents.synchronised]
+            for path in alone & old:
+                going[path].update(topics)
     return [
         TopicCut(bag, frozenset(going[bag.file]))
         for bag in snapshot.bags

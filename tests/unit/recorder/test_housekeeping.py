@@ -441,7 +441,7 @@ def test_a_recorder_that_was_killed_is_noted_when_it_starts_again(
     keeper = keeper_of(tmp_path, clock=later(0))
     with pytest.MonkeyPatch.context() as full:
         full.setattr("ros2_memory.bag_dir.json_files.append_durably", failing(errno.ENOSPC))
-        keeper.repair()
+        keeper.prepare()
     keeper.apply()
     keeper.wait()
     assert [(loss.by, loss.start) for loss in read_losses(tmp_path, 0, MAX_NS)] == found
@@ -454,7 +454,7 @@ def test_recordings_without_a_last_word_are_repaired(tmp_path: Path) -> None:
     (tmp_path / OWN / "metadata.yaml").touch()  # as on a disk that was full
     readable = McapReader().summarize(open_one).topics
     with structlog.testing.capture_logs() as captured:
-        keeper_of(tmp_path, clock=later(0)).repair()
+        keeper_of(tmp_path).apply()
     after = McapReader().summarize(open_one)
     assert (after.complete, after.topics) == (True, readable)
     assert not empty.exists()
@@ -472,7 +472,7 @@ def test_a_recording_of_nothing_but_empty_splits_goes(tmp_path: Path) -> None:
     (tmp_path / OWN / f"{OWN}_0.mcap").write_bytes(b"")
     (tmp_path / OWN / "metadata.yaml").touch()
     (tmp_path / OWN / "handover.json").write_text("{}")
-    keeper_of(tmp_path).repair()
+    keeper_of(tmp_path).apply()
     assert files_in(tmp_path) == []
 
 
@@ -480,7 +480,6 @@ def test_a_recording_of_another_is_left_alone_until_it_lay_still(tmp_path: Path)
     theirs = left_open(tmp_path / "theirs" / "theirs_0.mcap")
     clock = later(0)
     keeper = keeper_of(tmp_path, clock=clock)
-    keeper.repair()
     keeper.apply()
     assert not McapReader().summarize(theirs).complete
     clock.at += HOUR

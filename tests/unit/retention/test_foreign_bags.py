@@ -224,7 +224,7 @@ class TestRepair:
         for name in (A, B):
             (tmp_path / name).mkdir()
             (tmp_path / name / f"{name}_0.mcap").touch()
-        keeper_of(tmp_path, keeps_foreign=True).repair()
+        keeper_of(tmp_path, keeps_foreign=True).prepare()
         assert not (tmp_path / A).exists()
         assert (tmp_path / B / f"{B}_0.mcap").exists()
 
@@ -238,7 +238,6 @@ class TestRepair:
         before = cut.read_bytes()
         house = keeper_of(tmp_path, keeps_foreign=True)
         for _ in range(2):
-            house.repair()
             house.apply()
             assert cut.read_bytes() == before
             assert empty.exists()
@@ -247,7 +246,7 @@ class TestRepair:
             own.begin(A)
             own.complete(A)
         own_all(tmp_path)
-        house.repair()
+        house.apply()
         assert cut.read_bytes() != before
         assert not empty.exists()
 

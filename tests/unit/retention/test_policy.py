@@ -123,13 +123,6 @@ class TestAge:
 
 
 class TestBudget:
-    def test_the_oldest_are_deleted_and_no_more_than_needed(self) -> None:
-        for size, count in ((75, 3), (100, 0)):
-            deleted = expired(contents(*hourly(10)), budget(size))
-            assert names(deleted) == ["h9", "h8", "h7"][:count]
-        deleted = expired(contents(*hourly(10), other_bytes=15), budget(100))
-        assert names(deleted) == ["h9", "h8"]
-
     def test_the_newest_by_its_data_stays_though_another_was_written_later(self) -> None:
         copied = bag("copied", NOW - 5 * DAY, written=NOW + HOUR)
         deleted = expired(contents(bag("new", NOW), copied), budget(0))

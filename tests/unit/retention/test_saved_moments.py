@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.layout import MOMENT_FILE, REQUESTS_FOLDER
 from ros2_memory.bag_dir.moment_file import (
-    SaveRequest,
-    make_moment_folder,
     stored_moments_in,
 )
 from ros2_memory.retention import saved_moments
@@ -292,17 +290,6 @@ class TestCrashes:
         assert (reported["pending"], reported["missing"]) == (False, [])
         assert outcome.bags == len(in_moments(tmp_path)) >= 2
         assert len(list(stored_moments_in(tmp_path))) == 1
-
-    def test_a_folder_that_is_no_moment_yet_is_removed_and_nothing_else(
-        self, tmp_path: Path
-    ) -> None:
-        request = SaveRequest("0" * 32, "here", T0, T0, NOW)
-        begun = make_moment_folder(tmp_path, request)
-        (begun / f".{MOMENT_FILE}.tmp").write_text("{")
-        mine = tmp_path / "moments/mine"
-        mine.mkdir()
-        house_of(tmp_path).keep_moments()
-        assert (begun.exists(), mine.exists()) == (False, True)
 
     def test_a_moment_that_cannot_be_written_holds_up_no_other(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

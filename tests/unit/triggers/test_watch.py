@@ -199,13 +199,13 @@ def test_a_recorder_that_was_killed(tmp_path: Path) -> None:
     robot.beat(robot.names[-1])
     robot.clock.at = T0 + 30 * S
     robot.house = robot.new_house()
-    robot.house.repair()
+    robot.house.prepare()
     robot.look()
     assert robot.spans() == [(4, 33)]
     # One that was stopped ended as it should.
     robot.beat(state=RecorderState.STOPPED)
     robot.house = robot.new_house()
-    robot.house.repair()
+    robot.house.prepare()
     robot.look()
     assert robot.record("restart").fired == 1
 

@@ -30,7 +30,6 @@ CACHE: Final = "--max-cache-size"
 STATISTICS: Final = "--stats_max_publishing_rate"
 MESSAGES_LOST: Final = "/events/rosbag2_messages_lost"
 """Where a distribution with `STATISTICS` publishes what its recorders lose; it is recorded, too."""
-MIN_FREE: Final = "--min-free-space"
 
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9_-]*")
 _STORAGES = re.compile(r"-s \{([^}]*)\}|--storage \{([^}]*)\}")
@@ -46,7 +45,6 @@ def record_argv(
     storage_file: Path,
     node_name: str,
     cache_bytes: int,
-    min_free_bytes: int = 0,
     use_sim_time: bool = False,
     repeat_latched: Sequence[str] = (),
     known_options: Collection[str] = (),
@@ -63,8 +61,6 @@ def record_argv(
         node_name: the name of the recorder's node, if the distribution can set it.
         cache_bytes: size of each of the two buffers in which messages wait for the disk. rosbag2's
             own 100 MiB are more than a machine may spare beside two recorders' queues.
-        min_free_bytes: where the recorder ends by itself, if the distribution can do that; 0 for
-            nowhere.
         use_sim_time: whether log times come from `/clock`, before which nothing is recorded.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that.
@@ -79,7 +75,6 @@ def record_argv(
     argv += ["--include-hidden-topics"] * topics.hidden + ["--use-sim-time"] * use_sim_time
     optional: dict[str, Sequence[str | int] | None] = {
         CACHE: [cache_bytes],
-        MIN_FREE: [min_free_bytes] if min_free_bytes else None,
         # At most one message a second; without a rate they may be switched off.
         STATISTICS: [1],
         KEYBOARD: [],

@@ -35,7 +35,6 @@ def argv_for(
         storage_file=Path("/bags/s.yaml"),
         node_name="ros2_memory_rec_1",
         cache_bytes=64 * 2**20,
-        min_free_bytes=10**9,
         use_sim_time=use_sim_time,
         repeat_latched=repeat_latched,
         known_options=known,
@@ -63,17 +62,13 @@ def test_the_argv_is_this_to_the_letter() -> None:
 
 
 def test_what_a_distribution_knows_is_added_to_the_letter() -> None:
-    known = frozenset(
-        (*OPTIONAL, "--repeat-transient-local", "--max-cache-size", "--min-free-space")
-    )
+    known = frozenset((*OPTIONAL, "--repeat-transient-local", "--max-cache-size"))
     added = argv_for(known, use_sim_time=True, repeat_latched=("/tf_static=32", "/map"))
     assert added[: len(argv_for())] == argv_for()
     assert added[len(argv_for()) :] == [
         "--use-sim-time",
         "--max-cache-size",
         "67108864",
-        "--min-free-space",
-        "1000000000",
         "--disable-keyboard-controls",
         "--node-name",
         "ros2_memory_rec_1",
