@@ -22,7 +22,7 @@ from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
+from ros2_memory.history.duplicates import BagSpan, StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
@@ -525,10 +525,10 @@ def _lacks_most(
     for start, stop in pairwise(edges):
         stored = next(_merged_messages(view, topic, first, TimeWindow(start, stop)), None)
         if stored is not None:
-            near, key = TimeWindow.around(stored.time, COPY_HORIZON_NS), copy_key(stored.record)
+            near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
             copies = _merged_messages(view, topic, other, near)
             tried += 1
-            lacking += all(copy_key(copy.record) != key for copy in copies)
+            lacking += all(copy.identity != stored.identity for copy in copies)
     return 2 * lacking > tried
 
 

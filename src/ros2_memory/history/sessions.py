@@ -304,7 +304,8 @@ class Sessions:
         bags = self.bags_of(session, (topic,), window)
         if newest is not None and newest.bag in {span.bag for span in bags}:
             return newest
-        return self._view.stream.newest_among(bags, topic, window)
+        merged = self._view.stream.merged(bags, [topic], window, newest_first=True)
+        return next(self._view.bags.track_sources(merged), None)
 
     def moving(self, session: Session, window: TimeWindow) -> list[StampedTransform]:
         """Returns the moving transforms that a session received in a window, in log-time order."""
