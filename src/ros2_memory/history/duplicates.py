@@ -36,11 +36,3 @@ class StoredMessage(NamedTuple):
     def identity(self) -> tuple[Ns, int]:
         """What its copies share, of messages of its topic: publish time and CRC-32 of payload."""
         return self.record.publish_time, crc32(self.record.payload)
-
-
-class BagSpan(NamedTuple):
-    """A bag and the log times of its first and last message of some topics, both inclusive."""
-
-    first: Ns
-    last: Ns
-    bag: BagFile

@@ -29,13 +29,14 @@ from ros2_memory.core.spans import (
     without,
 )
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
-from ros2_memory.history.duplicates import BagSpan, StoredMessage
+from ros2_memory.index.segment import TopicExtent
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.history.bag_access import BagAccess
+    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.index.segment import Segment
 
 _COMPARED_NS: Final[Ns] = 10 * NS_PER_S
@@ -53,16 +54,16 @@ class MergedStream:
         self._first_copies: dict[tuple[str, Ns, int], tuple[Ns, Path]] = {}
         self._searched: dict[str, Spans] = {}
 
-    def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
+    def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[TopicExtent]:
         """Returns the bags that hold messages of these topics in the window, in order.
 
         Each with the times of its first and last message of those that reach into the window.
         """
-        spans: dict[str, BagSpan] = {}
+        spans: dict[str, TopicExtent] = {}
         for topic in topics:
             for bag, first, last in self._timeline.extents(topic, window):
-                known = spans.get(bag.file, BagSpan(first, last, bag))
-                spans[bag.file] = BagSpan(min(first, known.first), max(last, known.last), bag)
+                known = spans.get(bag.file, TopicExtent(bag, first, last))
+                spans[bag.file] = TopicExtent(bag, min(first, known.first), max(last, known.last))
         return sorted(spans.values(), key=_span_order)
 
     def messages(
@@ -203,7 +204,7 @@ class MergedStream:
 
     def merged(
         self,
-        bags: Sequence[BagSpan],
+        bags: Sequence[TopicExtent],
         topics: Sequence[str],
         window: TimeWindow,
         *,
@@ -252,9 +253,9 @@ def _start_of(segment: Segment) -> Ns:
     return segment.bags[0].start
 
 
-def _span_order(span: BagSpan) -> tuple[Ns, Ns, str]:
+def _span_order(span: TopicExtent) -> tuple[Ns, Ns, str]:
     return span.first, span.last, span.bag.file
 
 
-def _recording_order(span: BagSpan) -> tuple[str, Ns, Ns, str]:
+def _recording_order(span: TopicExtent) -> tuple[str, Ns, Ns, str]:
     return str(span.bag.recording), *_span_order(span)
