@@ -20,7 +20,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Call, Memory, Note, Notes, short_name
-from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.stored_message import StoredMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

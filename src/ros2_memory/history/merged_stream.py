@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.history.bag_access import BagAccess
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.segment import Segment
 
 _COMPARED_NS: Final[Ns] = 10 * NS_PER_S

@@ -39,7 +39,7 @@ from ros2_memory.index.recordings import is_named_after_folder
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"

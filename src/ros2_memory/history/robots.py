@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
