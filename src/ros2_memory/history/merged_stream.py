@@ -173,6 +173,13 @@ class MergedStream:
         are_copies = copies_among(Identities(*columns.T))
         return Counter(row for (_, row), is_copy in zip(rows, are_copies, strict=True) if is_copy)
 
+    def find_first_copy(self, stored: StoredMessage) -> None:
+        """Notes what cannot be read where a message may have been received before."""
+        topic, window = stored.topic, _since_published(stored)
+        if stored.record.may_be_repeated and self.may_be_repeated([topic]):
+            copies = self.merged(self.overlapping_bags([topic], window), [topic], window)
+            next((copy for copy in copies if copy.identity == stored.identity), None)
+
     def _is_repeated(self, stored: StoredMessage) -> bool:
         record = stored.record
         if not record.may_be_repeated:
@@ -211,7 +218,7 @@ class MergedStream:
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Yields all messages in order, duplicates too; opens a bag when the stream reaches it.
+        """Yields all messages in order, copies too; opens a bag when the stream reaches it.
 
         What cannot be read is noted, unless all of it lies before `since`.
         """
