@@ -547,20 +547,17 @@ def decode(view: View, stored: StoredMessage) -> object:
 
 def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
-    channel = stored.record.channel
     has = f"carries no {what}"
-    if view.extractor.geodetic(view.bags.decode(stored), channel.type) is not None:
+    if view.extractor.geodetic(view.bags.decode(stored), stored.type) is not None:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
-    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(channel.type):
+    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(stored.type):
         return (
-            f"topic: {channel.topic} is a {channel.type}, which {has}, and no topic recorded does; "
+            f"topic: {stored.topic} is a {stored.type}, which {has}, and no topic recorded does; "
             "trajectory_summary returns speeds from its poses"
         )
-    return (
-        f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
-    )
+    return f"topic: {stored.topic} is a {stored.type}, which {has}; give a topic that does, {hint}"
 
 
 def _active_answers(view: View) -> bool:

@@ -322,24 +322,23 @@ class Sessions:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        view, caches = self._view, self._view.memory.scanner.caches
-        if session not in self._static:
-            key = (session, view.static_topics)
-            timeline, static = caches.statics.get(key) or (None, ())
-            if timeline is view.timeline:
-                self._static[session] = static
-        if session not in self._static:
+        view, cache = self._view, self._view.memory.scanner.caches.statics
+        if session in self._static:
+            return self._static[session]
+        key = (session, view.static_topics)
+        timeline, static = cache.get(key) or (None, ())
+        if timeline is not view.timeline:
             before = view.notes.added
             static = _without_repeats(
                 transform
                 for topic in view.static_topics
                 for transform in self._static_received(topic, session)
             )
-            self._static[session] = static
             # What was noted must be noted in each answer.
             if view.notes.added == before and not view.call.used_active:
-                caches.statics.put(key, (view.timeline, static), 1000 + 600 * len(static))
-        return self._static[session]
+                cache.put(key, (view.timeline, static), 1000 + 600 * len(static))
+        self._static[session] = static
+        return static
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
         """Yields the static transforms of the parts in a window, of bags that are stored."""
