@@ -114,7 +114,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
     from ros2_memory.extract import Extracted
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.clock_faults import ClockFault
     from ros2_memory.index.snapshot import Snapshot
 
@@ -731,7 +731,7 @@ def _newest_at(
 def _holds_until_next(view: View, stored: StoredMessage) -> bool:
     """Whether a pose of a thinned day holds until the next: farther apart none was recorded."""
     window = TimeWindow(stored.time + 1, stored.time + _THINNED_POSES_NS)
-    return view.stream.first([stored.record.channel.topic], window) is not None
+    return view.stream.first([stored.topic], window) is not None
 
 
 def _window_before(
@@ -798,10 +798,9 @@ def _as_value(
 ) -> results.TopicValue:
     """Returns a message as a reply shows it, with all notes of the view so far."""
     message, shown = _decode_shown(view, stored, fields)
-    channel = stored.record.channel
     return results.TopicValue(
-        channel.topic,
-        channel.type,
+        stored.topic,
+        stored.type,
         Sample(stored.time, shown.value),
         _age(stored, now),
         frame_id=view.extractor.frame(message),

@@ -18,8 +18,8 @@ from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.context import Call
 from ros2_memory.history.coverage import note_unread
-from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.no_data import resolve_topic
+from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.messages.levels import with_level_names
 from ros2_memory.tools.reply_size import to_json_text

@@ -23,8 +23,8 @@ from ros2_memory.core.text import counted, match_topics
 from ros2_memory.core.timebase import MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.coverage import lost_in, note_unread, unix_text
-from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter

@@ -28,8 +28,8 @@ from ros2_memory.core.spans import Spans, lies_inside, overlaps_any, united, wit
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.duplicates import StoredMessage
 from ros2_memory.history.no_data import require_bags
+from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
 from ros2_memory.storage.base import BagReader, Batch, Record
 

@@ -20,7 +20,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Deadline, Ns
 from ros2_memory.history.context import Call, Memory, Note, Notes, short_name
-from ros2_memory.history.duplicates import StoredMessage
+from ros2_memory.history.stored_message import StoredMessage
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -168,7 +168,7 @@ class BagAccess:
         """Yields one bag's messages in log-time order; a note reports what cannot be read.
 
         There is no note where all that is lost lies before `since`: that part is read to recognise
-        duplicates only.
+        copies only.
         """
         self.check_deadline()
         part, reader = _indexed_part(bag, window), self.memory.reader
@@ -214,7 +214,7 @@ class BagAccess:
         """Yields one bag's messages of a topic in a window as tables; a note reports what is lost.
 
         With `around` all messages of the bag are yielded, and notes are still on the window alone:
-        what lies around it is read to recognise duplicates only, or not, if these are known.
+        what lies around it is read to recognise copies only, or not, if these are known.
         With `hashed` they have the hashes of all payloads, else those of latched channels alone.
         Without `columns` they have times, and rows for messages that cannot be decoded, too.
 

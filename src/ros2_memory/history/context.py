@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.regions import Place
     from ros2_memory.extract import SchemaExtractor
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.storage.base import BagReader
@@ -338,43 +338,41 @@ class Latching:
 
     def may_hold(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether some message of a topic may be latched."""
-        configured = self._configured(topic)
-        return snapshot.timeline.is_transient_state(topic) if configured is None else configured
+        return self._whatever_pace(snapshot, topic) is not False
 
     def holds(self, snapshot: Snapshot, stored: StoredMessage) -> bool:
         """Whether a message is latched, by the pace of its topic in its own recording."""
-        channel = stored.record.channel
-        configured = self._configured(channel.topic)
-        if configured is not None or not snapshot.timeline.is_transient_state(channel.topic):
-            return bool(configured)
+        settled = self._whatever_pace(snapshot, stored.topic)
+        if settled is not None:
+            return settled
         if is_carried(stored.bag.file):
-            origin = origin_of(channel)
+            origin = origin_of(stored.record.channel)
             return origin is None or not origin.often
-        return snapshot.timeline.pace(channel.topic, stored.bag.recording).is_rare
+        return snapshot.timeline.pace(stored.topic, stored.bag.recording).is_rare
 
     def is_latched(self, snapshot: Snapshot, topic: str) -> bool:
         """Whether a topic is latched, by its pace in the newest recording that holds it.
 
         Carried messages count as a recording only where there is no other.
         """
-        configured = self._configured(topic)
-        if configured is not None or not snapshot.timeline.is_transient_state(topic):
-            return bool(configured)
+        settled = self._whatever_pace(snapshot, topic)
+        if settled is not None:
+            return settled
         last = {path: last for path, (_, last) in snapshot.timeline.recordings(topic).items()}
         newest = max(
             last, key=lambda path: (path.name != CARRY_FOLDER, last[path], str(path)), default=None
         )
         return newest is not None and snapshot.timeline.pace(topic, newest).is_rare
 
-    def _configured(self, topic: str) -> bool | None:
-        """Returns what the configuration has of a topic; None where it has nothing."""
+    def _whatever_pace(self, snapshot: Snapshot, topic: str) -> bool | None:
+        """Returns whether a topic is latched; None where that depends on its pace."""
         if any(match_topics((topic,), glob) for glob in self.exclude):
             return False
         if topic in self.static_topics or any(
             match_topics((topic,), glob) for glob in self.include
         ):
             return True
-        return None
+        return None if snapshot.timeline.is_transient_state(topic) else False
 
 
 NoteKey: TypeAlias = "tuple[Reason, str]"

@@ -54,8 +54,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.history.duplicates import StoredMessage
     from ros2_memory.history.sessions import Session
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
 
 T = TypeVar("T", bound="Sized")

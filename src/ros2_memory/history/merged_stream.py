@@ -1,40 +1,48 @@
 """Many bags as one stream: in log-time order, each message once.
 
-Messages of one log time are in the order of their recordings' names, then of their bags.
+Messages of one log time are in the order of their recordings' names, then of their bags. Which
+ones count where recordings overlap, `columns.units` says.
 
-Recordings overlap (see `duplicates`), and a new recording receives latched messages again: with a
-new log time and the original publish time. Such a repeated message counts once too, at its
-earliest log time, however long ago that is.
+A new recording receives latched messages again: with a new log time and the original publish time.
+Such a message counts once too, at its earliest log time, however long ago that is.
 """
 
 from __future__ import annotations
 
 import heapq
 from bisect import bisect_left, bisect_right
-from collections import deque
+from collections import Counter, deque
 from functools import partial
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, TypeAlias
 
+import numpy as np
+
+from ros2_memory.columns.units import Identities, copies_among
 from ros2_memory.core.model import BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united, without
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.duplicates import (
-    BagSpan,
-    Copy,
-    StoredMessage,
-    bag_overlaps,
-    copy_key,
-    deduplicate_backward,
-    deduplicate_forward,
+from ros2_memory.core.spans import (
+    COPY_HORIZON_NS,
+    Spans,
+    lies_inside,
+    overlap_spans,
+    united,
+    without,
 )
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.index.segment import TopicExtent
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from ros2_memory.history.bag_access import BagAccess
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.segment import Segment
+
+_COMPARED_NS: Final[Ns] = 10 * NS_PER_S
+"""For so much of overlapping recordings it is looked up at once which messages count."""
+_Row: TypeAlias = tuple[str, Ns, Ns, int]
+"""Of a message of a topic: its file, log time, publish time, and the hash of its payload."""
 
 
 class MergedStream:
@@ -43,19 +51,19 @@ class MergedStream:
     def __init__(self, bags: BagAccess) -> None:
         self.bags = bags
         self._timeline = bags.snapshot.timeline
-        self._first_copies: dict[Copy, tuple[Ns, Path]] = {}
+        self._first_copies: dict[tuple[str, Ns, int], tuple[Ns, Path]] = {}
         self._searched: dict[str, Spans] = {}
 
-    def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[BagSpan]:
+    def overlapping_bags(self, topics: Collection[str], window: TimeWindow) -> list[TopicExtent]:
         """Returns the bags that hold messages of these topics in the window, in order.
 
         Each with the times of its first and last message of those that reach into the window.
         """
-        spans: dict[str, BagSpan] = {}
+        spans: dict[str, TopicExtent] = {}
         for topic in topics:
             for bag, first, last in self._timeline.extents(topic, window):
-                known = spans.get(bag.file, BagSpan(first, last, bag))
-                spans[bag.file] = BagSpan(min(first, known.first), max(last, known.last), bag)
+                known = spans.get(bag.file, TopicExtent(bag, first, last))
+                spans[bag.file] = TopicExtent(bag, min(first, known.first), max(last, known.last))
         return sorted(spans.values(), key=_span_order)
 
     def messages(
@@ -94,12 +102,6 @@ class MergedStream:
         """Returns the newest message of the topic before a log time."""
         return self.newest(topic, TimeWindow(MIN_NS, before))
 
-    def newest_among(
-        self, bags: Sequence[BagSpan], topic: str, window: TimeWindow
-    ) -> StoredMessage | None:
-        """Returns the newest message that some bags alone have of the topic in the window."""
-        return next(self._messages_in([topic], window, bags, newest_first=True), None)
-
     def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
         """Returns the window cut where segments begin, to hold few bags at a time."""
         segments = self._timeline.segments
@@ -114,23 +116,14 @@ class MergedStream:
         return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
 
     def _messages_in(
-        self,
-        topics: Sequence[str],
-        window: TimeWindow,
-        among: Sequence[BagSpan] | None = None,
-        *,
-        newest_first: bool,
+        self, topics: Sequence[str], window: TimeWindow, *, newest_first: bool
     ) -> Iterator[StoredMessage]:
-        wider = _with_horizon(window)
-        bags = self.overlapping_bags(topics, wider) if among is None else among
-        spans = bag_overlaps(bags)
-        messages: Iterator[StoredMessage]
-        if spans:
-            merged = self.merged(bags, topics, wider, newest_first=newest_first, since=window.start)
-            once = (deduplicate_backward if newest_first else deduplicate_forward)(merged, spans)
-            messages = (message for message in once if window.contains(message.time))
-        else:
-            messages = self.merged(bags, topics, window, newest_first=newest_first)
+        near = self.overlapping_bags(topics, window.widened(COPY_HORIZON_NS))
+        bags = [span for span in near if window.overlaps(span.first, span.last)]
+        messages = self.merged(bags, topics, window, newest_first=newest_first)
+        shared = overlap_spans((span.first, span.last, span.bag.recording) for span in near)
+        if shared:
+            messages = self._without_copies(messages, window, shared)
         if self.may_be_repeated(topics):
             messages = (message for message in messages if not self._is_repeated(message))
         if all(span.bag.state is BagState.CLOSED for span in bags):
@@ -144,14 +137,48 @@ class MergedStream:
             for topic in topics
         )
 
+    def _without_copies(
+        self, messages: Iterable[StoredMessage], window: TimeWindow, shared: Spans
+    ) -> Iterator[StoredMessage]:
+        """Yields messages of a window, in any order of time, without the copies among them.
+
+        It is looked at some seconds of a topic at once, where recordings share them.
+        """
+        asked: dict[str, tuple[Ns, Counter[_Row]]] = {}
+        for stored in messages:
+            if lies_inside(shared, stored.time):
+                topic, begin = stored.topic, stored.time - stored.time % _COMPARED_NS
+                if topic not in asked or asked[topic][0] != begin:
+                    part = TimeWindow(begin, begin + _COMPARED_NS).intersect(window)
+                    asked[topic] = begin, self._copies(topic, part)
+                _, copies = asked[topic]
+                row = stored.bag.file, stored.time, *stored.identity
+                if copies[row]:
+                    copies[row] -= 1
+                    continue
+            yield stored
+
+    def _copies(self, topic: str, part: TimeWindow) -> Counter[_Row]:
+        """Returns how many messages of a part of a topic are copies, by what tells them apart."""
+        around = TimeWindow(max(part.start - COPY_HORIZON_NS, MIN_NS), part.stop)
+        bags = self.overlapping_bags([topic], around)
+        recordings = sorted({str(span.bag.recording) for span in bags})
+        number_of = {recording: number for number, recording in enumerate(recordings)}
+        merged = self.merged(bags, [topic], around, since=part.start)
+        rows = [
+            (number_of[str(stored.bag.recording)], (stored.bag.file, stored.time, *stored.identity))
+            for stored in merged
+        ]
+        columns = np.array([(*row[1:], number) for number, row in rows], np.int64).reshape(-1, 4)
+        are_copies = copies_among(Identities(*columns.T))
+        return Counter(row for (_, row), is_copy in zip(rows, are_copies, strict=True) if is_copy)
+
     def find_first_copy(self, stored: StoredMessage) -> None:
         """Notes what cannot be read where a message may have been received before."""
         topic, window = stored.topic, _since_published(stored)
         if stored.record.may_be_repeated and self.may_be_repeated([topic]):
-            bags = self.overlapping_bags([topic], window)
-            copies = self.merged(bags, [topic], window)
-            key = copy_key(stored.record)
-            next((copy for copy in copies if copy_key(copy.record) == key), None)
+            copies = self.merged(self.overlapping_bags([topic], window), [topic], window)
+            next((copy for copy in copies if copy.identity == stored.identity), None)
 
     def _is_repeated(self, stored: StoredMessage) -> bool:
         record = stored.record
@@ -159,7 +186,7 @@ class MergedStream:
             return False
         self._find_first_copies(stored)
         own = stored.time, stored.bag.recording
-        first_time, first_recording = self._first_copies.get(copy_key(record), own)
+        first_time, first_recording = self._first_copies.get((stored.topic, *stored.identity), own)
         return stored.time > first_time and stored.bag.recording != first_recording
 
     def _find_first_copies(self, late: StoredMessage) -> None:
@@ -178,20 +205,20 @@ class MergedStream:
             part = TimeWindow(start, stop)
             bags = self.overlapping_bags([topic], part)
             for message in self.merged(bags, [topic], part, since=window.start):
-                key, first = copy_key(message.record), (message.time, message.bag.recording)
+                key, first = (topic, *message.identity), (message.time, message.bag.recording)
                 self._first_copies[key] = min(first, self._first_copies.get(key, first))
         self._searched[topic] = united([*searched, *missing])
 
     def merged(
         self,
-        bags: Sequence[BagSpan],
+        bags: Sequence[TopicExtent],
         topics: Sequence[str],
         window: TimeWindow,
         *,
         newest_first: bool = False,
         since: Ns = MIN_NS,
     ) -> Iterator[StoredMessage]:
-        """Yields all messages in order, duplicates too; opens a bag when the stream reaches it.
+        """Yields all messages in order, copies too; opens a bag when the stream reaches it.
 
         What cannot be read is noted, unless all of it lies before `since`.
         """
@@ -224,12 +251,8 @@ class MergedStream:
 
 def _since_published(stored: StoredMessage) -> TimeWindow:
     """Returns the window in which a late message may have been received before."""
-    return _with_horizon(TimeWindow(stored.record.publish_time, stored.time + 1))
-
-
-def _with_horizon(window: TimeWindow) -> TimeWindow:
-    """Returns the window and what before it can be the original of a duplicate in it."""
-    return TimeWindow(max(window.start - COPY_HORIZON_NS, MIN_NS), window.stop)
+    since = max(stored.record.publish_time - COPY_HORIZON_NS, MIN_NS)
+    return TimeWindow(since, stored.time + 1)
 
 
 def _start_of(segment: Segment) -> Ns:
@@ -237,9 +260,9 @@ def _start_of(segment: Segment) -> Ns:
     return segment.bags[0].start
 
 
-def _span_order(span: BagSpan) -> tuple[Ns, Ns, str]:
+def _span_order(span: TopicExtent) -> tuple[Ns, Ns, str]:
     return span.first, span.last, span.bag.file
 
 
-def _recording_order(span: BagSpan) -> tuple[str, Ns, Ns, str]:
+def _recording_order(span: TopicExtent) -> tuple[str, Ns, Ns, str]:
     return str(span.bag.recording), *_span_order(span)

@@ -39,7 +39,7 @@ from ros2_memory.index.recordings import is_named_after_folder
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator
 
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
 
 GIVE_TOPIC: Final = "give topic where the tool takes it"
@@ -320,8 +320,7 @@ def no_data_at(
         *elsewhere,
         *_distances(at, older, newer, tolerance),
         *why,
-        *_advice(view, reason),
-        *_to_come(view, at),
+        *_advice(view, reason, at),
     ]
     is_near = older and tolerance is not None and at - older.time <= max(_NEAR_NS, 2 * tolerance)
     if older and is_near and not _to_come(view, at):
@@ -388,7 +387,7 @@ def no_data_between(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     reason = between(view, window) if is_between else beyond(view, newest)
     if _have_expired(view, topics, window) or _is_thinned(view, window):
         reason = NoDataReason.DELETED
-    detail += [*_advice(view, reason), *_to_come(view, start)]
+    detail += _advice(view, reason, start)
     return with_notes(view, window, NoDataError(reason, "; ".join(detail)))
 
 
@@ -421,7 +420,7 @@ def require_recorded(view: View, asked: TimeWindow) -> None:
         reason = between(view, asked)
     else:
         reason = beyond(view, start)
-    detail += [*_advice(view, reason), *_to_come(view, start)]
+    detail += _advice(view, reason, start)
     raise with_notes(view, asked, NoDataError(reason, "; ".join(detail)))
 
 
@@ -548,20 +547,17 @@ def decode(view: View, stored: StoredMessage) -> object:
 
 def describe_lack(view: View, what: str, stored: StoredMessage) -> str:
     """Returns the sentence on a topic whose type does not carry the `what` that was asked for."""
-    channel = stored.record.channel
     has = f"carries no {what}"
-    if view.extractor.geodetic(view.bags.decode(stored), channel.type) is not None:
+    if view.extractor.geodetic(view.bags.decode(stored), stored.type) is not None:
         has = f"carries latitude and longitude in degrees, and no {what} in metres"
     topics = topics_with(view, what)
     hint = f"such as {listed(topics)}" if topics else "such as one of type nav_msgs/msg/Odometry"
-    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(channel.type):
+    if not topics and what == "velocity" and "position" in view.extractor.kinds_of(stored.type):
         return (
-            f"topic: {channel.topic} is a {channel.type}, which {has}, and no topic recorded does; "
+            f"topic: {stored.topic} is a {stored.type}, which {has}, and no topic recorded does; "
             "trajectory_summary returns speeds from its poses"
         )
-    return (
-        f"topic: {channel.topic} is a {channel.type}, which {has}; give a topic that does, {hint}"
-    )
+    return f"topic: {stored.topic} is a {stored.type}, which {has}; give a topic that does, {hint}"
 
 
 def _active_answers(view: View) -> bool:
@@ -569,17 +565,16 @@ def _active_answers(view: View) -> bool:
     return all(aside.answers for aside in view.snapshot.active)
 
 
-def _advice(view: View, reason: NoDataReason) -> list[str]:
-    snapshot = view.snapshot
-    earliest, latest = snapshot.earliest, snapshot.latest
-    advice = []
+def _advice(view: View, reason: NoDataReason, at: Ns) -> Iterator[str]:
+    """Yields what may help who asked about a moment and later."""
+    earliest, latest = view.snapshot.earliest, view.snapshot.latest
     if earliest is not None and latest is not None:
-        advice.append(f"the memory covers {unix_text(earliest)} to {unix_text(latest)}")
-    if reason is NoDataReason.NOT_CLOSED_YET:
-        advice.append(
-            f"ask about an earlier moment, or again in {ON_DISK_S} s"
-            if _active_answers(view)
-            else "the split being written is not read until it closes: ask about an earlier "
-            f"moment, or again in {view.limits.closed_after_s:g} s"
+        yield f"the memory covers {unix_text(earliest)} to {unix_text(latest)}"
+    if reason is NoDataReason.NOT_CLOSED_YET and _active_answers(view):
+        yield f"ask about an earlier moment, or again in {ON_DISK_S} s"
+    elif reason is NoDataReason.NOT_CLOSED_YET:
+        yield (
+            "the split being written is not read until it closes: ask about an earlier moment, "
+            f"or again in {view.limits.closed_after_s:g} s"
         )
-    return advice
+    yield from _to_come(view, at)

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.storage.base import IntArray, Schema
 
 _ELSEWHERE: Final = "for a place in another frame, such as the map, ask visits, or give where"

@@ -22,7 +22,6 @@ from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, united
 from ros2_memory.core.text import counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Ns, iso_local
 from ros2_memory.history.coverage import unix_text
-from ros2_memory.history.duplicates import BagSpan, StoredMessage, copy_key
 from ros2_memory.history.view import View
 from ros2_memory.index.clock_faults import FaultyClock
 from ros2_memory.index.recordings import (
@@ -30,12 +29,14 @@ from ros2_memory.index.recordings import (
     overlapping_recordings,
     recordings_of,
 )
+from ros2_memory.index.segment import TopicExtent
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.stored_message import StoredMessage
 
 _NEAR_NS: Final[Ns] = 10 * NS_PER_S
 """How far around one message others count as recorded at the same time."""
@@ -201,15 +202,14 @@ def _differing_topic(
     view: View, pair: Overlapping, recordings: Mapping[str, Sequence[BagFile]]
 ) -> str | None:
     both = TimeWindow(pair.start, pair.end + 1)
-    first_bags, other_bags = (
+    bags = [
         [bag for bag in recordings.get(str(path), ()) if bag.reaches_into(both)]
         for path in (pair.first, pair.second)
-    )
-    shared = _topics_of(first_bags) & _topics_of(other_bags) - view.timeline.transient_local
+    ]
+    shared = set.intersection(*map(_topics_of, bags)) - view.timeline.transient_local
     of_robot = [topic for topic in (view.pose_topic, *view.limits.tf_topics) if topic in shared]
     for topic in islice([*of_robot, *sorted(shared.difference(of_robot))], _MAX_COMPARED):
-        spans = _bag_spans(first_bags, topic), _bag_spans(other_bags, topic)
-        if _bags_differ(view, topic, spans, both):
+        if _bags_differ(view, topic, [_bag_spans(some, topic) for some in bags], both):
             return topic
     return None
 
@@ -218,9 +218,9 @@ def _topics_of(bags: Sequence[BagFile]) -> set[str]:
     return {topic for bag in bags for topic in bag.summary.schema.positions}
 
 
-def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[BagSpan]:
+def _bag_spans(bags: Sequence[BagFile], topic: str) -> list[TopicExtent]:
     holding = (bag for bag in bags if topic in bag.summary.schema.positions)
-    return [BagSpan(*bag.summary.span_of((topic,)), bag) for bag in holding]
+    return [TopicExtent(bag, *bag.summary.span_of((topic,))) for bag in holding]
 
 
 def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
@@ -485,27 +485,22 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
-    if view.sessions.are_joined(*pair) or not all(_has_bags(view, path, both) for path in pair):
-        return False
-    wide, noted = both.widened(COPY_HORIZON_NS), view.notes.added
-    bags = view.stream.overlapping_bags([topic], wide)
-    first_spans, other = ([span for span in bags if span.bag.recording == path] for path in pair)
-    differ = _bags_differ(view, topic, (first_spans, other), both)
+    noted = view.notes.added
+    near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
+    bags = [[span for span in near if span.bag.recording == path] for path in pair]
+    # One that a wrong clock dated spans years, mostly without a bag.
+    are_two = all(bags) and not view.sessions.are_joined(*pair)
+    differ = are_two and _bags_differ(view, topic, bags, both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
         differing[key] = differ
     return differ
 
 
-def _has_bags(view: View, recording: Path, window: TimeWindow) -> bool:
-    """Whether a recording may have bags in a window: one that a wrong clock dated spans years."""
-    folder = str(recording)
-    segments = view.timeline.segments_in(window)
-    spans = (segment.folder_spans[folder] for segment in segments if folder in segment.folders)
-    return any(window.overlaps(*span) for span in spans)
-
-
 def _bags_differ(
-    view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
+    view: View,
+    topic: str,
+    bags: Sequence[Sequence[TopicExtent]],
+    both: TimeWindow,
 ) -> bool:
     """Whether two lists of bags hold messages in a window, and each lacks most of the other's.
 
@@ -515,7 +510,10 @@ def _bags_differ(
 
 
 def _lacks_most(
-    view: View, topic: str, bags: tuple[Sequence[BagSpan], Sequence[BagSpan]], both: TimeWindow
+    view: View,
+    topic: str,
+    bags: Sequence[Sequence[TopicExtent]],
+    both: TimeWindow,
 ) -> bool:
     """Whether the second lacks most of some messages that the first has all over a window."""
     first, other = bags
@@ -525,15 +523,15 @@ def _lacks_most(
     for start, stop in pairwise(edges):
         stored = next(_merged_messages(view, topic, first, TimeWindow(start, stop)), None)
         if stored is not None:
-            near, key = TimeWindow.around(stored.time, COPY_HORIZON_NS), copy_key(stored.record)
+            near = TimeWindow.around(stored.time, COPY_HORIZON_NS)
             copies = _merged_messages(view, topic, other, near)
             tried += 1
-            lacking += all(copy_key(copy.record) != key for copy in copies)
+            lacking += all(copy.identity != stored.identity for copy in copies)
     return 2 * lacking > tried
 
 
 def _merged_messages(
-    view: View, topic: str, bags: Sequence[BagSpan], window: TimeWindow
+    view: View, topic: str, bags: Sequence[TopicExtent], window: TimeWindow
 ) -> Iterator[StoredMessage]:
     inside = [span for span in bags if window.overlaps(span.first, span.last)]
     return view.stream.merged(inside, [topic], window)

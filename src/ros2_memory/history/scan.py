@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import Counter
 from functools import partial
-from itertools import groupby
 from typing import TYPE_CHECKING, NamedTuple, TypedDict, TypeVar, Unpack
 
 import numpy as np
@@ -30,7 +29,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.table import Table
     from ros2_memory.columns.values import Mask
     from ros2_memory.columns.zones import PartZones
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import IntArray
 
@@ -285,6 +284,11 @@ def messages_at(view: View, rows: Rows) -> Iterator[tuple[int, StoredMessage]]:
                 met[stored.time] += 1
 
 
+def _within(rows: Rows, window: TimeWindow) -> Rows:
+    times = rows.times
+    return rows.some(np.flatnonzero((times >= window.start) & (times < window.stop)))
+
+
 class Counted(NamedTuple):
     """How many messages each piece holds, and the log times of its first and last one."""
 
@@ -379,13 +383,12 @@ def pick(
         for piece in np.unique(pieces).tolist():
             part = window.intersect(TimeWindow(bounds[piece], bounds[piece + 1]))
             nth = chosen[pieces == piece] - (ends[piece] - counts[piece])
-            scanned = [rows.times for rows in opened.rows(among=part)]
-            times = np.sort(np.concatenate([np.empty(0, np.int64), *scanned]))
-            times = times[(times >= part.start) & (times < part.stop)]
-            there = nth[nth < times.size].tolist()  # fewer, where a bag was deleted since
-            for time, equal in groupby(there, key=lambda position: int(times[position])):
-                numbers = {position - int(np.searchsorted(times, time)) for position in equal}
-                at_once = view.stream.messages([topic], TimeWindow(time, time + 1))
-                yield from (stored for number, stored in enumerate(at_once) if number in numbers)
+            tables = [_within(rows, part) for rows in _in_order([*opened.rows(among=part)])]
+            begins = np.cumsum([0, *map(len, tables)])
+            times = np.concatenate([np.empty(0, np.int64), *(rows.times for rows in tables)])
+            order = np.argsort(times, kind="stable")
+            for place in order[nth[nth < times.size]].tolist():  # a bag may be deleted since
+                table = int(np.searchsorted(begins, place, side="right")) - 1
+                yield from messages_of(view, tables[table].some(place - begins[table : table + 1]))
 
     return int(ends[-1]), read()

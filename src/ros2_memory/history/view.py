@@ -32,7 +32,7 @@ from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
-from ros2_memory.history.scan import open_scan, scan
+from ros2_memory.history.scan import blocks, open_scan, scan
 from ros2_memory.history.sessions import Sessions
 from ros2_memory.index.segment import TopicTotals
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.storage.base import IntArray
 
 
@@ -162,13 +162,12 @@ class View:
 
     def _last_of(self, topic: str, type_name: str) -> Ns:
         """Returns the log time of the newest message of a type that counts."""
-        newest = MIN_NS
-        for rows in scan(self, topic, TimeWindow.everything(), newest_first=True, columns=False):
-            if rows.last < newest:
-                break
-            if rows.table.channel.type == type_name:
-                newest = max(newest, rows.span[1])
-        return newest
+        rows = scan(self, topic, TimeWindow.everything(), newest_first=True, columns=False)
+        for together in blocks(rows, newest_first=True):
+            lasts = [some.span[1] for some in together if some.table.channel.type == type_name]
+            if lasts:
+                return max(lasts)
+        return MIN_NS
 
 
 @dataclass(frozen=True, slots=True)

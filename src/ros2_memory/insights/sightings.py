@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.analysis.clock_steps import Elapsed
     from ros2_memory.history.context import Call, Memory
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
 
 _SightingOrEpisode = TypeVar("_SightingOrEpisode", Sighting, Episode)
 _MOST_TRIED: Final = 5

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.scan import Stretch
     from ros2_memory.core.model import BagFile, TimeWindow
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
 

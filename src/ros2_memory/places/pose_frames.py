@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.analysis.motion.trajectory import Waypoint
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
     from ros2_memory.storage.base import Mask
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from mcap.writer import Writer as McapFile
 
-    from ros2_memory.history.duplicates import StoredMessage
+    from ros2_memory.history.stored_message import StoredMessage
     from tests.support.program import Program
 
 T0 = 1_700_000_000 * NS_PER_S

@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 import random
-from collections import Counter
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import COPY_HORIZON_NS
-from ros2_memory.core.timebase import MAX_NS, MIN_NS
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.duplicates import StoredMessage, deduplicate_backward, deduplicate_forward
-from ros2_memory.history.scan import pick
+from ros2_memory.history.scan import pick, scan
 from ros2_memory.history.view import TimeRange, View
 from ros2_memory.index import timeline
 from ros2_memory.insights.recap import recap
 from ros2_memory.messages.to_json import evenly
-from ros2_memory.storage.base import Channel, Record, Schema
+from ros2_memory.storage.base import Record
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, Msg, boolean, log_entry, odom, write_mcap
 from tests.support.examples import examples
@@ -140,51 +136,47 @@ def test_every_message_counts_exactly_once_however_recordings_overlap(
     assert [each.time for each in chosen] == [expected[i] for i in evenly(total, 8)]
 
 
-CHANNEL = Channel("/bumper", "cdr", Schema("std_msgs/msg/Bool"))
-EVERYWHERE = [(MIN_NS, MAX_NS)]
-
-
-def found(recording: str, time: int, said: bytes = b"x") -> StoredMessage:
-    bag = BagFile(f"/{recording}/0.mcap", 1, 1, BagState.CLOSED, BagSummary(()), 0, 0)
-    return StoredMessage(bag, Record(CHANNEL, time, 0, said))
-
-
 @st.composite
-def histories(draw: st.DrawFn) -> list[StoredMessage]:
-    """Rows of a few messages that are alike, in two recordings or three, some rows close by.
-
-    Those without a pause are shorter than the horizon.
-    """
-    messages = []
-    start = 0
+def histories(draw: st.DrawFn) -> dict[str, list[Msg]]:
+    """Rows of a few messages that are alike, in two recordings or three, some rows close by."""
+    recordings: dict[str, list[Msg]] = {}
+    start = T0
     for _ in range(draw(st.integers(1, 4))):
         start += draw(st.sampled_from([MS, 3 * S, 20 * S]))
+        published = draw(st.sampled_from([start, T0]))
         for _ in range(draw(st.integers(1, 6))):
             at = start + draw(st.integers(0, 3)) * draw(st.sampled_from([1, 150 * MS]))
-            said = draw(st.sampled_from([b"x", b"y"]))
-            messages.append(found(draw(st.sampled_from("aabbc")), at, said))
-        start = max(each.time for each in messages)
-    return sorted(messages, key=lambda each: each.time)
+            said = boolean(at, data=draw(st.booleans()))
+            recording = recordings.setdefault(draw(st.sampled_from("aabbc")), [])
+            recording.append(replace(said, publish_time=published))
+        start = max(each.log_time for messages in recordings.values() for each in messages)
+    return {
+        name: sorted(messages, key=lambda each: each.log_time)
+        for name, messages in recordings.items()
+    }
 
 
-@given(histories())
-@example([found("a", 0), found("b", 1), found("b", 2)])
-@example([found("a", 0), found("b", 1), found("a", 2)])
-def test_the_same_copies_are_kept_newest_first(messages: list[StoredMessage]) -> None:
-    forwards = list(deduplicate_forward(messages, EVERYWHERE))
-    backwards = list(deduplicate_backward(reversed(messages), EVERYWHERE))
-    assert backwards[::-1] == forwards
+def alike(*log_times: int) -> list[Msg]:
+    return [replace(boolean(T0 + at, data=True), publish_time=T0) for at in log_times]
 
 
-@given(histories(), st.integers(0, 30 * S), st.integers(0, 30 * S))
-def test_what_lies_outside_of_the_overlap_is_kept_both_ways(
-    messages: list[StoredMessage], one: int, other: int
+@settings(max_examples=examples(40))
+@given(histories(), st.sampled_from([0.0, 0.5, 1.0]))
+@example({"a": alike(0), "b": alike(1, 2)}, 0.0)
+@example({"a": alike(0, 2), "b": alike(1)}, 1.0)
+@example({"a": alike(0), "b": alike(0, 0)}, 0.0)
+def test_the_same_copies_are_left_out_newest_first_and_of_columns(
+    recordings: dict[str, list[Msg]], part: float
 ) -> None:
-    spans = [(min(one, other), max(one, other))]
-    forwards = list(deduplicate_forward(messages, spans))
-    assert list(deduplicate_backward(reversed(messages), spans))[::-1] == forwards
-    outside = [each for each in messages if not spans[0][0] <= each.time < spans[0][1]]
-    assert not Counter(map(id, outside)) - Counter(map(id, forwards))
+    with TemporaryDirectory() as folder:
+        bag_dir = Path(folder)
+        for name, messages in recordings.items():
+            recorded(bag_dir, name, messages)
+        view = View(with_store(memory_of(bag_dir), bag_dir, part=part), Call())
+        counting = [rows.times for rows in scan(view, "/bumper", TimeWindow.everything())]
+        expected = np.sort(np.concatenate(counting)).tolist()
+        assert times(view, "/bumper") == expected
+        assert times(view, "/bumper", newest_first=True) == expected[::-1]
 
 
 @each_way
@@ -197,21 +189,6 @@ def test_messages_without_a_publish_time_are_no_copies(tmp_path: Path, recalls: 
     memory = memory_of(tmp_path, recalls=recalls)
     [bumper] = asked(memory, tmp_path, "list_recorded_topics")
     assert bumper["count"] == 40
-
-
-def test_no_more_is_held_of_messages_that_are_all_alike_than_of_some_seconds() -> None:
-    taken = 0
-
-    def endless() -> Iterator[StoredMessage]:
-        nonlocal taken
-        for number in range(10_000):
-            taken += 1
-            yield found("ab"[number % 2], (10_000 - number) * 100 * MS)
-
-    kept = deduplicate_backward(endless(), EVERYWHERE)
-    next(kept)
-    assert taken * 100 * MS < 4 * COPY_HORIZON_NS
-    assert 4_900 < 1 + sum(1 for _ in kept) < 5_600
 
 
 TOPIC = "/rosout"
