@@ -35,18 +35,10 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import Source, found_in, sources_in
-from ros2_memory.columns.shown import (
-    ByType,
-    Listing,
-    Narrowed,
-    Node,
-    Shape,
-    Spot,
-    is_object,
-    leaves_below,
-    placed,
-)
+from ros2_memory.columns.detections import found_in
+from ros2_memory.columns.limits import placed
+from ros2_memory.columns.shown import UNKNOWN, ByType, Listing, Node, Shape, leaves_of
+from ros2_memory.columns.sources import Source, sources_in
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError, Values
 from ros2_memory.columns.walk import entries_of_codes
 
@@ -132,7 +124,7 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
     flags = [*_flag_leaves(value, "")] if has_events(type_name) else []
     if len(flags) > MOST[FLAG]:
         raise UnknownShapeError("more booleans than are tracked")
-    sources = [*sources_in(value)] if has_events(type_name) else []
+    sources = sources_in(value) if has_events(type_name) else []
     return partial(_states, sources, flags, numbers)
 
 
@@ -141,12 +133,12 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
 
 def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
     """Yields the booleans of objects; none of lists."""
-    if isinstance(node, Narrowed):
-        raise UnknownShapeError("an element of a list stands alone")
+    if node is UNKNOWN or (isinstance(node, Leaf) and node.limits):
+        raise UnknownShapeError("it depends on the message")
     if isinstance(node, Leaf) and node.kind is Kind.BOOLEAN:
         yield path, node
-    elif is_object(node):
-        for name, inner in node.fields.items():
+    elif isinstance(node, dict):
+        for name, inner in node.items():
             yield from _flag_leaves(inner, f"{path}.{name}" if path else name)
 
 
@@ -165,13 +157,13 @@ def _entry_leaves(value: Node, type_name: str) -> _Entry:
 
 
 def _child(node: Node | None, name: str) -> Node | None:
-    return node.fields.get(name) if is_object(node) else None
+    return node.get(name) if isinstance(node, dict) else None
 
 
 def _command_leaves(value: Node) -> Iterator[Leaf]:
     """Yields the floats of a command."""
-    for _, leaf, limits in leaves_below(Spot(value)):
-        if limits or leaf.level != ROWS:
+    for leaf in leaves_of(value):
+        if leaf.limits or leaf.level != ROWS:
             raise UnknownShapeError("a command has a list")
         if leaf.kind is Kind.REAL:
             yield leaf
@@ -182,7 +174,7 @@ def _goal_leaves(value: Node) -> Iterator[Leaf]:
     listed = _child(value, "status_list")
     if not isinstance(listed, Listing):
         raise UnknownShapeError("the definition is not the standard one")
-    for _, leaf, _ in leaves_below(Spot(listed.element)):
+    for leaf in leaves_of(listed.element):
         if leaf.level == listed.level and leaf.conversion in {
             Conversion.STORED,
             Conversion.SECONDS,
