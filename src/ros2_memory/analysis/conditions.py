@@ -225,8 +225,9 @@ class NearPosition:
 
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Returns whether a position (m) is near; its z may be NaN where none is asked."""
-        here: Vector3 = (x, y, 0.0 if self.z is None else z)
-        return math.dist(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
+        off_x, off_y, off_z = x - self.x, y - self.y, 0.0 if self.z is None else z - self.z
+        # Not `math.dist`: numpy computes the same of columns.
+        return math.sqrt(off_x * off_x + off_y * off_y + off_z * off_z) <= self.tolerance_m
 
 
 Test: TypeAlias = Contains | Equals | Beyond | NearPosition

@@ -509,13 +509,12 @@ def unit_quaternions(rotations: Floats) -> Floats:
     Those that are of unit length within 1e-12 are left as they are.
     """
     with np.errstate(all="ignore"):
-        off = ~(np.abs(row_sums(rotations * rotations) - 1) < 1e-12)
-        if not off.any():
+        is_unit = np.abs(row_sums(rotations * rotations) - 1) < 1e-12
+        if is_unit.all():
             return rotations
-        scaled = rotations[off] / row_maxima(np.abs(rotations[off]))[:, None]
-        units = rotations.copy()
-        units[off] = scaled / np.sqrt(row_sums(scaled * scaled))[:, None]
-    return units
+        scaled = rotations / row_maxima(np.abs(rotations))[:, None]
+        scaled /= np.sqrt(row_sums(scaled * scaled))[:, None]
+        return np.where(is_unit[:, None], rotations, scaled)
 
 
 def _identity(times: Times, *, valid: bool = True) -> FramePoses:

@@ -31,7 +31,7 @@ class FieldNumbers(NamedTuple):
             computed of exact quaternions may differ by their last digits.
         errors: the most by which each of them is off, where that differs.
         exactly: returns the exact numbers at some positions, ascending; None where only the bag
-            has them.
+            has them, and of several numbers of a message.
     """
 
     rows: Ints
@@ -110,26 +110,8 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
             for part in parts
         ]
     )
-    ends = np.cumsum([part.rows.size for part in parts])
-
-    def exactly(positions: Ints) -> Floats:
-        exact = joined[order[positions]].astype(np.float64)
-        for part, end in zip(parts, ends.tolist(), strict=True):
-            places = order[positions] - (end - part.rows.size)
-            of_part = np.flatnonzero((places >= 0) & (places < part.rows.size))
-            if part.exactly is not None and of_part.size:
-                exact[of_part] = part.exactly(places[of_part])
-        return exact
-
-    is_settled = all(part.exactly is not None or part.error == 0 for part in parts)
     error = max(part.error for part in parts)
-    return FieldNumbers(
-        rows[order],
-        joined[order],
-        error,
-        errors[order] if error else None,
-        exactly if is_settled else None,
-    )
+    return FieldNumbers(rows[order], joined[order], error, errors[order] if error else None)
 
 
 def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node | None:
@@ -162,14 +144,10 @@ def _numbers_of(values: Values, leaf: Leaf) -> FieldNumbers:
         is_whole = column.dtype.kind in "iu"
         column = column.astype(np.int64 if is_whole else np.float64, copy=False)
 
-    def exactly_at(positions: Ints) -> Floats:
-        assert exactly is not None  # noqa: S101 - else nobody has this function
-        return exactly(kept[positions])
-
     return FieldNumbers(
         rows,
         column,
         float(np.max(error, initial=0.0)),
         error[kept] if isinstance(error, np.ndarray) else None,
-        exactly and exactly_at,
+        None if exactly is None else lambda positions: exactly(kept[positions]),
     )

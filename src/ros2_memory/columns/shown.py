@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-MAX_PARTS: Final = 20_000
+_MAX_PARTS: Final = 5_000
 """Of one value: nested definitions of some lines can spell out more than memory holds."""
 
 _FILLER: Final = "structure_needs_at_least_one_member"
@@ -113,12 +113,11 @@ class Shape:
 
     Attributes:
         type: as the channel names it.
-        definition: its fields.
     """
 
     def __init__(self, definition: Definition, type_name: str, extractor: SchemaExtractor) -> None:
         self.type = type_name
-        self.definition = definition
+        self._definition = definition
         self._fields = extractor.fields_of(type_name)
         self._limit = extractor.limit
         self._parts = 0
@@ -160,7 +159,7 @@ class Shape:
 
     @cached_property
     def _whole(self) -> Node:
-        return self._shown(Place(ROWS, "", self.definition, None, 0))
+        return self._shown(Place(ROWS, "", self._definition, None, 0))
 
     def at(self, path: Sequence[str]) -> Node | None:
         """Returns what is at a path in the message, as the value shows it; None where nothing is.
@@ -174,7 +173,7 @@ class Shape:
         """Returns a part of the message as the value shows it."""
         level, path, kind, length, depth = place
         self._parts += 1
-        if self._parts > MAX_PARTS:
+        if self._parts > _MAX_PARTS:
             return UNKNOWN
         if length is None and isinstance(kind, str):
             return Leaf(level, (path,), _kind(kind))
@@ -238,13 +237,8 @@ def _summary(type_name: str, fields: dict[str, Node], place: Place) -> Node:
     """
     kind = type_name.rpartition("/")[2]
     if kind == "MagneticField":
-        node = fields[place.path.rpartition(".")[2]]
-        is_vector = isinstance(node, dict) and [*node] == [*"xyz"]
-        return (
-            node
-            if is_vector and all(isinstance(axis, Leaf) for axis in leaves_of(node))
-            else UNKNOWN
-        )
+        field = fields[place.path.rpartition(".")[2]]
+        return field if isinstance(field, dict) and [*field] == [*"xyz"] else UNKNOWN
     if not isinstance(place.kind, str) or place.length != SEQUENCE:
         return UNKNOWN
     encoding, info = fields.get("format"), fields.get("info")
@@ -273,7 +267,7 @@ def _converted(name: str, node: Node) -> Node:
     return _angles_of(leaves[0].level, [*others, first]) if is_numeric else NOTHING
 
 
-@lru_cache(maxsize=1024)
+@lru_cache(maxsize=128)
 def _shape(definition: Definition, type_name: str, extractor: SchemaExtractor) -> Shape:
     return Shape(definition, type_name, extractor)
 
@@ -296,20 +290,19 @@ class ByType(Generic[T]):
     def __init__(self, extractor: SchemaExtractor, make: Callable[[Shape], T]) -> None:
         self._extractor = extractor
         self._make = make
-        self._known: dict[tuple[Definition, str], T | None] = {}
+        self._known: dict[Shape, T | None] = {}
 
     def of(self, table_or_parts: Table | PartZones) -> T | None:
         """Returns that of a table's type, or of some parts'; None where the messages decide."""
         shape = shape_of(table_or_parts, self._extractor)
         if shape is None:
             return None
-        key = (shape.definition, shape.type)
-        if key not in self._known:
+        if shape not in self._known:
             try:
-                self._known[key] = self._make(shape)
+                self._known[shape] = self._make(shape)
             except UnknownShapeError:
-                self._known[key] = None
-        return self._known[key]
+                self._known[shape] = None
+        return self._known[shape]
 
 
 def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | None:

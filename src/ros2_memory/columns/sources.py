@@ -132,7 +132,10 @@ class Labels(NamedTuple):
         named = self.scored.read(values)
         if not self.is_best:
             return np.arange(len(named.name)), named
-        order, begins = _ranked(named.score, values.elements(self.scored.level).owners)
+        owners = values.elements(self.scored.level).owners
+        # Without a score last; of those of one score the first.
+        order = np.lexsort((-np.where(np.isnan(named.score), -np.inf, named.score), owners))
+        begins = np.diff(owners[order], prepend=-1) != 0
         best = order[begins]
         if named.error:
             follows = np.flatnonzero(begins[:-1] & ~begins[1:])
@@ -318,13 +321,3 @@ def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
         return any(looks_like_json(word) for leaf in texts for word in values.texts(leaf).words)
     except UnknownShapeError:
         return True
-
-
-def _ranked(score: Floats, owners: Ints) -> tuple[Ints, Mask]:
-    """Returns the order of hypotheses by detection, the best first, and which begin one there.
-
-    Of those of one score the first comes first; without a score, last.
-    """
-    rank = np.where(np.isnan(score), -np.inf, score)
-    order = np.lexsort((-rank, owners))
-    return order, np.diff(owners[order], prepend=-1) != 0

@@ -437,23 +437,17 @@ class _PlaceTest(NamedTuple):
     def _near(self, columns: Sequence[LeafNumbers]) -> TruthValues:
         tolerance = self.test.tolerance_m
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
-        axes += [np.full(len(axes[0]), np.nan)] * (len(self._center) - len(axes))
+        error = sum(column.error for column in columns)
         with np.errstate(all="ignore"):
             squared = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
             apart = np.sqrt(np.add.reduce(squared))
-            # Their sum, which is no less than the root of their squares: of 1e-200 that is 0.
-            error = sum(column.error for column in columns)
-            margin = error + tolerance * _ROUNDING
-            has_infinite = np.logical_or.reduce([np.isinf(axis) for axis in axes])
-            is_doubtful = (np.abs(apart - tolerance) <= margin) | (apart < _TINY_M)
-            is_doubtful |= np.isinf(apart) | has_infinite
             is_near = apart <= tolerance
-        if np.any(error):
-            return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
-        for nth in np.flatnonzero(is_doubtful).tolist():
-            x, y, z = (*(float(axis[nth]) for axis in axes), math.nan)[:3]
-            is_near[nth] = self.test.is_near(x, y, z)
-        return TruthValues.known(is_near)
+            if not np.any(error):
+                return TruthValues.known(is_near)
+            # Their sum, which is no less than the root of their squares: of 1e-200 that is 0.
+            is_doubtful = np.abs(apart - tolerance) <= error + tolerance * _ROUNDING
+            is_doubtful |= apart < _TINY_M
+        return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
 
 
 def _place_tests(test: NearPosition, target: Node) -> Iterator[_PlaceTest]:
@@ -465,8 +459,6 @@ def _place_tests(test: NearPosition, target: Node) -> Iterator[_PlaceTest]:
     for point in points(target, is_axis):
         axes = [point.get(axis) for axis in "xyz"]
         leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.is_number]
-        # A missing z is NaN, which is near only what is infinitely far away.
-        if all(axis in leaves for axis in axes[:2]) and (
-            test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
-        ):
+        # A missing z is NaN, which is near nothing.
+        if all(axis in leaves for axis in axes[:2]) and (test.z is None or len(leaves) == 3):
             yield _PlaceTest(test, leaves)
