@@ -16,7 +16,7 @@ import struct
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, starmap
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias, TypeVar
 
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import abbreviate
@@ -24,9 +24,11 @@ from ros2_memory.messages.conversions import Summary
 from ros2_memory.messages.detections import detections_of, looks_like_json, without_low_scores
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
+
+T = TypeVar("T")
 
 Scalar: TypeAlias = bool | int | float | str
 
@@ -223,8 +225,9 @@ class NearPosition:
 
     def is_near(self, x: float, y: float, z: float) -> bool:
         """Returns whether a position (m) is near; its z may be NaN where none is asked."""
-        here: Vector3 = (x, y, 0.0 if self.z is None else z)
-        return math.dist(here, (self.x, self.y, self.z or 0.0)) <= self.tolerance_m
+        off_x, off_y, off_z = x - self.x, y - self.y, 0.0 if self.z is None else z - self.z
+        # Not `math.dist`: numpy computes the same of columns.
+        return math.sqrt(off_x * off_x + off_y * off_y + off_z * off_z) <= self.tolerance_m
 
 
 Test: TypeAlias = Contains | Equals | Beyond | NearPosition
@@ -368,27 +371,38 @@ def parse_condition(
     return Condition(test, path, min_score)
 
 
-def at_field(value: JsonValue, dot_path: str) -> list[JsonValue]:
+def at_field(value: T, dot_path: str) -> list[T]:
     """Returns what is at a dot-path in an extracted value; empty where there is nothing.
 
     Over a list the path goes on in every element, unless the segment is a whole number, which
     selects one (negative: from the end). `detections.label` gives every label, `detections.0.label`
     the first. Of joint states `positions.elbow` is what `names` has beside it in each value.
     """
-    return _along(value, dot_path)[-1]
-
-
-def _along(value: JsonValue, dot_path: str) -> list[list[JsonValue]]:
-    """Returns what is at each beginning of a dot-path: first the value, last its targets."""
-    nodes: list[list[JsonValue]] = [[value]]
     head, _, name = dot_path.partition(".")
     names = names_beside(value, dot_path)
-    for segment in (head, str(names.index(name))) if name in names else dot_path.split("."):
-        nodes.append([target for node in nodes[-1] for target in _descend(node, segment)])
+    is_name = name in names
+    return along(value, [head, str(names.index(name))] if is_name else dot_path.split("."))[-1]
+
+
+def element_at(elements: list[T], index: int) -> list[T]:
+    """Returns the element at a place, negative from the end, if there is one."""
+    return [elements[index]] if -len(elements) <= index < len(elements) else []
+
+
+def along(
+    value: T, path: Sequence[str], pick: Callable[[list[T], int], list[T]] = element_at
+) -> list[list[T]]:
+    """Returns what is at each beginning of a path: first the value, last its targets.
+
+    `pick` returns the element of a list at a place.
+    """
+    nodes = [[value]]
+    for segment in path:
+        nodes.append([target for node in nodes[-1] for target in _descend(node, segment, pick)])
     return nodes
 
 
-def names_beside(value: JsonValue, dot_path: str) -> list[JsonValue]:
+def names_beside(value: object, dot_path: str) -> list[object]:
     """Returns the names of an array's elements where a path has one instead of a number."""
     head, _, name = dot_path.partition(".")
     if not isinstance(value, dict) or not name or _INDEX.fullmatch(name):
@@ -406,20 +420,26 @@ def positions(value: JsonValue) -> Iterator[Vector3]:
     The value itself where it is an object with x and y, or the elements of a list of those; else
     the objects found at any depth under `position`, `point` or `translation`.
     """
-    own = list(own_positions(value))
-    if own:
-        yield from own
-        return
-    waiting: list[JsonValue] = [value]
+    for node in points(value, lambda axis: isinstance(axis, int | float | None)):
+        yield (_coordinate(node["x"]), _coordinate(node["y"]), _coordinate(node.get("z")))
+
+
+def points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]]:
+    """Yields the objects that are the positions in a value.
+
+    `is_axis` returns whether something may be a coordinate.
+    """
+    own = [*_own_points(value, is_axis)]
+    yield from own
+    waiting = [] if own else [value]
     while waiting:
         node = waiting.pop()
         if isinstance(node, list):
             waiting.extend(reversed(node))
         elif isinstance(node, dict):
             for key in POSITION_KEYS:
-                inner = node.get(key)
-                if isinstance(inner, dict | list):
-                    yield from own_positions(inner)
+                if key in node:
+                    yield from _own_points(node[key], is_axis)
             waiting.extend(reversed(node.values()))
 
 
@@ -494,21 +514,21 @@ def _kind(value: JsonValue) -> str:
     return "an object" if isinstance(value, dict) else abbreviate(value)
 
 
-def _descend(node: JsonValue, segment: str) -> Iterator[JsonValue]:
+def _descend(
+    node: T, segment: str, pick: Callable[[list[T], int], list[T]] = element_at
+) -> Iterator[T]:
     if isinstance(node, dict):
         if segment in node:
             yield node[segment]
     elif isinstance(node, list):
         if _INDEX.fullmatch(segment):
-            index = int(segment)
-            if -len(node) <= index < len(node):
-                yield node[index]
+            yield from pick(node, int(segment))
         else:
             for element in node:
-                yield from _descend(element, segment)
+                yield from _descend(element, segment, pick)
 
 
-def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
+def leaves(value: T, *, in_objects: bool = True) -> Iterator[T]:
     """Yields everything at any depth that is neither a list nor an object.
 
     Without `in_objects` nothing inside an object: the value itself, or the elements of a list. Of a
@@ -518,7 +538,9 @@ def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
     while waiting:
         node = waiting.pop()
         if isinstance(node, Summary):
-            node = [part for part in node.values() if isinstance(part, str) and in_objects]
+            texts = (part for part in node.values() if not isinstance(part, int | list))
+            waiting += texts if in_objects else ()
+            continue
         if isinstance(node, dict):
             if in_objects:
                 waiting += node.values()
@@ -528,18 +550,12 @@ def leaves(value: JsonValue, *, in_objects: bool = True) -> Iterator[JsonValue]:
             yield node
 
 
-def own_positions(value: JsonValue) -> Iterator[Vector3]:
-    """Yields the position that a value is, or those that the elements of a list are."""
+def _own_points(value: T, is_axis: Callable[[T], bool]) -> Iterator[dict[str, T]]:
+    """Yields the object that a value is, or the elements of a list, that have an x and a y."""
     for node in value if isinstance(value, list) else (value,):
         # Null is a coordinate that was NaN; texts and lists are not coordinates at all.
-        if (
-            isinstance(node, dict)
-            and "x" in node
-            and "y" in node
-            and isinstance(node["x"], int | float | None)
-            and isinstance(node["y"], int | float | None)
-        ):
-            yield (_coordinate(node["x"]), _coordinate(node["y"]), _coordinate(node.get("z")))
+        if isinstance(node, dict) and all(axis in node and is_axis(node[axis]) for axis in "xy"):
+            yield node
 
 
 def _coordinate(value: JsonValue) -> float:
@@ -683,7 +699,7 @@ def _plain_text(test: Test) -> str | None:
 
 def _is_unknown_below(value: JsonValue, dot_path: str) -> bool:
     """Returns whether some beginning of the path leads to an empty list or a null."""
-    beginnings = chain.from_iterable(_along(value, dot_path)[:-1])
+    beginnings = chain.from_iterable(along(value, dot_path.split("."))[:-1])
     return any(target is None or target == [] for target in beginnings)
 
 

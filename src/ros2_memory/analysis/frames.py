@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.core.arrays import row_maxima, stacked
+from ros2_memory.core.arrays import row_maxima, row_sums, stacked
 from ros2_memory.core.errors import NoDataError, NoDataReason
 from ros2_memory.core.geometry import multiply, rotate, slerp
 from ros2_memory.core.model import StampedTransform, TimeWindow, Transform
@@ -504,16 +504,17 @@ def static_in(static: Sequence[StampedTransform], window: TimeWindow) -> list[St
 
 
 def unit_quaternions(rotations: Floats) -> Floats:
-    """Returns unit quaternions; those that are of unit length within 1e-12 are left as they are."""
-    x, y, z, w = rotations.T
-    off = np.abs(x * x + y * y + z * z + w * w - 1) >= 1e-12
-    if not off.any():
-        return rotations
-    scaled = rotations[off] / row_maxima(np.abs(rotations[off]))[:, None]
-    x, y, z, w = scaled.T
-    units = rotations.copy()
-    units[off] = scaled / np.sqrt(x * x + y * y + z * z + w * w)[:, None]
-    return units
+    """Returns unit quaternions, N x 4; NaN where they are zero or not finite.
+
+    Those that are of unit length within 1e-12 are left as they are.
+    """
+    with np.errstate(all="ignore"):
+        is_unit = np.abs(row_sums(rotations * rotations) - 1) < 1e-12
+        if is_unit.all():
+            return rotations
+        scaled = rotations / row_maxima(np.abs(rotations))[:, None]
+        scaled /= np.sqrt(row_sums(scaled * scaled))[:, None]
+        return np.where(is_unit[:, None], rotations, scaled)
 
 
 def _identity(times: Times, *, valid: bool = True) -> FramePoses:

@@ -8,38 +8,41 @@ have to be read.
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.columns.plan import fields_at
-from ros2_memory.columns.scores import NamedScores, Scored, hypotheses, or_else, ranked, scored
-from ros2_memory.columns.shown import (
-    ByType,
-    Items,
-    Listing,
-    Narrowed,
-    Node,
-    Nothing,
-    Object,
-    is_object,
+from ros2_memory.columns.shown import ByType, Shape
+from ros2_memory.columns.sources import (
+    Json,
+    Labels,
+    NamedScores,
+    Source,
+    Words,
+    or_else,
+    sources_in,
 )
 from ros2_memory.columns.table import Table, Texts, joined_texts
-from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values, zone_of
+from ros2_memory.columns.values import (
+    ROWS,
+    Conversion,
+    Kind,
+    Leaf,
+    UnknownShapeError,
+    Values,
+    zone_of,
+)
 from ros2_memory.columns.walk import entries_of_codes
-from ros2_memory.core.text import LISTS_OF_LABELS
-from ros2_memory.messages.detections import MAX_DEPTH, POSITIONS, Detection, detections_of
-from ros2_memory.storage.base import Definition
+from ros2_memory.messages.detections import Detection, detections_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
 
     from ros2_memory.columns.values import Floats, Ints, Level, Mask
     from ros2_memory.columns.zones import PartZones
     from ros2_memory.extract import SchemaExtractor
 
 Points: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
-_STAMP: Final = "builtin_interfaces/msg/Time"
 
 
 class Detections(NamedTuple):
@@ -92,50 +95,21 @@ class StampedDetections(NamedTuple):
     frames: Texts
 
 
-class Point(NamedTuple):
-    """Numbers that may be the place of an object: x, y and z (m).
+class _Plan(NamedTuple):
+    """Where a type has detections, and the frame and stamp (ns) of its header, one each at most."""
 
-    `frames` are the texts beside it that may name its frame, the outermost first.
-    """
+    sources: Sequence[Source]
+    frames: Sequence[Leaf]
+    stamps: Sequence[Leaf]
 
-    axes: tuple[Leaf, ...]
-    frames: tuple[Leaf, ...]
-
-
-class Labels(NamedTuple):
-    """Objects that may be detections: what names them, and what else there is where nothing does.
-
-    Attributes:
-        scored: names and scores; of the hypotheses with `is_best`.
-        otherwise: where detections are where the object is none.
-        frames: that name the frame, outermost first.
-        points: where they may have their place, first choice first; None where that depends on the
-            message.
-        is_best: they are named by the best of several hypotheses, which is what is scored.
-    """
-
-    scored: Scored
-    otherwise: tuple[Source, ...]
-    frames: tuple[Leaf, ...]
-    points: tuple[Point, ...] | None
-    is_best: bool = False
-
-
-class Words(NamedTuple):
-    """A list of labels."""
-
-    leaf: Leaf
-
-
-class Json(NamedTuple):
-    """A text that may be JSON, and how deep detections are looked for in it."""
-
-    leaf: Leaf
-    depth: int
-    frames: tuple[Leaf, ...]
-
-
-Source: TypeAlias = Labels | Words | Json
+    @classmethod
+    def of(cls, shape: Shape) -> _Plan:
+        """Returns that of a type; raises `UnknownShapeError` where it depends on the message."""
+        frame, stamp = (shape.at(("header", name)) for name in ("frame_id", "stamp"))
+        frames = [frame] if isinstance(frame, Leaf) and frame.kind is Kind.TEXT else []
+        is_time = isinstance(stamp, Leaf) and stamp.conversion is Conversion.SECONDS
+        stamps = [Leaf(ROWS, ("header.stamp",), Kind.INTEGER)] if is_time else []
+        return cls(sources_in(shape.value), frames, stamps)
 
 
 class DetectionColumns:
@@ -146,41 +120,38 @@ class DetectionColumns:
     """
 
     def __init__(self, extractor: SchemaExtractor) -> None:
-        self._sources = ByType(extractor, lambda shape: tuple(sources_in(shape.value)))
+        self._plans = ByType(extractor, _Plan.of)
 
     def of(self, table: Table) -> StampedDetections | None:
         """Returns the detections of a table's messages; None where they have to be read."""
-        definition, sources = table.definition, self._sources.of(table)
-        if definition is None or sources is None:
+        plan, values = self._plans.of(table), Values(table)
+        if plan is None:
             return None
-        values = Values(table)
-        header_frames = _header_frames(definition)
         try:
-            detections = joined_detections(
-                [part for source in sources for part in found_in(values, source, places=True)]
+            found = joined_detections(
+                [part for source in plan.sources for part in found_in(values, source, places=True)]
             )
-            frames = _frames_at(values, ROWS, detections.rows, header_frames)
-            return StampedDetections(
-                detections._replace(frames=or_else(detections.frames, frames)),
-                _stamps(values, definition),
-                _frames_at(values, ROWS, np.arange(values.rows), header_frames),
-            )
+            frames = _frames_at(values, ROWS, np.arange(values.rows), plan.frames)
+            own = Texts(frames.codes[found.rows], frames.words)
+            found = found._replace(frames=or_else(found.frames, own))
+            stamps = [values.numbers(leaf).values.astype(np.int64) for leaf in plan.stamps]
+            return StampedDetections(found, stamps[0] if stamps else None, frames)
         except UnknownShapeError:
             return None
 
     def has_labels(self, table: Table) -> bool:
         """Returns whether the type of a table has fields for labels, not only texts."""
-        sources = self._sources.of(table)
-        return sources is None or any(not isinstance(source, Json) for source in sources)
+        plan = self._plans.of(table)
+        return plan is None or any(not isinstance(source, Json) for source in plan.sources)
 
     def may_match(self, table_or_parts: Table | PartZones) -> bool | Mask:
         """Returns whether a message may hold a detection, as known without reading a column.
 
         Of several parts for each of them, or for all.
         """
-        sources = self._sources.of(table_or_parts)
-        possible: bool | Mask = sources is None
-        for source in sources or ():
+        plan = self._plans.of(table_or_parts)
+        possible: bool | Mask = plan is None
+        for source in () if plan is None else plan.sources:
             if not isinstance(source, Json):
                 return True
             possible = possible | _may_be_json(table_or_parts, source.leaf)
@@ -219,94 +190,6 @@ def joined_detections(parts: Sequence[Detections]) -> Detections:
     )
 
 
-# Where a type has detections
-
-
-def sources_in(
-    node: Node, depth: int = MAX_DEPTH, frames: tuple[Leaf, ...] = ()
-) -> Iterator[Source]:
-    """Yields where detections may be in a value; it goes where `detections_of` goes.
-
-    Raises:
-        UnknownShapeError: that depends on the message.
-    """
-    if depth == 0:
-        return
-    if isinstance(node, Narrowed):
-        raise UnknownShapeError("an element of a list stands alone")
-    if isinstance(node, Leaf):
-        if node.kind is Kind.TEXT:
-            yield Json(node, depth, frames)
-    elif isinstance(node, Listing):
-        if is_object(node.element) or isinstance(node.element, Narrowed):
-            yield from sources_in(node.element, depth - 1, frames)
-    elif is_object(node):
-        yield from _sources_in_object(node.fields, depth, frames)
-
-
-def _sources_in_object(
-    fields: Mapping[str, Node], depth: int, frames: tuple[Leaf, ...]
-) -> Iterator[Source]:
-    named, several, results = scored(fields), hypotheses(fields), fields.get("results")
-    frames = (*frames, *_frame_leaves(fields))
-    inner = tuple(_sources_in_fields(fields, depth, frames))
-    if named is not None:
-        yield Labels(named, inner, frames, _points(fields))
-    elif several is not None and isinstance(results, Listing) and is_object(results.element):
-        best_points, points = _points(results.element.fields), _points(fields)
-        is_known = best_points is not None and points is not None
-        both = (*(best_points or ()), *(points or ())) if is_known else None
-        yield Labels(several, inner, frames, both, is_best=True)
-    else:
-        yield from inner
-
-
-def _sources_in_fields(
-    fields: Mapping[str, Node], depth: int, frames: tuple[Leaf, ...]
-) -> Iterator[Source]:
-    for name, node in fields.items():
-        element = node.element if isinstance(node, Listing) else None
-        if name in LISTS_OF_LABELS and isinstance(element, Leaf) and element.kind is Kind.TEXT:
-            yield Words(element)
-        yield from sources_in(node, depth - 1, frames)
-
-
-def _frame_leaves(fields: Mapping[str, Node]) -> Iterator[Leaf]:
-    header = fields.get("header")
-    leaf = (header.fields if isinstance(header, Object) else fields).get("frame_id")
-    if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT:
-        yield leaf
-
-
-def _points(fields: Mapping[str, Node]) -> tuple[Point, ...] | None:
-    """Returns where an object may have its place, first choice first; None: it depends."""
-    points: list[Point] = []
-    for path in POSITIONS:
-        node: Node | None = Object(fields)
-        frames: list[Leaf] = []
-        for name in path:
-            node = node.fields.get(name) if is_object(node) else None
-            if is_object(node):
-                frames += _frame_leaves(node.fields)
-        if node is None or isinstance(node, Leaf | Nothing):
-            continue
-        if isinstance(node, Items):
-            axes: list[Node] = [*node.items]
-        elif isinstance(node, Object):
-            axes = [node.fields[axis] for axis in "xyz" if axis in node.fields]
-        else:
-            return None
-        leaves = [axis for axis in axes if isinstance(axis, Leaf)]
-        if len(leaves) < len(axes):
-            return None
-        if len(leaves) == 3 and all(leaf.is_number for leaf in leaves):
-            points.append(Point(tuple(leaves), tuple(frames)))
-    return tuple(points)
-
-
-# What a table holds
-
-
 def found_in(values: Values, source: Source, *, places: bool) -> Iterator[Detections]:
     """Yields the detections at one place of the messages of a table.
 
@@ -328,35 +211,31 @@ def _in_labels(values: Values, leaf: Leaf) -> Detections:
     texts = values.texts(leaf)
     is_label = np.array([bool(word) for word in texts.words], np.bool_)
     positions = np.flatnonzero(is_label[texts.codes])
-    return _detections_at(values, leaf.level, texts, positions, np.full(len(texts), math.nan))
+    named = NamedScores(texts, np.full(len(texts), math.nan), 0.0)
+    return _detections_at(values, leaf.level, positions, named.at(positions))
 
 
 def _in_objects(values: Values, source: Labels, *, places: bool) -> Detections:
     """Returns the objects that have a name, with their scores; raises as `found_in`."""
-    level, named = source.scored.level, source.scored.read(values)
-    positions, size = np.arange(len(named.name)), len(named.name)
-    if source.is_best:
-        positions = _best_hypotheses(named, values.elements(level).owners)
-        size = values.size(level.parent or level)
-    positions = positions[named.is_named[positions]]
-    if positions.size < size and any(
+    positions, named = source.read(values)
+    which = np.flatnonzero(named.is_named)
+    if which.size < values.size(source.level) and any(
         detections.rows.size
         for inner in source.otherwise
         for detections in found_in(values, inner, places=False)
     ):
         raise UnknownShapeError("some objects are detections, and some have such in them")
-    detections = _detections_at(values, level, named.name, positions, named.score)
+    positions = positions[which]
+    detections = _detections_at(values, source.scored.level, positions, named.at(which))
     return _placed(values, source, positions, detections) if places else detections
 
 
-def _detections_at(
-    values: Values, level: Level, names: Texts, positions: Ints, scores: Floats
-) -> Detections:
+def _detections_at(values: Values, level: Level, positions: Ints, named: NamedScores) -> Detections:
     """Returns the detections at some positions of a level, by their rows, without a place."""
     return Detections(
         _owners_at(values, level, positions, ROWS),
-        Texts(names.codes[positions], names.words),
-        scores[positions],
+        named.name,
+        named.score,
         np.full((positions.size, 3), math.nan),
         _no_frames(positions.size),
     )
@@ -390,24 +269,6 @@ def _in_json(values: Values, source: Json) -> Iterator[Detections]:
     found = parsed.taken(nth)._replace(rows=rows)
     frames = _frames_at(values, source.leaf.level, positions, source.frames)
     yield found._replace(frames=or_else(found.frames, frames))
-
-
-def _best_hypotheses(named: NamedScores, owners: Ints) -> Ints:
-    """Returns the first of the hypotheses of the highest score, for each detection.
-
-    Raises:
-        UnknownShapeError: they were rounded, so that another may be the best.
-    """
-    order, begins = ranked(named.score, owners)
-    best: Ints = order[begins]
-    if named.error:
-        follows = np.flatnonzero(begins[:-1] & ~begins[1:])
-        score, codes = named.score[order], named.name.codes[order]
-        with np.errstate(invalid="ignore"):  # infinity less infinity
-            is_close = score[follows] - score[follows + 1] <= 2 * named.error
-        if (is_close & (codes[follows] != codes[follows + 1])).any():
-            raise UnknownShapeError("another hypothesis may be the best")
-    return best
 
 
 def _placed(values: Values, source: Labels, positions: Ints, detections: Detections) -> Detections:
@@ -445,27 +306,3 @@ def _owners_at(values: Values, level: Level, positions: Ints, outer: Level) -> I
     while level != outer and level.parent is not None:
         positions, level = values.elements(level).owners[positions], level.parent
     return positions
-
-
-def _kind_at(definition: Definition, *path: str) -> str | Definition:
-    """Returns what a field is; empty where there is no such field, or an array."""
-    fields = fields_at(definition, path)
-    is_there = len(fields) == len(path) and all(entry.length is None for entry in fields)
-    return fields[-1].kind if is_there else ""
-
-
-def _header_frames(definition: Definition) -> tuple[Leaf, ...]:
-    """Returns the frame in a message's own header, if it has one."""
-    if _kind_at(definition, "header", "frame_id") not in {"string", "wstring"}:
-        return ()
-    return (Leaf(ROWS, ("header.frame_id",), Kind.TEXT),)
-
-
-def _stamps(values: Values, definition: Definition) -> Ints | None:
-    kind = _kind_at(definition, "header", "stamp")
-    if not isinstance(kind, Definition) or kind.type != _STAMP:
-        return None
-    stamps = values.numeric(ROWS, "header.stamp")
-    if stamps is None:
-        raise UnknownShapeError("stamps are not held")
-    return stamps.astype(np.int64)

@@ -7,20 +7,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.shown import (
-    Limits,
-    Node,
-    Spot,
-    is_object,
-    leaves_below,
-    placed,
-    shape_of,
-)
+from ros2_memory.columns.limits import placed
+from ros2_memory.columns.shown import Node, leaves_of, shape_of
 from ros2_memory.columns.table import Table, Texts
 from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError, Values
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Sequence
 
     from ros2_memory.columns.values import Floats, Ints
     from ros2_memory.extract import SchemaExtractor
@@ -38,7 +31,7 @@ class FieldNumbers(NamedTuple):
             computed of exact quaternions may differ by their last digits.
         errors: the most by which each of them is off, where that differs.
         exactly: returns the exact numbers at some positions, ascending; None where only the bag
-            has them.
+            has them, and of several numbers of a message.
     """
 
     rows: Ints
@@ -62,7 +55,7 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
         None where the columns do not hold them all: then the bag has to be read.
     """
     try:
-        parts = [_numbers_of(Values(table), *found) for found in _leaves(table, field, extractor)]
+        parts = [_numbers_of(Values(table), leaf) for leaf in _leaves(table, field, extractor)]
     except UnknownShapeError:
         return None
     if not parts:
@@ -73,11 +66,11 @@ def numbers(table: Table, field: str, extractor: SchemaExtractor) -> FieldNumber
 def column_of(table: Table, field: str, extractor: SchemaExtractor) -> str | None:
     """Returns the path of the column that has all numbers of a field as they are; None: none."""
     try:
-        [(leaf, limits)] = _leaves(table, field, extractor)
+        [leaf] = _leaves(table, field, extractor)
     except (UnknownShapeError, ValueError):  # none, or several
         return None
     is_stored = leaf.level is ROWS and leaf.conversion is Conversion.STORED
-    return leaf.sources[0] if is_stored and not limits else None
+    return leaf.sources[0] if is_stored and not leaf.limits else None
 
 
 def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Texts | None:
@@ -88,13 +81,14 @@ def words_of(table: Table, field: str | None, extractor: SchemaExtractor) -> Tex
     """
     try:
         node = _node(table, field, extractor)
-        if is_object(node):
-            [node] = node.fields.values()
+        if isinstance(node, dict):
+            [node] = node.values()
         if (
             not isinstance(node, Leaf)
             or node.level is not ROWS
             or node.conversion is not Conversion.STORED
             or node.kind is Kind.REAL
+            or node.limits
         ):
             return None
         if node.kind is Kind.TEXT:
@@ -116,26 +110,8 @@ def _joined(parts: Sequence[FieldNumbers]) -> FieldNumbers:
             for part in parts
         ]
     )
-    ends = np.cumsum([part.rows.size for part in parts])
-
-    def exactly(positions: Ints) -> Floats:
-        exact = joined[order[positions]].astype(np.float64)
-        for part, end in zip(parts, ends.tolist(), strict=True):
-            places = order[positions] - (end - part.rows.size)
-            of_part = np.flatnonzero((places >= 0) & (places < part.rows.size))
-            if part.exactly is not None and of_part.size:
-                exact[of_part] = part.exactly(places[of_part])
-        return exact
-
-    is_settled = all(part.exactly is not None or part.error == 0 for part in parts)
     error = max(part.error for part in parts)
-    return FieldNumbers(
-        rows[order],
-        joined[order],
-        error,
-        errors[order] if error else None,
-        exactly if is_settled else None,
-    )
+    return FieldNumbers(rows[order], joined[order], error, errors[order] if error else None)
 
 
 def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node | None:
@@ -146,19 +122,17 @@ def _node(table: Table, field: str | None, extractor: SchemaExtractor) -> Node |
     return shape.value if field is None else shape.find(field)
 
 
-def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> Iterator[tuple[Leaf, Limits]]:
-    """Yields the numbers of a field; not those of a summary."""
+def _leaves(table: Table, field: str, extractor: SchemaExtractor) -> list[Leaf]:
+    """Returns the numbers of a field; not those of a summary."""
     node = _node(table, field, extractor)
-    for _, leaf, limits in () if node is None else leaves_below(Spot(node)):
-        if leaf.is_number:
-            yield leaf, limits
+    return [] if node is None else [leaf for leaf in leaves_of(node) if leaf.is_number]
 
 
-def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers:
+def _numbers_of(values: Values, leaf: Leaf) -> FieldNumbers:
     column, error, exactly = values.numbers(leaf)
     everything = np.arange(len(column))
-    kept, rows = placed(values, leaf.level, everything, limits, surely=True)
-    possible, _ = placed(values, leaf.level, everything, limits, surely=False)
+    kept, rows = placed(values, leaf.level, everything, leaf.limits, surely=True)
+    possible, _ = placed(values, leaf.level, everything, leaf.limits, surely=False)
     if len(kept) < len(possible) or not values.holds_all(leaf):
         raise UnknownShapeError("some numbers are not held, or may not stand there")
     if len(kept) < len(column):
@@ -170,14 +144,10 @@ def _numbers_of(values: Values, leaf: Leaf, limits: Limits) -> FieldNumbers:
         is_whole = column.dtype.kind in "iu"
         column = column.astype(np.int64 if is_whole else np.float64, copy=False)
 
-    def exactly_at(positions: Ints) -> Floats:
-        assert exactly is not None  # noqa: S101 - else nobody has this function
-        return exactly(kept[positions])
-
     return FieldNumbers(
         rows,
         column,
         float(np.max(error, initial=0.0)),
         error[kept] if isinstance(error, np.ndarray) else None,
-        exactly and exactly_at,
+        None if exactly is None else lambda positions: exactly(kept[positions]),
     )

@@ -10,13 +10,13 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
+from ros2_memory.analysis.frames import unit_quaternions
 from ros2_memory.analysis.poses import FrameCodes, Poses
-from ros2_memory.columns.plan import fields_at
-from ros2_memory.columns.shown import ByType
+from ros2_memory.columns.shown import ByType, Listing, Node, Shape, xyzw_of
 from ros2_memory.columns.steps import EXACT, METRES, QUATERNION, RADIANS, VELOCITY, Step
 from ros2_memory.columns.table import Table, Texts
-from ros2_memory.columns.values import UnknownShapeError
-from ros2_memory.core.arrays import row_maxima, row_sums
+from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError
+from ros2_memory.core.arrays import row_sums
 from ros2_memory.extract import (
     FRAME,
     POSE_FRAMES,
@@ -26,21 +26,18 @@ from ros2_memory.extract import (
     PointPose,
     SchemaExtractor,
 )
-from ros2_memory.storage.base import SEQUENCE, Definition, IntArray
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.values import Floats
-    from ros2_memory.messages.conversions import Segments
+    from ros2_memory.storage.base import IntArray
 
     Vectors: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.float64]]"
 
-_UNIT_TOLERANCE: Final = 1e-12
 _ABOUT_UNIT: Final = 1e-2
 _MOST_STEPPED: Final = 1e9
 """Larger numbers of metres are no places, and are not rounded here."""
-_TEXTS: Final = frozenset({"string", "wstring"})
 
 
 class PoseColumns:
@@ -52,7 +49,7 @@ class PoseColumns:
 
     def __init__(self, extractor: SchemaExtractor) -> None:
         self._columns = ByType(
-            extractor, lambda shape: _columns_of(extractor.plan(shape.type), shape.definition)
+            extractor, lambda shape: _columns_of(extractor.plan(shape.type), shape)
         )
 
     def of(self, table: Table, times: IntArray, index: IntArray | None) -> Poses | None:
@@ -107,116 +104,98 @@ class _Columns(NamedTuple):
     velocity: tuple[str, ...] = ()
 
 
-class _Field(NamedTuple):
-    path: str
-    kind: str | Definition
-    length: int | None
-
-    @property
-    def is_number(self) -> bool:
-        return self.length is None and self._has_numbers
-
-    @property
-    def _has_numbers(self) -> bool:
-        return isinstance(self.kind, str) and self.kind != "bool" and self.kind not in _TEXTS
-
-    def parts(self, names: str) -> tuple[str, ...]:
-        """Returns the paths of its fields with these names; none unless all are numbers."""
-        if self.length is not None or not isinstance(self.kind, Definition):
-            return ()
-        fields = [_field_at(self.kind, (name,)) for name in names]
-        paths = tuple(f"{self.path}.{part.path}" for part in fields if part and part.is_number)
-        return paths if len(paths) == len(names) else ()
-
-    def elements(self, count: int) -> tuple[str, ...]:
-        """Returns the paths of its elements; none unless it is an array of so many numbers.
-
-        Raises:
-            UnknownShapeError: it has another length in each message.
-        """
-        if self.length == SEQUENCE and self._has_numbers:
-            raise UnknownShapeError(f"{self.path} has another length in each message")
-        if self.length != count or not self._has_numbers:
-            return ()
-        return tuple(f"{self.path}.{nth}" for nth in range(count))
-
-
-def _field_at(definition: Definition, path: Segments) -> _Field | None:
-    """Returns the field at a path; None where there is none.
+def _columns_of(plan: Plan, shape: Shape) -> _Columns:
+    """Returns where poses are in messages of a type; without axes where they have none.
 
     Raises:
-        UnknownShapeError: it leads through a list.
+        UnknownShapeError: it depends on the message.
     """
-    fields = fields_at(definition, path)
-    if any(entry.length is not None for entry in fields[: len(path) - 1]):
-        raise UnknownShapeError(f"{'.'.join(path)} leads through a list")
-    if len(fields) < len(path):
-        return None
-    return _Field(".".join(path), fields[-1].kind, fields[-1].length)
-
-
-def _columns_of(plan: Plan, definition: Definition) -> _Columns:
-    """Returns where poses are in messages of a type; without axes where they have none."""
-    pose = _pose(plan, definition)
+    routes = (
+        _planar(route, shape) if isinstance(route, PlanarPose) else _point(route, shape)
+        for route in plan.poses
+    )
+    pose = next(filter(None, routes), None)
     if pose is None:
         return _Columns()
-    frame = _field_at(definition, FRAME.segments)
-    is_named = frame is not None and frame.length is None and frame.kind in _TEXTS
-    numbered = plan.pose_frame and _field_at(definition, plan.pose_frame.segments)
+    frame = shape.at(FRAME.segments)
+    is_named = isinstance(frame, Leaf) and frame.kind is Kind.TEXT
+    numbered = plan.pose_frame and _number(shape.at(plan.pose_frame.segments))
     return pose._replace(
-        frame=frame.path if frame is not None and is_named else "",
-        numbered_frame=numbered.path if numbered and numbered.is_number else "",
-        velocity=_velocity(plan, definition),
+        frame=".".join(FRAME.segments) if is_named else "",
+        numbered_frame=numbered or "",
+        velocity=_velocity(plan, shape),
     )
 
 
-def _pose(plan: Plan, definition: Definition) -> _Columns | None:
-    """Returns the paths of the first route by which messages of a type have a pose."""
-    for route in plan.poses:
-        if isinstance(route, PlanarPose):
-            paths = _planar(route, definition)
-        else:
-            paths = _point(route, definition)
-        if paths is not None:
-            return paths
-    return None
+def _number(node: Node | None) -> str:
+    """Returns the path of a number; empty for anything else.
+
+    Raises:
+        UnknownShapeError: it is in a list.
+    """
+    if not isinstance(node, Leaf) or not node.is_number or node.conversion is not Conversion.STORED:
+        return ""
+    if node.level != ROWS:
+        raise UnknownShapeError("a path leads through a list")
+    return node.sources[0]
 
 
-def _point(route: PointPose, definition: Definition) -> _Columns | None:
-    position = _field_at(definition, route.position.segments)
-    orientation = _field_at(definition, route.orientation.segments)
-    axes = position.parts("xyz") if position else ()
-    turn = orientation.parts("xyzw") if orientation else ()
+def _numbers(node: Node | None, names: str) -> tuple[str, ...]:
+    """Returns the paths of the numbers that an object has under these names; none unless of all.
+
+    Raises:
+        UnknownShapeError: it is in a list.
+    """
+    if isinstance(node, Listing) and isinstance(node.element, dict):
+        raise UnknownShapeError("a path leads through a list")
+    if not isinstance(node, dict):
+        return ()
+    xyzw = xyzw_of(node) if names == "xyzw" else []
+    paths = [*map(_number, xyzw or map(node.get, names))]
+    return tuple(paths) if all(paths) else ()
+
+
+def _elements(node: Node | None, count: int) -> tuple[str, ...]:
+    """Returns the paths of the numbers of an array; none unless it is one of so many.
+
+    Raises:
+        UnknownShapeError: it has another length in each message.
+    """
+    if isinstance(node, Listing):
+        raise UnknownShapeError("an array has another length in each message")
+    paths = [*map(_number, node)] if isinstance(node, list) else []
+    return tuple(paths) if len(paths) == count and all(paths) else ()
+
+
+def _point(route: PointPose, shape: Shape) -> _Columns | None:
+    position = shape.at(route.position.segments)
+    orientation = shape.at(route.orientation.segments)
+    axes, turn = _numbers(position, "xyz"), _numbers(orientation, "xyzw")
     if route.arrays:
-        axes = axes or (position.elements(3) if position else ())
+        axes = axes or _elements(position, 3)
         # PX4 writes w first.
-        elements = orientation.elements(4) if orientation and not turn else ()
+        elements = () if turn else _elements(orientation, 4)
         turn = turn or (*elements[1:], *elements[:1])
     return _Columns(axes, turn) if axes else None
 
 
-def _planar(route: PlanarPose, definition: Definition) -> _Columns | None:
+def _planar(route: PlanarPose, shape: Shape) -> _Columns | None:
     routes = (route.x, route.y, route.z, route.heading)
-    fields = [_field_at(definition, axis.segments) for axis in routes]
-    x, y, z, heading = (entry.path if entry and entry.is_number else "" for entry in fields)
-    if not x or not y or (route.is_needed and fields[-1] is None):
+    nodes = [shape.at(axis.segments) for axis in routes]
+    x, y, z, heading = map(_number, nodes)
+    if not x or not y or (route.is_needed and nodes[-1] is None):
         return None
     return _Columns((x, y, z) if z else (x, y), (heading,) if heading else ())
 
 
-def _velocity(plan: Plan, definition: Definition) -> tuple[str, ...]:
+def _velocity(plan: Plan, shape: Shape) -> tuple[str, ...]:
     """Returns the paths of the first linear velocity that an angular one stands beside."""
     for linear_route, angular_route in plan.twists:
-        linear = _field_at(definition, linear_route.segments)
-        angular = _field_at(definition, angular_route.segments)
-        if linear is None or angular is None:
-            continue
-        velocity, turning = linear.parts("xyz"), angular.parts("xyz")
+        both = [shape.at(route.segments) for route in (linear_route, angular_route)]
+        velocity, turning = (_numbers(node, "xyz") for node in both)
         if not velocity and plan is not UNMAPPED:
-            velocity, turning = (
-                (entry.path,) if entry.is_number else entry.elements(3)
-                for entry in (linear, angular)
-            )
+            paths = [(_number(node), node) for node in both]
+            velocity, turning = ((path,) if path else _elements(node, 3) for path, node in paths)
         if velocity and turning:
             return velocity
     return ()
@@ -290,14 +269,9 @@ def _at_unit_length(turns: Vectors) -> Vectors:
     Rounded where that is their length already: of others rounding would change the rotation more.
     """
     with np.errstate(all="ignore"):
-        off = np.abs(row_sums(turns * turns) - 1)
-        turns = np.where((off < _ABOUT_UNIT)[:, None], rounded(turns, QUATERNION), turns)
-        largest = row_maxima(np.abs(turns))
-        is_turn = np.isfinite(largest) & (largest > 0)
-        scaled = turns / largest[:, None]
-        scaled /= np.sqrt(row_sums(scaled * scaled))[:, None]
-        is_unit = np.abs(row_sums(turns * turns) - 1) < _UNIT_TOLERANCE
-        return np.where(is_unit[:, None], turns, np.where(is_turn[:, None], scaled, np.nan))
+        is_about_unit = np.abs(row_sums(turns * turns) - 1) < _ABOUT_UNIT
+    turns = np.where(is_about_unit[:, None], rounded(turns, QUATERNION), turns)
+    return unit_quaternions(turns)
 
 
 def _frames_of(rows: _RoundedRows, columns: _Columns, count: int) -> Texts:

@@ -5,22 +5,21 @@ messages of a type at once, from the definition and the schema map alone: which 
 has, under which names, and the column that each is read or computed from. What is stored is not
 looked at, so one tree serves all tables of a type.
 
-A node is what may stand in the value: a `Leaf` (a number, boolean or text of each row or element),
-an `Object`, a list (`Listing` over the elements of a level, `Items` of a short fixed array), or
-null (`NOTHING`). `Narrowed` and `Choice` say for which rows a node stands there.
+A tree is built as the value is: of dicts, and of lists (`Listing` where its elements are those of a
+level, a plain list for a short array of fixed length), so that the same functions go through both.
+In place of a number, boolean or text it has a `Leaf`, whose limits say for which rows it stands
+there; and `NOTHING` for null.
 """
 
 from __future__ import annotations
 
-import re
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeGuard, TypeVar
+from enum import Enum, auto
+from functools import cached_property, lru_cache
+from itertools import chain
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeAlias, TypeVar
 
-import numpy as np
-
-from ros2_memory.analysis.conditions import ELEMENT_NAMES
-from ros2_memory.columns.stored import Lazily
+from ros2_memory.analysis import conditions
+from ros2_memory.columns.limits import Limit, at_name, at_place, where_longer
 from ros2_memory.columns.table import MAX_NUMBERS, Table
 from ros2_memory.columns.values import (
     NUMBERS,
@@ -30,128 +29,55 @@ from ros2_memory.columns.values import (
     Leaf,
     Level,
     UnknownShapeError,
-    Values,
 )
 from ros2_memory.extract import POINTS, SchemaExtractor
-from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, ValueKind, kind_of_type
+from ros2_memory.messages.conversions import ANGLES, SUMMARIZED, Summary, ValueKind, kind_of_type
 from ros2_memory.messages.to_json import MAX_DEPTH, MAX_EXACT_NUMBERS
 from ros2_memory.storage.base import SEQUENCE, Definition
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
-    from ros2_memory.columns.values import Ints, Mask
     from ros2_memory.columns.zones import PartZones
 
 T = TypeVar("T")
 
-MAX_LEAVES: Final = 20_000
+_MAX_PARTS: Final = 5_000
 """Of one value: nested definitions of some lines can spell out more than memory holds."""
 
 _FILLER: Final = "structure_needs_at_least_one_member"
-_INDEX: Final = re.compile(r"-?\d{1,9}", re.ASCII)
 _BYTES: Final = frozenset({"uint8", "char"})
 """What rosbags decodes to uint8, whose long arrays are shown as their length."""
+_TURNS: Final = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
 
 
-class TruthValues(NamedTuple):
-    """Of some rows or elements: where something surely stands, and where it may stand."""
+class Constant(Enum):
+    """What is no leaf, and no list or object of such."""
 
-    surely: Mask
-    perhaps: Mask
-
-    @classmethod
-    def known(cls, stands: Mask) -> TruthValues:
-        """Returns that it stands there and nowhere else."""
-        return cls(stands, stands)
-
-    @property
-    def unsure(self) -> Mask:
-        """Where it may stand or not."""
-        return self.perhaps & ~self.surely
-
-    @property
-    def is_settled(self) -> bool:
-        """Whether it is known everywhere."""
-        return not self.unsure.any()
-
-    @property
-    def is_none(self) -> bool:
-        """Whether it stands nowhere."""
-        return not self.perhaps.any()
+    NOTHING = auto()  # null
+    UNKNOWN = auto()  # depends on the message: the messages decide
 
 
-def nowhere(size: int) -> TruthValues:
-    """Returns that so many rows or elements do not have a value."""
-    return TruthValues(np.zeros(size, np.bool_), np.zeros(size, np.bool_))
+NOTHING: Final = Constant.NOTHING
+UNKNOWN: Final = Constant.UNKNOWN
+
+Node: TypeAlias = "Leaf | dict[str, Node] | list[Node] | Constant"
 
 
-def unknown(size: int) -> TruthValues:
-    """Returns that nothing is known of so many rows or elements."""
-    return TruthValues(np.zeros(size, np.bool_), np.ones(size, np.bool_))
+class Listing(list["Node"]):
+    """A list of the elements of a level.
 
-
-class Limit(NamedTuple):
-    """For which rows or elements of a level something stands in the value.
-
-    Attributes:
-        level: the level that it is about.
-        find: returns where it stands, for some rows or elements of the level; may raise
-            `UnknownShapeError`.
-        is_of_scores: whether detections of a low score are left out by it.
+    An array of numbers also has the `Summary` that is shown in place of a long one.
     """
 
-    level: Level
-    find: Callable[[Values, Ints], TruthValues]
-    is_of_scores: bool = False
+    def __init__(self, level: Level, *parts: Node) -> None:
+        super().__init__(parts)
+        self.level = level
 
-    def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where it stands, for some rows or elements of the level."""
-        try:
-            return self.find(values, positions)
-        except UnknownShapeError:
-            return unknown(len(positions))
-
-
-def _at_place(level: Level, place: int) -> Limit:
-    """Returns the limit to the element at this place of each list; negative from the end."""
-
-    def find(values: Values, positions: Ints) -> TruthValues:
-        return TruthValues.known(values.places(level, positions, from_end=place < 0) == place)
-
-    return Limit(level, find)
-
-
-def _at_name(level: Level, names: Leaf, name: str, nth: int | None = None) -> Limit:
-    """Returns the limit to the element that has this name in the list of names beside it.
-
-    Of an array of fixed length, whose elements are columns of their own: to rows where it is `nth`.
-    """
-
-    def find(values: Values, positions: Ints) -> TruthValues:
-        texts, owners = values.texts(names), values.elements(names.level).owners
-        has_name = np.array([word == name for word in texts.words], np.bool_)[texts.codes]
-        found = np.flatnonzero(has_name)[::-1]  # the first of a row is written last
-        places = np.full(values.rows, -1)
-        places[owners[found]] = values.places(names.level, found, from_end=False)
-        if nth is not None:
-            return TruthValues.known(places[positions] == nth)
-        at = values.places(level, positions, from_end=False)
-        return TruthValues.known(at == places[values.elements(level).owners[positions]])
-
-    return Limit(level, find)
-
-
-def _where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) -> Limit:
-    """Returns the limit to sequences of more numbers than this, or else of no more."""
-
-    def find(values: Values, positions: Ints) -> TruthValues:
-        lengths = values.numeric(level, f"{sequence}.length")
-        if lengths is None:
-            return unknown(len(positions))
-        return TruthValues.known((lengths[positions] > count) == is_longer)
-
-    return Limit(level, find)
+    @property
+    def element(self) -> Node:
+        """What each element is."""
+        return self[0]
 
 
 class Place(NamedTuple):
@@ -177,91 +103,6 @@ class Place(NamedTuple):
         return Place(Level(self.level, self.path), "", self.kind, None, self.depth + 1)
 
 
-class Object(NamedTuple):
-    """A message that is shown field by field, or an object that the conversions make.
-
-    Attributes:
-        fields: what stands under each name; of a message it is made when it is asked for, which may
-            raise `UnknownShapeError`.
-        place: of a message.
-        xyzw: the rotation as its message has it, of angles that a message was converted to.
-        is_summary: whether it is a `messages.conversions.Summary`.
-    """
-
-    fields: Mapping[str, Node]
-    place: Place | None = None
-    xyzw: Object | None = None
-    is_summary: bool = False
-
-
-class Listing(NamedTuple):
-    """A list of the elements of a level."""
-
-    level: Level
-    element: Node
-
-
-class Items(NamedTuple):
-    """A list of so many for all rows."""
-
-    items: tuple[Leaf, ...]
-
-
-class Narrowed(NamedTuple):
-    """A node that stands in the value of some rows or elements alone, and null in the others."""
-
-    limit: Limit
-    node: Node
-
-
-class Choice(NamedTuple):
-    """An array of numbers (`array`), which is shown as one of these, whichever holds for a row."""
-
-    cases: tuple[Node, ...]
-    array: Node
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Nothing:
-    """Null."""
-
-
-NOTHING: Final = Nothing()
-
-Node: TypeAlias = Leaf | Object | Listing | Items | Narrowed | Choice | Nothing
-Limits: TypeAlias = tuple[Limit, ...]
-
-
-class Spot(NamedTuple):
-    """A node, and the limits on what stands there."""
-
-    node: Node
-    limits: Limits = ()
-
-
-def placed(
-    values: Values, level: Level, positions: Ints, limits: Limits, *, surely: bool
-) -> tuple[Ints, Ints]:
-    """Returns which of some rows or elements stand in the value, and the row of each.
-
-    Args:
-        values: of the table.
-        level: of the rows or elements.
-        positions: their positions.
-        limits: on what stands there.
-        surely: whether those that may or may not stand there are left out.
-    """
-    current, kept, owners = level, positions, positions
-    while True:
-        for limit in limits:
-            if limit.level == current and len(kept):
-                mask = limit.kept(values, owners)[0 if surely else 1]
-                kept, owners = kept[mask], owners[mask]
-        if current.parent is None:
-            return kept, owners
-        owners, current = values.elements(current).owners[owners], current.parent
-
-
 class Shape:
     """The value that `extractor` shows of messages of a type.
 
@@ -272,14 +113,14 @@ class Shape:
 
     Attributes:
         type: as the channel names it.
-        definition: its fields.
     """
 
     def __init__(self, definition: Definition, type_name: str, extractor: SchemaExtractor) -> None:
         self.type = type_name
-        self.definition = definition
+        self._definition = definition
         self._fields = extractor.fields_of(type_name)
         self._limit = extractor.limit
+        self._parts = 0
 
     @cached_property
     def value(self) -> Node:
@@ -288,15 +129,13 @@ class Shape:
         Raises:
             UnknownShapeError: it depends on the message.
         """
-        nodes = {name: self._at(path) for name, path in self._fields.items()}
+        nodes = {name: self.at(path) for name, path in self._fields.items()}
         if all(node is None for node in nodes.values()):
-            return self.shown(self._root)
-        return Object(
-            {
-                name: NOTHING if node is None else _converted(name, node)
-                for name, node in nodes.items()
-            }
-        )
+            return self._whole
+        return {
+            name: NOTHING if node is None else _converted(name, node)
+            for name, node in nodes.items()
+        }
 
     def find(self, path: str) -> Node | None:
         """Returns what `SchemaExtractor.exact_at` returns for a path; None where nothing is.
@@ -307,22 +146,39 @@ class Shape:
         name, *inner = path.split(".")
         node: Node | None = None
         if name in self._fields:
-            whole = self._at(self._fields[name])
-            node = None if whole is None else descend(_converted(name, whole), inner)
+            whole = self.at(self._fields[name])
+            node = None if whole is None else _descend(_converted(name, whole), inner)
         elif not self._fields:
-            node = descend(self.shown(self._root), [name, *inner])
-        if node is None:
-            plain = self._at([name, *inner])
-            node = None if plain is None else _with_changed_leaves(plain, _quaternion_as_xyzw)
+            node = _descend(self._whole, [name, *inner])
+        if node is not None:
+            return node
+        node = self.at([name, *inner])
+        if node is not None and any(leaf.conversion in _TURNS for leaf in leaves_of(node)):
+            raise UnknownShapeError(f"{path} is a rotation, or has one")  # shown as x, y, z, w
         return node
 
-    def shown(self, place: Place) -> Node:
+    @cached_property
+    def _whole(self) -> Node:
+        return self._shown(Place(ROWS, "", self._definition, None, 0))
+
+    def at(self, path: Sequence[str]) -> Node | None:
+        """Returns what is at a path in the message, as the value shows it; None where nothing is.
+
+        Raises:
+            UnknownShapeError: it depends on the message.
+        """
+        return _descend(self._whole, path, parts=True)
+
+    def _shown(self, place: Place) -> Node:
         """Returns a part of the message as the value shows it."""
         level, path, kind, length, depth = place
+        self._parts += 1
+        if self._parts > _MAX_PARTS:
+            return UNKNOWN
         if length is None and isinstance(kind, str):
             return Leaf(level, (path,), _kind(kind))
         if depth >= MAX_DEPTH:
-            raise UnknownShapeError(f"{path} lies {depth} levels deep")
+            return UNKNOWN
         if length is not None or isinstance(kind, str):
             return self._array(place)
         return self._message(place, kind)
@@ -341,121 +197,86 @@ class Shape:
         if kind is ValueKind.VECTOR and are_numbers:
             return _vector(level, sources)
         if kind is ValueKind.QUATERNION:
-            xyzw = Object({name: _real(level, _below(path, name)) for name in "xyzw"})
-            return _angles_of(level, sources, xyzw) if are_numbers else NOTHING
+            return _angles_of(level, sources) if are_numbers else NOTHING
+        shown = {name: self._shown(field) for name, field in fields.items()}
         summarized = SUMMARIZED.get(definition.type)
-
-        def shown(name: str) -> Node:
-            make = partial(self._summary, message) if name == summarized else self.shown
-            return make(fields[name])
-
-        message = Object(Lazily(fields, shown), place)
-        return message
-
-    def _plain(self, place: Place) -> Node:
-        """Returns a part of the message as its definition has it, to be walked further."""
-        kind = place.kind
-        if isinstance(kind, str):
-            return self.shown(place)
-        if place.length is not None:
-            element = place.element()
-            return Listing(element.level, self._plain(element))
-        fields = place.fields(kind)
-        return Object(Lazily(fields, lambda name: self._plain(fields[name])), place)
-
-    def _summary(self, message: Object, place: Place) -> Node:
-        """Returns what the conversions make of the data of an image, a map or a magnet.
-
-        Raises:
-            UnknownShapeError: it is a plain image or a cloud, or the definition is not the standard
-                one.
-        """
-        around = message.place.kind if message.place else ""
-        kind = around.type.rpartition("/")[2] if isinstance(around, Definition) else ""
-        if kind == "MagneticField":
-            node = self.shown(place)
-            if is_object(node) and node.place is None:
-                return node
-        if not isinstance(place.kind, str) or place.length != SEQUENCE:
-            raise UnknownShapeError(f"{place.path} is no sequence of bytes")
-
-        def leaf(kind: Kind, *path: str) -> Leaf:
-            child = descend(message, path)
-            if isinstance(child, Leaf) and child.kind is kind:
-                return child
-            raise UnknownShapeError(f"{'.'.join(path)} is not as in the standard definition")
-
-        count = Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)
-        if kind == "CompressedImage":  # as markers have them
-            parts = {"bytes": count, "encoding": leaf(Kind.TEXT, "format")}
-            return Object(parts, is_summary=True)
-        if kind != "OccupancyGrid":
-            raise UnknownShapeError("images and clouds are no columns")
-        shape = tuple(leaf(Kind.INTEGER, "info", name) for name in ("height", "width"))
-        return Object({"bytes": count, "shape": Items(shape)}, is_summary=True)
-
-    @cached_property
-    def _root(self) -> Place:
-        return Place(ROWS, "", self.definition, None, 0)
-
-    def _at(self, path: Sequence[str]) -> Node | None:
-        node = descend(self.shown(self._root), path)
-        if node is not None:
-            return node
-        plain = descend(self._plain(self._root), path)
-        return None if plain is None else _with_changed_leaves(plain, self._as_shown)
-
-    def _as_shown(self, node: Node) -> Node:
-        """Returns the end of a walk through definitions as the value shows it."""
-        if isinstance(node, Object) and node.place is not None:
-            return self.shown(node.place)
-        return node
+        if summarized in fields:
+            shown[summarized] = _summary(definition.type, shown, fields[summarized])
+        return shown
 
     def _array(self, place: Place) -> Node:
         level, path, kind, length, _ = place
         element = place.element()
-        listing = Listing(element.level, self.shown(element))
-        if not isinstance(kind, str) or _kind(kind) is Kind.TEXT:
-            return listing
-        count, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
-        counted = Leaf(level, (f"{path}.length",), Kind.INTEGER)
-        summary = Object({key: counted}, is_summary=True)
+        leaf = self._shown(element)
+        if not isinstance(kind, str) or not isinstance(leaf, Leaf) or leaf.kind is Kind.TEXT:
+            return Listing(element.level, leaf)
+        most, key = (self._limit, "bytes") if kind in _BYTES else (MAX_EXACT_NUMBERS, "numbers")
+        summary = Summary({key: _size(place)})
         if length == SEQUENCE:
-            longer = _where_longer(level, path, count, is_longer=True)
-            shorter = _where_longer(level, path, count, is_longer=False)
-            return Choice((Narrowed(longer, summary), Narrowed(shorter, listing)), listing)
-        size = length or 0
-        array: Node = listing
-        if size <= MAX_NUMBERS:
-            array = Items(
-                tuple(Leaf(level, (f"{path}.{nth}",), _kind(kind)) for nth in range(size))
+            longer, shorter = (
+                where_longer(level, path, most, is_longer=is_longer) for is_longer in (True, False)
             )
-        return array if size <= count else Choice((summary,), array)
+            return Listing(element.level, narrowed(leaf, shorter), narrowed(summary, longer))
+        size = length or 0
+        if size > most:
+            return summary
+        if size > MAX_NUMBERS:
+            return Listing(element.level, leaf)
+        return [Leaf(level, (f"{path}.{nth}",), leaf.kind) for nth in range(size)]
+
+
+def _size(place: Place) -> Node:
+    """Returns the length of a sequence in a summary: in a list, as what is not searched there."""
+    return [Leaf(place.level, (f"{place.path}.length",), Kind.INTEGER)]
+
+
+def _summary(type_name: str, fields: dict[str, Node], place: Place) -> Node:
+    """Returns what the conversions make of the data of an image, a map or a magnet.
+
+    `UNKNOWN` where it is a plain image or a cloud, or the definition is not the standard one.
+    """
+    kind = type_name.rpartition("/")[2]
+    if kind == "MagneticField":
+        field = fields[place.path.rpartition(".")[2]]
+        return field if isinstance(field, dict) and [*field] == [*"xyz"] else UNKNOWN
+    if not isinstance(place.kind, str) or place.length != SEQUENCE:
+        return UNKNOWN
+    encoding, info = fields.get("format"), fields.get("info")
+    if kind == "CompressedImage" and isinstance(encoding, Leaf) and encoding.kind is Kind.TEXT:
+        return Summary({"bytes": _size(place), "encoding": encoding})  # as markers have them
+    if kind == "OccupancyGrid" and isinstance(info, dict):
+        shape = [info.get(name, UNKNOWN) for name in ("height", "width")]
+        if all(isinstance(length, Leaf) and length.kind is Kind.INTEGER for length in shape):
+            return Summary({"bytes": _size(place), "shape": shape})
+    return UNKNOWN
 
 
 def _converted(name: str, node: Node) -> Node:
     """Returns the value of a name of the schema map: an array as the point or turn it is."""
-    if isinstance(node, Narrowed):
-        return Narrowed(node.limit, _converted(name, node.node))
     count = 3 if name in POINTS else 4 if name == "orientation" else 0
-    array = node.array if isinstance(node, Choice) else node
-    if count and isinstance(node, Choice) and isinstance(array, Listing) and len(node.cases) > 1:
+    if count and isinstance(node, Listing) and len(node) > 1:
         raise UnknownShapeError(f"{name} has another length in each message")
-    if not count or not isinstance(array, Items) or len(array.items) != count:
+    if not isinstance(node, list) or isinstance(node, Listing) or len(node) != count:
         return node
-    is_numeric = all(leaf.is_number for leaf in array.items)
-    level, first, *others = array.items[0].level, *(leaf.sources[0] for leaf in array.items)
+    leaves = leaves_of(node)
+    is_numeric = all(leaf.is_number for leaf in leaves)
+    first, *others = (leaf.sources[0] for leaf in leaves)
     if name in POINTS:
-        return _vector(level, [first, *others]) if is_numeric else node
+        return _vector(leaves[0].level, [first, *others]) if is_numeric else node
     # PX4 writes w first.
-    return _angles_of(level, [*others, first]) if is_numeric else NOTHING
+    return _angles_of(leaves[0].level, [*others, first]) if is_numeric else NOTHING
+
+
+@lru_cache(maxsize=128)
+def _shape(definition: Definition, type_name: str, extractor: SchemaExtractor) -> Shape:
+    return Shape(definition, type_name, extractor)
 
 
 def shape_of(table_or_parts: Table | PartZones, extractor: SchemaExtractor) -> Shape | None:
     """Returns the shape of a table's type, or of some parts'; None where the messages decide."""
     if table_or_parts.definition is None or "" in table_or_parts.left_out:
         return None
-    return Shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
+    return _shape(table_or_parts.definition, table_or_parts.channel.type, extractor)
 
 
 class ByType(Generic[T]):
@@ -469,173 +290,141 @@ class ByType(Generic[T]):
     def __init__(self, extractor: SchemaExtractor, make: Callable[[Shape], T]) -> None:
         self._extractor = extractor
         self._make = make
-        self._known: dict[tuple[Definition, str], T | None] = {}
+        self._known: dict[Shape, T | None] = {}
 
     def of(self, table_or_parts: Table | PartZones) -> T | None:
         """Returns that of a table's type, or of some parts'; None where the messages decide."""
         shape = shape_of(table_or_parts, self._extractor)
         if shape is None:
             return None
-        key = (shape.definition, shape.type)
-        if key not in self._known:
+        if shape not in self._known:
             try:
-                self._known[key] = self._make(shape)
+                self._known[shape] = self._make(shape)
             except UnknownShapeError:
-                self._known[key] = None
-        return self._known[key]
+                self._known[shape] = None
+        return self._known[shape]
 
 
-def descend(node: Node, path: Sequence[str]) -> Node | None:
-    """Returns what is at a path of the schema map, as `messages.fields.descend` finds it.
+def _descend(node: Node, path: Sequence[str], *, parts: bool = False) -> Node | None:
+    """Returns what is at a path of the schema map, as `messages.conversions.descend` finds it.
 
-    None where no field is.
+    With `parts` also the numbers of a rotation. None where no field is.
+
+    Raises:
+        UnknownShapeError: it depends on the message.
     """
     for nth, segment in enumerate(path):
-        if isinstance(node, Choice):
-            node = node.array
-        if isinstance(node, Nothing):
+        if isinstance(node, Listing) and len(node) > 1:  # a long array is looked at here
+            node = Listing(
+                node.level, _changed(node.element, lambda leaf: leaf._replace(limits=()))
+            )
+        if node is NOTHING:
             return node
-        if isinstance(node, Narrowed):
-            inner = descend(node.node, path[nth:])
-            return None if inner is None else Narrowed(node.limit, inner)
-        if isinstance(node, Listing | Items) and segment.isascii() and segment.isdecimal():
-            node = _element_at(node, int(segment[:10]))
+        if isinstance(node, list) and segment.isascii() and segment.isdecimal():
+            node = next(iter(picked(node, int(segment[:10]))), NOTHING)
         elif isinstance(node, Listing):
-            inner = descend(node.element, path[nth:])
+            inner = _descend(node.element, path[nth:], parts=parts)
             return None if inner is None else Listing(node.level, inner)
-        elif isinstance(node, Object) and segment in node.fields:
-            node = node.fields[segment]
+        elif isinstance(node, dict) and segment in node:
+            node = node[segment]
+        elif (
+            node is UNKNOWN
+            or isinstance(node, Summary)
+            or (isinstance(node, Leaf) and node.conversion is Conversion.SECONDS)
+        ):
+            raise UnknownShapeError(f"{segment} is in a part that is not shown as it is")
         else:
-            return None
+            xyzw = xyzw_of(node) if parts and isinstance(node, dict) else []
+            if not xyzw or segment not in {*"xyzw"}:
+                return None
+            node = xyzw["xyzw".index(segment)]
     return node
 
 
-def at_field(root: Node, dot_path: str) -> Sequence[Spot]:
+def xyzw_of(angles: dict[str, Node]) -> list[Leaf]:
+    """Returns the parts of the quaternion that is shown as angles; nothing for any other object."""
+    leaf = angles.get(ANGLES[0])
+    if not isinstance(leaf, Leaf) or leaf.conversion not in _TURNS:
+        return []
+    return [Leaf(leaf.level, (part,), Kind.REAL, limits=leaf.limits) for part in leaf.sources]
+
+
+def at_field(root: Node, dot_path: str) -> list[Node]:
     """Returns what is at a dot-path in the value, as `analysis.conditions.at_field` finds it.
 
     Raises:
         UnknownShapeError: it depends on the message.
     """
+    names = conditions.names_beside(root, dot_path)
     head, _, name = dot_path.partition(".")
-    fields = root.fields if isinstance(root, Object) else {}
-    lists = (fields[key] for key in ELEMENT_NAMES if key in fields and key != head)
-    names = next((node.element for node in lists if isinstance(node, Listing)), None)
-    if name and head in fields and isinstance(names, Leaf) and not _INDEX.fullmatch(name):
-        found = list[Spot]()
-        for array, limits in opened(Spot(fields[head])):
-            if isinstance(array, Listing) and isinstance(array.element, Leaf):
-                element = Narrowed(_at_name(array.level, names, name), array.element)
-                found.append(Spot(element, limits))
-            elif isinstance(array, Items):
-                for nth, leaf in enumerate(array.items):
-                    element = Narrowed(_at_name(leaf.level, names, name, nth), leaf)
-                    found.append(Spot(element, limits))
-            else:  # such as the summary of a long one
-                found += _along([Spot(array, limits)], name)
-        return found
-    return _along([Spot(root)], dot_path)
+    array = root.get(head) if isinstance(root, dict) else None
+    leaf = names.element if isinstance(names, Listing) else None
+    if isinstance(leaf, Leaf) and leaf.kind is Kind.TEXT and isinstance(array, list):
+        if leaf.level.parent != ROWS or leaf.limits:
+            raise UnknownShapeError(f"{name} is looked for in several lists of names")
+        if not isinstance(array, Listing):
+            return [
+                narrowed(element, at_name(ROWS, leaf, name, nth))
+                for nth, element in enumerate(array)
+            ]
+        sizes = (part[name] for part in array if isinstance(part, Summary) and name in part)
+        return [narrowed(array.element, at_name(array.level, leaf, name)), *sizes]
+    found = conditions.along(root, dot_path.split("."), picked)
+    if any(node is UNKNOWN for node in chain.from_iterable(found)):
+        raise UnknownShapeError(f"{dot_path} leads to what is not known")
+    return found[-1]
 
 
-def _along(spots: Sequence[Spot], dot_path: str) -> Sequence[Spot]:
-    for segment in dot_path.split("."):
-        spots = [target for spot in spots for target in _step(spot, segment)]
-    return spots
+def picked(nodes: list[Node], index: int) -> list[Node]:
+    """Returns the element of a list at a place, if there may be one."""
+    if not isinstance(nodes, Listing):
+        return conditions.element_at(nodes, index)
+    return [narrowed(nodes.element, at_place(nodes.level, index))]
 
 
-def opened(spot: Spot) -> Iterator[Spot]:
-    """Yields a spot without `Narrowed` and `Choice`: their limits are the spot's own."""
-    node, limits = spot
-    if isinstance(node, Narrowed):
-        yield from opened(Spot(node.node, (*limits, node.limit)))
-    elif isinstance(node, Choice):
-        for case in node.cases:
-            yield from opened(Spot(case, limits))
-    else:
-        yield spot
-
-
-def leaves_below(root: Spot) -> Iterator[tuple[str, Leaf, Limits]]:
-    """Yields the leaves at or below a spot, with their dot-paths in the value.
-
-    Below a summary these are its texts, as in `analysis.conditions.leaves`.
+def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
+    """Returns the leaves of a node, those of `analysis.conditions.leaves`, in their order.
 
     Raises:
-        UnknownShapeError: there are more than `MAX_LEAVES`, or it depends on the message.
+        UnknownShapeError: it depends on the message.
     """
-    waiting = [("", root)]
-    count = 0
-    while waiting:
-        path, spot = waiting.pop()
-        count += 1
-        if count > MAX_LEAVES:
-            raise UnknownShapeError(f"the value has more than {MAX_LEAVES} parts")
-        for node, limits in opened(spot):
-            if isinstance(node, Leaf):
-                yield path, node, limits
-            elif isinstance(node, Listing):
-                waiting.append((path, Spot(node.element, limits)))
-            elif isinstance(node, Items):
-                yield from ((path, item, limits) for item in node.items)
-            elif isinstance(node, Object):
-                waiting.extend(
-                    (_below(path, key), Spot(child, limits))
-                    for key, child in reversed([*node.fields.items()])
-                    if not node.is_summary or (isinstance(child, Leaf) and child.kind is Kind.TEXT)
-                )
+    found = [*conditions.leaves(node, in_objects=in_objects)]
+    if UNKNOWN in found:
+        raise UnknownShapeError("it depends on the message")
+    return [leaf for leaf in found[::-1] if isinstance(leaf, Leaf)]
 
 
-def is_object(node: Node | None) -> TypeGuard[Object]:
-    """Returns whether a node is an object that may be a detection, or have some in it."""
-    return isinstance(node, Object) and node.xyzw is None
+def narrowed(node: Node, limit: Limit) -> Node:
+    """Returns a node that stands in the value of some rows or elements alone."""
+    return _changed(node, lambda leaf: leaf._replace(limits=(*leaf.limits, limit)))
 
 
-def _step(spot: Spot, segment: str) -> Iterator[Spot]:
-    for node, limits in opened(spot):
-        if isinstance(node, Object):
-            if segment in node.fields:
-                yield Spot(node.fields[segment], limits)
-        elif isinstance(node, Listing | Items) and _INDEX.fullmatch(segment):
-            yield Spot(_element_at(node, int(segment)), limits)
-        elif isinstance(node, Listing):
-            yield from _step(Spot(node.element, limits), segment)
-
-
-def _element_at(node: Listing | Items, index: int) -> Node:
+def _changed(node: Node, change: Callable[[Leaf], Leaf]) -> Node:
+    """Returns a node with its leaves changed."""
+    if isinstance(node, Leaf):
+        return change(node)
     if isinstance(node, Listing):
-        return Narrowed(_at_place(node.level, index), node.element)
-    return node.items[index] if -len(node.items) <= index < len(node.items) else NOTHING
-
-
-def _with_changed_leaves(node: Node, change: Callable[[Node], Node]) -> Node:
-    """Returns a node with each value in it changed: of a list, its elements."""
-    if isinstance(node, Listing):
-        return Listing(node.level, _with_changed_leaves(node.element, change))
-    if isinstance(node, Narrowed):
-        return Narrowed(node.limit, _with_changed_leaves(node.node, change))
-    return change(node)
-
-
-def _quaternion_as_xyzw(node: Node) -> Node:
-    """Returns a rotation as the x, y, z, w of its message, and not as angles; others unchanged."""
-    return node.xyzw if isinstance(node, Object) and node.xyzw is not None else node
+        return Listing(node.level, *(_changed(part, change) for part in node))
+    if isinstance(node, list):
+        return [_changed(part, change) for part in node]
+    if isinstance(node, dict):
+        return type(node)({name: _changed(part, change) for name, part in node.items()})
+    return node
 
 
 def _below(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _real(level: Level, source: str) -> Leaf:
-    return Leaf(level, (source,), Kind.REAL)
+def _vector(level: Level, sources: Sequence[str]) -> Node:
+    return {
+        axis: Leaf(level, (source,), Kind.REAL) for axis, source in zip("xyz", sources, strict=True)
+    }
 
 
-def _vector(level: Level, sources: Sequence[str]) -> Object:
-    return Object({axis: _real(level, source) for axis, source in zip("xyz", sources, strict=True)})
-
-
-def _angles_of(level: Level, sources: Sequence[str], xyzw: Object | None = None) -> Object:
-    angles = (Conversion.ROLL, Conversion.PITCH, Conversion.YAW)
-    leaves = [Leaf(level, tuple(sources), Kind.REAL, angle) for angle in angles]
-    return Object(dict(zip(ANGLES, leaves, strict=True)), xyzw=xyzw)
+def _angles_of(level: Level, sources: Sequence[str]) -> Node:
+    leaves = [Leaf(level, tuple(sources), Kind.REAL, turn) for turn in _TURNS]
+    return dict(zip(ANGLES, leaves, strict=True))
 
 
 def _kind(primitive: str) -> Kind:

@@ -35,19 +35,11 @@ from ros2_memory.analysis.facts import (
     joined_facts,
     state_of,
 )
-from ros2_memory.columns.detections import Source, found_in, sources_in
-from ros2_memory.columns.shown import (
-    ByType,
-    Listing,
-    Narrowed,
-    Node,
-    Shape,
-    Spot,
-    is_object,
-    leaves_below,
-    placed,
-)
-from ros2_memory.columns.values import ROWS, Conversion, Kind, Leaf, UnknownShapeError, Values
+from ros2_memory.columns.detections import found_in
+from ros2_memory.columns.limits import placed
+from ros2_memory.columns.shown import UNKNOWN, ByType, Node, Shape, at_field, leaves_of
+from ros2_memory.columns.sources import Source, sources_in
+from ros2_memory.columns.values import ROWS, Kind, Leaf, UnknownShapeError, Values
 from ros2_memory.columns.walk import entries_of_codes
 
 if TYPE_CHECKING:
@@ -68,19 +60,13 @@ class FromColumns(NamedTuple):
     Attributes:
         stated: what is known.
         unsure: the rows of the messages that have to be read besides, ascending.
-        alike: by row, equal numbers for consecutive messages that state the same, so that one of
-            them has to be read; None where only those that are `unsure` have to be.
     """
 
     stated: Stated
     unsure: Ints
-    alike: Ints | None = None
 
     def to_read(self, index: Ints | None) -> Ints:
         """Returns the positions, among some rows (None: all), of the messages to be read."""
-        if self.alike is not None:
-            alike = self.alike if index is None else self.alike[index]
-            return np.flatnonzero(np.diff(alike, prepend=-1))
         return self.unsure if index is None else np.flatnonzero(np.isin(index, self.unsure))
 
 
@@ -119,20 +105,20 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
     """
     value, type_name = shape.value, shape.type
     if type_name == GOALS:
-        return partial(_goals, [*_goal_leaves(value)])
+        return _goals
     if has_errors(type_name):
         return partial(_entries, _entry_leaves(value, type_name), type_name)
     numbers: Callable[[Values], tuple[Facts, Ints]] | None = None
     commands = [*_command_leaves(value)] if type_name in VELOCITIES else []
-    leaf = _child(value, "percentage")
+    charges = _leaves_at(value, "percentage") if type_name == BATTERY else []
     if commands:
         numbers = partial(_command_facts, commands)
-    elif type_name == BATTERY and isinstance(leaf, Leaf) and leaf.kind is Kind.REAL:
-        numbers = partial(_charge_facts, leaf)
+    elif [charge.kind for charge in charges] == [Kind.REAL]:
+        numbers = partial(_charge_facts, charges[0])
     flags = [*_flag_leaves(value, "")] if has_events(type_name) else []
     if len(flags) > MOST[FLAG]:
         raise UnknownShapeError("more booleans than are tracked")
-    sources = [*sources_in(value)] if has_events(type_name) else []
+    sources = sources_in(value) if has_events(type_name) else []
     return partial(_states, sources, flags, numbers)
 
 
@@ -141,62 +127,45 @@ def _reader_of(shape: Shape) -> Callable[[Values], FromColumns]:
 
 def _flag_leaves(node: Node, path: str) -> Iterator[tuple[str, Leaf]]:
     """Yields the booleans of objects; none of lists."""
-    if isinstance(node, Narrowed):
-        raise UnknownShapeError("an element of a list stands alone")
+    if node is UNKNOWN or (isinstance(node, Leaf) and node.limits):
+        raise UnknownShapeError("it depends on the message")
     if isinstance(node, Leaf) and node.kind is Kind.BOOLEAN:
         yield path, node
-    elif is_object(node):
-        for name, inner in node.fields.items():
+    elif isinstance(node, dict):
+        for name, inner in node.items():
             yield from _flag_leaves(inner, f"{path}.{name}" if path else name)
 
 
 def _entry_leaves(value: Node, type_name: str) -> _Entry:
     """Returns level, name and text of a log entry, or of the elements of a list of diagnostics."""
-    node: Node | None = value
-    texts = ("name", "msg")
+    paths = ["level", "name", "msg"]
     if type_name == DIAGNOSTICS:
-        listed = _child(value, "status")
-        texts, node = ("name", "message"), listed.element if isinstance(listed, Listing) else None
-    leaves = [_child(node, name) for name in ("level", *texts)]
-    kinds = [leaf.kind for leaf in leaves if isinstance(leaf, Leaf)]
-    if kinds != [Kind.INTEGER, Kind.TEXT, Kind.TEXT]:
+        paths = ["status.level", "status.name", "status.message"]
+    leaves = [leaf for path in paths for leaf in _leaves_at(value, path)]
+    if [leaf.kind for leaf in leaves] != [Kind.INTEGER, Kind.TEXT, Kind.TEXT]:
         raise UnknownShapeError("the definition is not the standard one")
-    return _Entry(*(leaf for leaf in leaves if isinstance(leaf, Leaf)))
+    return _Entry(*leaves)
 
 
-def _child(node: Node | None, name: str) -> Node | None:
-    return node.fields.get(name) if is_object(node) else None
+def _leaves_at(value: Node, path: str) -> list[Leaf]:
+    return [node for node in at_field(value, path) if isinstance(node, Leaf)]
 
 
 def _command_leaves(value: Node) -> Iterator[Leaf]:
     """Yields the floats of a command."""
-    for _, leaf, limits in leaves_below(Spot(value)):
-        if limits or leaf.level != ROWS:
+    for leaf in leaves_of(value):
+        if leaf.limits or leaf.level != ROWS:
             raise UnknownShapeError("a command has a list")
         if leaf.kind is Kind.REAL:
             yield leaf
 
 
-def _goal_leaves(value: Node) -> Iterator[Leaf]:
-    """Yields what tells the goals of a status apart, but for their ids, and their statuses."""
-    listed = _child(value, "status_list")
-    if not isinstance(listed, Listing):
-        raise UnknownShapeError("the definition is not the standard one")
-    for _, leaf, _ in leaves_below(Spot(listed.element)):
-        if leaf.level == listed.level and leaf.conversion in {
-            Conversion.STORED,
-            Conversion.SECONDS,
-        }:
-            yield leaf
-    for end in ("least", "greatest"):
-        yield Leaf(listed.level, (f"goal_info.goal_id.uuid.{end}",), Kind.REAL)
-
-
 # What a table holds
 
 
-def _goals(leaves: Sequence[Leaf], values: Values) -> FromColumns:
-    return FromColumns(Stated(values.table.log_times), _NO_ROWS, _alike_goals(values, leaves))
+def _goals(values: Values) -> FromColumns:
+    """Returns that all messages are to be read: the ids of goals are no columns."""
+    return FromColumns(Stated(values.table.log_times), np.arange(values.rows))
 
 
 def _entries(entry: _Entry, type_name: str, values: Values) -> FromColumns:
@@ -300,25 +269,3 @@ def _facts_of(kind: str, rows: Ints, numbers: Ints | Mask | Floats, name: str = 
     """Returns a number of each row as a fact, under one word."""
     words = [Word(kind, name) if name else Word(kind)]
     return Facts(rows, np.zeros(rows.size, np.int64), numbers.astype(np.float64), words)
-
-
-def _alike_goals(values: Values, leaves: Sequence[Leaf]) -> Ints:
-    """Returns a number for each row: that of the row before if both list the same goals.
-
-    An action server lists a goal with the time at which it accepted it, so one goal does not take
-    the place of another without a trace.
-    """
-    columns = [values.numbers(leaf).values for leaf in leaves]
-    owners = values.elements(leaves[0].level).owners
-    first = np.searchsorted(owners, np.arange(values.rows + 1))
-    counts = np.diff(first)
-    is_new = np.diff(counts, prepend=-1) != 0
-    # Each element is compared with the one that has its place in the row before.
-    nth = np.arange(owners.size) - first[owners]
-    before = np.maximum(first[np.maximum(owners - 1, 0)] + nth, 0)
-    before = np.minimum(before, max(owners.size - 1, 0))
-    is_different = np.zeros(owners.size, np.bool_)
-    for column in columns:
-        is_different |= column != column[before]
-    is_new[owners[is_different]] = True
-    return np.cumsum(is_new)

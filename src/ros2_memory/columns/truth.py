@@ -11,38 +11,22 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import chain, compress
+from itertools import compress
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.analysis.conditions import (
-    POSITION_KEYS,
     Beyond,
     Condition,
     Contains,
     Equals,
     NearPosition,
+    points,
 )
-from ros2_memory.columns.scores import may_be_json, without_low
-from ros2_memory.columns.shown import (
-    MAX_LEAVES,
-    ByType,
-    Limits,
-    Listing,
-    Node,
-    Nothing,
-    Object,
-    Shape,
-    Spot,
-    TruthValues,
-    at_field,
-    leaves_below,
-    nowhere,
-    opened,
-    placed,
-    unknown,
-)
+from ros2_memory.columns.limits import Limit, TruthValues, nowhere, placed, unknown
+from ros2_memory.columns.shown import NOTHING, ByType, Node, Shape, at_field, leaves_of
+from ros2_memory.columns.sources import may_be_json, without_low
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import MAX_NUMBERS, as_float
 from ros2_memory.columns.values import (
@@ -176,23 +160,19 @@ def _any_of(tests: Sequence[_Test], values: Values) -> TruthValues:
 
 def _tests(condition: Condition, value: Node) -> list[_Test]:
     test, field = condition.test, condition.field
-    spots = [Spot(value)] if field is None else at_field(value, field)
-    if isinstance(test, NearPosition):
-        return [
-            _PlaceTest(test, leaves, limits)
-            for spot in spots
-            for leaves, limits in _positions(spot)
-            # A missing z is NaN, which is near only what is infinitely far away.
-            if test.z is None or len(leaves) == 3 or math.isinf(test.tolerance_m)
-        ]
+    targets = [value] if field is None else at_field(value, field)
     tests: list[_Test] = []
-    for spot in spots:
-        for path, leaf, limits in leaves_below(spot):
-            # Elements of lists have no name of their own.
-            is_element = field is not None and not path
-            leaf_test = _LeafTest(test, leaf, limits, is_element, condition.least_score, {})
-            if leaf_test.is_needed:
-                tests.append(leaf_test)
+    for target in targets:
+        leaves = leaves_of(target)
+        if isinstance(test, NearPosition):
+            tests += _place_tests(test, target)
+            continue
+        # Elements of lists have no name of their own.
+        elements = [] if field is None else leaves_of(target, in_objects=False)
+        leaf_tests = (
+            _LeafTest(test, leaf, leaf in elements, condition.least_score, {}) for leaf in leaves
+        )
+        tests += (leaf_test for leaf_test in leaf_tests if leaf_test.is_needed)
     return tests
 
 
@@ -202,7 +182,6 @@ class _LeafTest(NamedTuple):
     Attributes:
         test: what is asked.
         leaf: on which leaf.
-        limits: where that stands in the value.
         is_element: whether it is what a field leads to, or an element of that.
         least_score: for texts that are JSON.
         decided: whether texts pass that many parts have.
@@ -210,7 +189,6 @@ class _LeafTest(NamedTuple):
 
     test: Contains | Equals | Beyond
     leaf: Leaf
-    limits: Limits
     is_element: bool
     least_score: float
     decided: dict[str, bool]
@@ -259,7 +237,7 @@ class _LeafTest(NamedTuple):
             possible = possible | zone.spans(number)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
         """Yields which rows or elements of a level pass.
 
         Raises:
@@ -267,13 +245,13 @@ class _LeafTest(NamedTuple):
         """
         leaf, around = self.leaf, self.leaf.level.parent
         if leaf.kind is Kind.TEXT:
-            yield leaf.level, self._passing_texts(values), self.limits
+            yield leaf.level, self._passing_texts(values), leaf.limits
         elif not leaf.is_of_array or around is None:
-            yield leaf.level, self._passing_numbers(values.numbers(leaf)), self.limits
+            yield leaf.level, self._passing_numbers(values.numbers(leaf)), leaf.limits
         else:
             is_held = values.numeric(leaf.level, "") is not None
             if is_held:
-                yield leaf.level, self._passing_numbers(values.numbers(leaf)), self.limits
+                yield leaf.level, self._passing_numbers(values.numbers(leaf)), leaf.limits
             yield from self._in_long_arrays(values, around, is_part=is_held)
 
     @property
@@ -344,7 +322,7 @@ class _LeafTest(NamedTuple):
 
     def _in_long_arrays(
         self, values: Values, level: Level, *, is_part: bool
-    ) -> Iterator[tuple[Level, TruthValues, Limits]]:
+    ) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
         """Yields the rows or elements whose arrays are too long to be held, by what is known."""
         path = self.leaf.level.name
         lengths = values.numeric(level, f"{path}.length")
@@ -361,9 +339,10 @@ class _LeafTest(NamedTuple):
             ends = [level.full(f"{path}.{end}") for end in ("least", "greatest")]
             error = max(values.table.error(end) for end in ends)
             kept = self._between(least, greatest, error)
-        limits = tuple(limit for limit in self.limits if limit.level != self.leaf.level)
+        leaf = self.leaf
+        limits = tuple(limit for limit in leaf.limits if limit.level != leaf.level)
         # Of one that is picked from an array, what is known of all says only what it may be.
-        surely = is_long & kept.surely & (len(limits) == len(self.limits))
+        surely = is_long & kept.surely & (len(limits) == len(leaf.limits))
         yield level, TruthValues(surely, is_long & kept.perhaps), limits
 
     def _between(self, least: Numeric, greatest: Numeric, error: float) -> TruthValues:
@@ -434,8 +413,7 @@ class _PlaceTest(NamedTuple):
     """`near_position`, on one position of a value: the leaves of its x, y and perhaps z."""
 
     test: NearPosition
-    leaves: tuple[Leaf, ...]
-    limits: Limits
+    leaves: Sequence[Leaf]
 
     def may_match(self, zone_of: ZoneOf[Leaf]) -> bool | Mask:
         """Returns whether some position may be near, as far as known without reading any."""
@@ -446,10 +424,10 @@ class _PlaceTest(NamedTuple):
             possible = possible if zone is None else possible & zone.may_be_near(center, reach)
         return possible
 
-    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, Limits]]:
+    def passing(self, values: Values) -> Iterator[tuple[Level, TruthValues, tuple[Limit, ...]]]:
         """Yields which rows or elements of a level are near; raises as that of `_LeafTest`."""
         columns = [values.numbers(leaf) for leaf in self.leaves[: len(self._center)]]
-        yield self.leaves[0].level, self._near(columns), self.limits
+        yield self.leaves[0].level, self._near(columns), self.leaves[0].limits
 
     @property
     def _center(self) -> tuple[float, ...]:
@@ -459,63 +437,28 @@ class _PlaceTest(NamedTuple):
     def _near(self, columns: Sequence[LeafNumbers]) -> TruthValues:
         tolerance = self.test.tolerance_m
         axes = [column.values.astype(np.float64, copy=False) for column in columns]
-        axes += [np.full(len(axes[0]), np.nan)] * (len(self._center) - len(axes))
+        error = sum(column.error for column in columns)
         with np.errstate(all="ignore"):
             squared = [(axis - at) ** 2 for axis, at in zip(axes, self._center, strict=True)]
             apart = np.sqrt(np.add.reduce(squared))
-            # Their sum, which is no less than the root of their squares: of 1e-200 that is 0.
-            error = sum(column.error for column in columns)
-            margin = error + tolerance * _ROUNDING
-            has_infinite = np.logical_or.reduce([np.isinf(axis) for axis in axes])
-            is_doubtful = (np.abs(apart - tolerance) <= margin) | (apart < _TINY_M)
-            is_doubtful |= np.isinf(apart) | has_infinite
             is_near = apart <= tolerance
-        if np.any(error):
-            return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
-        for nth in np.flatnonzero(is_doubtful).tolist():
-            x, y, z = (*(float(axis[nth]) for axis in axes), math.nan)[:3]
-            is_near[nth] = self.test.is_near(x, y, z)
-        return TruthValues.known(is_near)
+            if not np.any(error):
+                return TruthValues.known(is_near)
+            # Their sum, which is no less than the root of their squares: of 1e-200 that is 0.
+            is_doubtful = np.abs(apart - tolerance) <= error + tolerance * _ROUNDING
+            is_doubtful |= apart < _TINY_M
+        return TruthValues(is_near & ~is_doubtful, is_near | is_doubtful)
 
 
-def _positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
-    """Yields the positions in a value, as `analysis.conditions.positions` finds them."""
-    for whole in opened(spot):
-        direct = [*_own_positions(whole)]
-        yield from direct or _positions_below(whole)
+def _place_tests(test: NearPosition, target: Node) -> Iterator[_PlaceTest]:
+    """Yields a test of each position in a part of a value."""
 
+    def is_axis(node: Node) -> bool:
+        return node is NOTHING or (isinstance(node, Leaf) and node.kind is not Kind.TEXT)
 
-def _positions_below(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
-    waiting, count = [spot], 0
-    while waiting:
-        for node, limits in opened(waiting.pop()):
-            count += 1
-            if count > MAX_LEAVES:
-                raise UnknownShapeError(f"the value has more than {MAX_LEAVES} parts")
-            if isinstance(node, Listing):
-                waiting.append(Spot(node.element, limits))
-            elif isinstance(node, Object):
-                fields = node.fields
-                named = [Spot(fields[key], limits) for key in POSITION_KEYS if key in fields]
-                for inner in chain.from_iterable(map(opened, named)):
-                    yield from _own_positions(inner)
-                waiting.extend(Spot(child, limits) for child in fields.values())
-
-
-def _own_positions(spot: Spot) -> Iterator[tuple[tuple[Leaf, ...], Limits]]:
-    """Yields the position that an opened node is, or that the elements of a list are."""
-    node, limits = spot
-    if isinstance(node, Listing):
-        for inner in opened(Spot(node.element, limits)):
-            if not isinstance(inner.node, Listing):
-                yield from _own_positions(inner)
-    elif isinstance(node, Object):
-        axes = [node.fields.get(axis) for axis in "xyz"]
-        is_position = all(
-            isinstance(axis, Nothing) or (isinstance(axis, Leaf) and axis.kind is not Kind.TEXT)
-            for axis in axes[:2]
-        )
-        if is_position:
-            leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.is_number]
-            if all(axis in leaves for axis in axes[:2]):
-                yield tuple(leaves), limits
+    for point in points(target, is_axis):
+        axes = [point.get(axis) for axis in "xyz"]
+        leaves = [axis for axis in axes if isinstance(axis, Leaf) and axis.is_number]
+        # A missing z is NaN, which is near nothing.
+        if all(axis in leaves for axis in axes[:2]) and (test.z is None or len(leaves) == 3):
+            yield _PlaceTest(test, leaves)

@@ -14,15 +14,19 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, cast
 
 import numpy as np
 
+from ros2_memory.analysis.frames import unit_quaternions
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.table import IN_PART, MAX_NUMBERS, Column, Elements, Table, Texts, Zone
 from ros2_memory.columns.zones import Zones
+from ros2_memory.core.arrays import row_sums
 from ros2_memory.core.geometry import GIMBAL_LOCK_SINE
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.messages.conversions import ANGLES, euler_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
+    from ros2_memory.columns.limits import Limit
 
     Floats: TypeAlias = "np.ndarray[tuple[int], np.dtype[np.float64]]"
     # Of any dtype: that of floats has the operations that all of them have.
@@ -37,7 +41,6 @@ ZoneOf: TypeAlias = "Callable[[T], Zone | Zones | None]"
 
 _EXACT_BELOW: Final = 2**53
 """Whole numbers below this are floats."""
-_UNIT_TOLERANCE: Final = 1e-12
 _ROUNDING_DEG: Final = 1e-9
 """More than numpy's arcsine and arctangent differ from those of the mathematical library."""
 _TURN_ERRORS: Final = 8.0
@@ -108,6 +111,7 @@ class Leaf(NamedTuple):
         conversion: how its value comes out of the sources.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
+        limits: for which rows or elements it stands in the value.
     """
 
     level: Level
@@ -115,6 +119,7 @@ class Leaf(NamedTuple):
     kind: Kind
     conversion: Conversion = Conversion.STORED
     json_depth: int = 0
+    limits: tuple[Limit, ...] = ()
 
     @property
     def is_number(self) -> bool:
@@ -277,8 +282,8 @@ class Values:
     def _angle(self, leaf: Leaf, parts: Sequence[Numeric]) -> LeafNumbers:
         """Returns one of the angles (degrees) of quaternions."""
         key = (leaf.level, leaf.sources)
-        x, y, z, w = (part.astype(np.float64, copy=False) for part in parts)
-        turn = self.once(key, lambda _: _euler(x, y, z, w))
+        floats = [part.astype(np.float64, copy=False) for part in parts]
+        turn = self.once(key, lambda _: _euler(floats))
         which = _ANGLES[leaf.conversion]
         angles, error = turn.degrees[which], self.error(leaf)
         if error:
@@ -287,7 +292,7 @@ class Values:
         def exactly(positions: Ints) -> Floats:
             angle_of: dict[tuple[float, float, float, float], float] = {}
             exact = np.empty(len(positions))
-            rows = zip(*(part[positions].tolist() for part in (x, y, z, w)), strict=True)
+            rows = zip(*(part[positions].tolist() for part in floats), strict=True)
             for nth, numbers in enumerate(rows):
                 if numbers not in angle_of:
                     euler = euler_of(numbers)
@@ -354,29 +359,21 @@ class _Turns(NamedTuple):
     cosine: Floats
 
 
-def _euler(x: Floats, y: Floats, z: Floats, w: Floats) -> _Turns:
+def _euler(parts: Sequence[Floats]) -> _Turns:
     """Returns quaternions as angles, as `conversions.unit` and `geometry.rpy` compute them."""
+    turns = np.stack(parts, axis=1)
+    x, y, z, w = unit_quaternions(turns).T
     with np.errstate(all="ignore"):
-        squared = x * x + y * y + z * z + w * w
-        largest = np.maximum.reduce([np.abs(part) for part in (x, y, z, w)])
-        parts = [part / largest for part in (x, y, z, w)]
-        length = np.sqrt(sum((part * part for part in parts[1:]), parts[0] * parts[0]))
-        is_unit = np.abs(squared - 1) < _UNIT_TOLERANCE
-        is_turn = np.isfinite(largest) & (largest > 0)
-        x, y, z, w = (
-            np.where(is_unit, whole, np.where(is_turn, part / length, np.nan))
-            for whole, part in zip((x, y, z, w), parts, strict=True)
-        )
         sine = np.clip(2 * (w * y - z * x), -1.0, 1.0)
         is_locked = np.abs(sine) > GIMBAL_LOCK_SINE
         at_lock = 2 * np.arctan2(z, w)
         at_lock -= math.tau * np.rint(at_lock / math.tau)
         roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
         yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        roll = np.where(is_locked, np.where(np.isnan(roll), np.nan, 0.0), roll)
+        roll = np.where(is_locked, 0.0, roll)
         yaw = np.where(is_locked, at_lock, yaw)
         degrees = np.degrees(roll), np.degrees(np.arcsin(sine)), np.degrees(yaw)
-        return _Turns(degrees, length * largest, np.sqrt(1 - sine * sine))
+        return _Turns(degrees, np.sqrt(row_sums(turns * turns)), np.sqrt(1 - sine * sine))
 
 
 def _angle_error(error: float, length: Floats, cosine: Floats, angles: Floats) -> Floats:

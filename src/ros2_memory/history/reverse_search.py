@@ -27,7 +27,7 @@ from ros2_memory.analysis.conditions import (
     summarising,
 )
 from ros2_memory.analysis.facts import FULL_CHARGE, charge_of
-from ros2_memory.columns.shown import TruthValues
+from ros2_memory.columns.limits import TruthValues
 from ros2_memory.columns.stored import StoredTable
 from ros2_memory.columns.truth import ColumnCondition
 from ros2_memory.core.errors import (

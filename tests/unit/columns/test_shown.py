@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ros2_memory.columns.limits import placed
 from ros2_memory.columns.numbers import numbers
-from ros2_memory.columns.shown import Shape, Spot, leaves_below, placed
+from ros2_memory.columns.shown import Constant, Node, Shape
 from ros2_memory.columns.values import (
     ROWS,
     Conversion,
@@ -79,20 +80,33 @@ def named_leaves(value: JsonValue, path: str = "") -> Iterator[tuple[str, object
         yield path, value
 
 
+def paths_in(node: Node, path: str = "") -> Iterator[tuple[str, Leaf]]:
+    """The leaves of a tree, with their paths; sizes of arrays are left out."""
+    if isinstance(node, Leaf):
+        yield path, node
+    elif isinstance(node, dict):
+        for name, inner in node.items():
+            if not isinstance(node, Summary) or isinstance(inner, Leaf):
+                yield from paths_in(inner, f"{path}.{name}" if path else name)
+    elif not isinstance(node, Constant):
+        for inner in node:
+            yield from paths_in(inner, path)
+
+
 def read_leaves(drawn: Drawn, extractor: SchemaExtractor) -> list[Counter[tuple[str, object]]]:
     """The leaves of each message as the columns hold them."""
     assert drawn.table.definition is not None
     values = Values(drawn.table)
     found: list[Counter[tuple[str, object]]] = [Counter() for _ in drawn.messages]
     shape = Shape(drawn.table.definition, drawn.type, extractor)
-    for path, leaf, limits in leaves_below(Spot(shape.value)):
+    for path, leaf in paths_in(shape.value):
         try:
             column, size = column_of(values, leaf), values.size(leaf.level)
         except UnknownShapeError:
             continue
         if not values.holds_all(leaf):
             continue
-        kept, rows = placed(values, leaf.level, np.arange(size), limits, surely=True)
+        kept, rows = placed(values, leaf.level, np.arange(size), leaf.limits, surely=True)
         for at, row in zip(kept.tolist(), rows.tolist(), strict=True):
             if column[at] == column[at]:
                 found[row][path, column[at]] += 1

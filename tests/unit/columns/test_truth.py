@@ -32,7 +32,7 @@ from tests.unit.columns.drawn_tables import (
 )
 
 if TYPE_CHECKING:
-    from ros2_memory.columns.shown import TruthValues
+    from ros2_memory.columns.limits import TruthValues
     from ros2_memory.core.model import JsonValue
 
 EXTRACTOR = shipped_extractor()
