@@ -719,9 +719,7 @@ def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> lis
         ]
         if ended:
             lasts = [instance.stays[-1] for instance in ended]
-            preferred = [
-                (last.place == stay.place, _has_ended(last, stay), last.last) for last in lasts
-            ]
+            preferred = [(last.place == stay.place, last.last) for last in lasts]
             ended[preferred.index(max(preferred))].stays.append(stay)
         else:
             instances.append(Instance(group.key, group.epoch, [stay]))

@@ -128,15 +128,9 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
 
 def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
     """Returns where the peak is that the first of some cells lies at: the mean of those near it."""
-    peak: Floats = centre[0]
-    for _ in range(3):
-        near = np.flatnonzero(is_free & (_away_squared(centre, peak) <= _PEAK_MM**2))
-        if not len(near):
-            break
-        # As `numpy.average`, which takes ten times as long for few rows.
-        before, peak = peak, mass[near] @ centre[near] / mass[near].sum()
-        if (before == peak).all():
-            break
+    near = np.flatnonzero(is_free & (_away_squared(centre, centre[0]) <= _PEAK_MM**2))
+    # As `numpy.average`, which takes ten times as long for few rows.
+    peak: Floats = mass[near] @ centre[near] / mass[near].sum()
     return peak
 
 

@@ -78,6 +78,18 @@ class RobotTrack:
         """The first and the last time of each piece (ns, inclusive)."""
         return self.times[self.begins], self.times[self.ends]
 
+    def at(self, times: Times) -> tuple[Floats, Floats, Floats]:
+        """Returns x, y (m) and heading (rad) at some times, at least one; there is a vertex."""
+        first = max(int(np.searchsorted(self.times, times.min(), side="right")) - 1, 0)
+        around = slice(first, int(np.searchsorted(self.times, times.max())) + 1)
+        # From the first vertex, so that numbers are small enough for a double to be exact.
+        since = self.times[0]
+        x, y, heading = (
+            np.interp(times - since, self.times[around] - since, column[around])
+            for column in (self.x, self.y, self.heading)
+        )
+        return x, y, heading
+
 
 class PartialTrack(NamedTuple):
     """The track by some poses, in order of time, before it is joined with those before and after.
@@ -272,14 +284,13 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
     after = int(np.searchsorted(track.times, time, side="right"))
     if not after:
         return None
-    before = after - 1
-    since = time - int(track.times[before])
     if after == len(track.times) or track.begins[after]:
-        return (float(track.x[before]), float(track.y[before])) if since <= silence else None
-    share = since / int(track.times[after] - track.times[before])
-    x = track.x[before] + (track.x[after] - track.x[before]) * share
-    y = track.y[before] + (track.y[after] - track.y[before]) * share
-    return float(x), float(y)
+        last = int(track.times[after - 1])
+        if time - last > silence:
+            return None
+        time = last
+    x, y, _ = track.at(np.array([time]))
+    return float(x[0]), float(y[0])
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
@@ -296,10 +307,5 @@ def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
     if 0 < last < len(times) and not track.begins[last] and at[-1:] != [window.stop - 1]:
         at, begins = [*at, window.stop - 1], [*begins, False]
     moments = np.array(at, np.int64)
-    # From the first vertex, so that numbers are small enough for a double to be exact.
-    since = times[0] if len(times) else 0
-    x, y, heading = (
-        np.interp(moments - since, times - since, column) if len(at) else column[:0]
-        for column in (track.x, track.y, track.heading)
-    )
-    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_), track.fastest_mps)
+    places = track.at(moments) if at else (track.x[:0], track.y[:0], track.heading[:0])
+    return RobotTrack(moments, *places, np.array(begins, np.bool_), track.fastest_mps)
