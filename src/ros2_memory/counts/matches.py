@@ -621,7 +621,7 @@ def count_values(
         about=(topic,),
         start=start,
         end=stop - 1,
-        columns=(("count", "count"), ("seconds", "duration"), ("first", "time"), ("last", "time")),
+        columns=_COLUMNS[:4],
         rows=tuple(rows[:_MOST_VALUES]),
         all=(
             sum(count for _, (count, *_) in rows),

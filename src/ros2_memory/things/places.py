@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Sights, Spot
 from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.timebase import NS_PER_S
@@ -211,13 +212,9 @@ class Sightings(NamedTuple):
 
 def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     """Returns the number of the visit of each sighting, of things in ascending order."""
-    # The latest so far of a thing, as its place among all: these are small numbers.
-    order = np.argsort(last, kind="stable")
-    rank = np.empty(len(last), np.int64)
-    rank[order] = np.arange(len(last))
-    offset = np.broadcast_to(thing, len(last)) * len(last)
-    latest = last[order][np.maximum.accumulate(rank + offset) - offset]
-    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (offset[1:] != offset[:-1])
+    things = np.broadcast_to(thing, len(last))
+    latest = running_end(things, last)
+    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (things[1:] != things[:-1])
     return np.concatenate(([0], np.cumsum(begins)))
 
 

@@ -348,15 +348,13 @@ class Watching:
 
         def make() -> Joined[Seen]:
             # Which topics are of detectors shows in all of a history, so these stay apart.
-            alike: dict[
-                tuple[int, str, tuple[tuple[str, ...], ...]], list[SeenStretch[Session]]
-            ] = {}
-            for around in reversed(together):
-                for stretch in self._seen_in(around):
-                    topics = tuple(of_topic.topics for of_topic in stretch.sights)
-                    key = numbers[stretch.session], stretch.frame_id, topics
-                    alike.setdefault(key, []).append(stretch)
-            return Joined([Seen(tuple(_as_one(key[0], alike[key]) for key in sorted(alike)))])
+            def kind(stretch: SeenStretch[Session]) -> tuple[int, str, list[tuple[str, ...]]]:
+                topics = [of_topic.topics for of_topic in stretch.sights]
+                return numbers[stretch.session], stretch.frame_id, topics
+
+            seen = [part for around in reversed(together) for part in self._seen_in(around)]
+            by_kind = groupby(sorted(seen, key=kind), kind)
+            return Joined([Seen(tuple(_as_one(of[0], [*alike]) for of, alike in by_kind))])
 
         key = FragmentKey(start, digest, parts)
         [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments

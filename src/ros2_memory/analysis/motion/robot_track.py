@@ -284,13 +284,14 @@ def place_at(track: RobotTrack, time: Ns, silence: Ns = MAX_NS) -> tuple[float, 
     after = int(np.searchsorted(track.times, time, side="right"))
     if not after:
         return None
+    before = after - 1
+    since = time - int(track.times[before])
     if after == len(track.times) or track.begins[after]:
-        last = int(track.times[after - 1])
-        if time - last > silence:
-            return None
-        time = last
-    x, y, _ = track.at(np.array([time]))
-    return float(x[0]), float(y[0])
+        return (float(track.x[before]), float(track.y[before])) if since <= silence else None
+    share = since / int(track.times[after] - track.times[before])
+    x = track.x[before] + (track.x[after] - track.x[before]) * share
+    y = track.y[before] + (track.y[after] - track.y[before]) * share
+    return float(x), float(y)
 
 
 def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
