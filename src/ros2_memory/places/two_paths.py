@@ -172,8 +172,6 @@ def placed_standstills(
     at = np.linspace(ends[:, 0], ends[:, 1], _SAMPLES_OF_STAND, axis=1).astype(np.int64)
     is_known = _is_known(track, at)
     has_known = is_known.any(axis=1)
-    if not has_known.any():
-        return
     ends, at, is_known = ends[has_known], at[has_known], is_known[has_known]
     x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(at)[:2])
     rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)

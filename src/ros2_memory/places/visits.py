@@ -423,7 +423,11 @@ class ConfirmedStays:
         last = int(np.searchsorted(track.times, stay.stop, side="left"))
         times = track.times[first : last + 1]
         inner = np.concatenate(([stay.start], times, [stay.stop])).clip(stay.start, stay.stop)
-        x, y, _ = track.at(inner)
+        since = times[0]
+        x, y = (
+            np.interp(inner - since, times - since, column[first : last + 1])
+            for column in (track.x, track.y)
+        )
         line = Steps(x[:-1], y[:-1], x[1:], y[1:])
         along, off = line.nearest_to(circle.x, circle.y)
         nearest = int(off.argmin())

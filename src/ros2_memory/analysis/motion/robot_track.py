@@ -79,15 +79,11 @@ class RobotTrack:
         return self.times[self.begins], self.times[self.ends]
 
     def at(self, times: Times) -> tuple[Floats, Floats, Floats]:
-        """Returns x, y (m) and heading (rad) at some times, at least one; there is a vertex."""
-        first = max(int(np.searchsorted(self.times, times.min(), side="right")) - 1, 0)
-        around = slice(first, int(np.searchsorted(self.times, times.max())) + 1)
+        """Returns x, y (m) and heading (rad) at some times; there must be a vertex."""
         # From the first vertex, so that numbers are small enough for a double to be exact.
         since = self.times[0]
-        x, y, heading = (
-            np.interp(times - since, self.times[around] - since, column[around])
-            for column in (self.x, self.y, self.heading)
-        )
+        columns = (self.x, self.y, self.heading)
+        x, y, heading = (np.interp(times - since, self.times - since, axis) for axis in columns)
         return x, y, heading
 
 
