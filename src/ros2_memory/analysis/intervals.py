@@ -245,7 +245,7 @@ def _merge_tables(tables: Sequence[IntervalTable], follow: Flags) -> IntervalTab
     label = np.array([place[word] for word in words], np.intp)[codes]
     order = np.lexsort((part, rows["first"], label))
     rows, part, label = rows[order], part[order], label[order]
-    first, ends, reach = rows["first"], rows["ends"], _running_end(label, rows["last"])
+    first, ends, reach = rows["first"], rows["ends"], running_end(label, rows["last"])
     goes_on = (ends[:-1] & _TO_END > 0) & (ends[1:] & _FROM_START > 0)
     goes_on &= (part[1:] - part[:-1] == 1) & follow[part[1:]]
     goes_on |= first[1:] <= np.minimum(reach[:-1], MAX_NS - FLICKER_NS) + FLICKER_NS
@@ -273,7 +273,7 @@ def _merge_runs(rows: IntervalRows, reach: Ints, goes_on: Flags) -> bytes:
     return intervals[np.lexsort((intervals["label"], intervals["first"]))].tobytes()
 
 
-def _running_end(label: NDArray[np.intp], last: Ints) -> Ints:
+def running_end(label: NDArray[np.intp], last: Ints) -> Ints:
     """Returns the latest end of each row and of those before it of its label; sorted by label."""
     if bool(((last[1:] >= last[:-1]) | (label[1:] != label[:-1])).all()):
         return last

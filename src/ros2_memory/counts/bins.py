@@ -351,15 +351,10 @@ class BinnedWindow:
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
-        segments = self.view.timeline.segments_in(self.counted)
-        spans = np.concatenate(
-            [
-                np.empty((2, 0), np.int64),
-                *(segment.bounds_in(topics, self.counted) for segment in segments),
-            ],
-            axis=1,
-        )
-        firsts, lasts = pieces_of(spans[0], spans[1], pause)
+        bounds = [self.view.bounds(topic, self.counted) for topic in topics]
+        firsts, lasts = np.concatenate(bounds, axis=1)
+        is_inside = (firsts < self.counted.stop) & (lasts >= self.counted.start)
+        firsts, lasts = pieces_of(firsts[is_inside], lasts[is_inside], pause)
         heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
         self.add_lengths(column, "duration", without(heard, self.gaps))
 

@@ -17,10 +17,11 @@ from __future__ import annotations
 
 import heapq
 import json
+import math
 from collections import Counter, defaultdict
 from dataclasses import replace
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING, Final, Literal, TypeAlias
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -278,9 +279,8 @@ def _label_held(
     """Returns when a thing with a label was in view; None where no label meets a condition."""
     view, matches = binned.view, Condition(condition.test).matches
     if scope.is_bounded or condition.min_score or len(topics) > 1:
-        reader = LabelReader(view, scope, condition)
-        reader.read(topics, matches)
-        visible, since = reader.visible, reader.since
+        seen = read_labels(view, topics, scope, condition, matches)
+        visible, since = seen.visible, seen.since
     else:
         events, since = _events_in_order(view, topics[0], binned.counted)
         parts = [
@@ -413,20 +413,21 @@ def count_labels(
             f'label as value ("{ANY_LABEL}" for all), and no field'
         )
     topics = matching_topics(view, topic)
-    reader = LabelReader(view, scope, condition)
-    reader.read(topics, lambda label: value == ANY_LABEL or test.passes(label))
-    if reader.since is not None:
+    seen = read_labels(
+        view, topics, scope, condition, lambda label: value == ANY_LABEL or test.passes(label)
+    )
+    if seen.since is not None:
         view.notes.add_lack(
-            f"not all before {unix_text(reader.since)} is counted: "
+            f"not all before {unix_text(seen.since)} is counted: "
             f"{view.bags.filling_progress() or 'out of time; '}ask about a shorter window"
         )
-    window = scope.window if reader.since is None else replace(scope.window, start=reader.since)
-    intervals, elapsed = reader.visible.intervals(), elapsed_in(view, window)
+    window = scope.window if seen.since is None else replace(scope.window, start=seen.since)
+    intervals, elapsed = seen.visible.intervals(), elapsed_in(view, window)
     of_label: defaultdict[str, list[VisibleInterval]] = defaultdict(list)
     for interval in intervals:
         of_label[interval.label].append(interval)
     rows = [
-        (named(label), _row(own, elapsed, reader.most_at_once[label]))
+        (named(label), _row(own, elapsed, seen.most_at_once[label]))
         for label, own in of_label.items()
     ]
     rows.sort(key=lambda row: (-(row[1][0] or 0), row[0]))
@@ -452,17 +453,17 @@ def count_labels(
     return Bins(
         by=BY_LABEL,
         about=tuple(topics),
-        start=min(max(start, reader.since or first), end),
+        start=min(max(start, seen.since or first), end),
         end=max(min(end, last), start),
         columns=_COLUMNS,
         rows=tuple(rows[:_MOST_LABELS]),
-        all=_row(intervals, elapsed, reader.most_at_once_of_all),
+        all=_row(intervals, elapsed, seen.most_at_once_of_all),
         notes=view.notes.sentences(),
     )
 
 
-class LabelReader:
-    """Reads what counts, the newest first: detections in a scope, of a condition's least score.
+class SeenLabels(NamedTuple):
+    """What was seen of some labels.
 
     Attributes:
         visible: when labels were in view.
@@ -471,59 +472,67 @@ class LabelReader:
         since: back to when all was read, where the time was over before; else None.
     """
 
-    def __init__(self, view: View, scope: Scope, condition: Condition) -> None:
-        self.visible = IntervalTable()
-        self.most_at_once: Counter[str] = Counter()
-        self.most_at_once_of_all = 0
-        self.since: Ns | None = None
-        self._view = view
-        self._scope = scope
-        self._least_score = condition.least_score if condition.min_score > 0 else -np.inf
+    visible: IntervalTable
+    most_at_once: Counter[str]
+    most_at_once_of_all: int
+    since: Ns | None
 
-    def read(self, topics: Sequence[str], wanted: Callable[[str], bool]) -> None:
-        """Reads the detections of topics whose labels are wanted."""
-        reading = self._view.call.partial_after(READING_S)
-        reached: Ns | None = None
-        found: list[dict[str, list[IntervalPart]]] = []
-        try:
-            for window in self._scope.narrowed():
-                found.append(defaultdict(list))
-                sources = (_detection_blocks(self._view, topic, window) for topic in topics)
-                for topic, detected in heapq.merge(*sources, key=lambda of: -of[1].log_times[-1]):
-                    part = self._read_block(detected, wanted)
-                    found[-1][topic].append(part)
-                    reached = part.first if len(topics) == 1 else part.last
-                    if reading.expired():
-                        raise QueryTimeoutError("the rest is left out")  # noqa: TRY301 - as by a scan
-        except QueryTimeoutError:
-            if reached is None:
-                raise
-            self.since = reached
-        self.visible = united(
-            [joined(parts[::-1]).visible for of_window in found for parts in of_window.values()]
-        )
 
-    def _read_block(self, detected: Detected, wanted: Callable[[str], bool]) -> IntervalPart:
-        """Returns when wanted labels were in view in a block, by detections that count.
+def read_labels(
+    view: View,
+    topics: Sequence[str],
+    scope: Scope,
+    condition: Condition,
+    wanted: Callable[[str], bool],
+) -> SeenLabels:
+    """Returns what was seen in a scope of the labels that are wanted, of a condition's least score.
 
-        How many of each one message has is taken up into `most_at_once`.
-        """
-        times, detections = detected.log_times, detected.found
-        is_wanted = np.array([wanted(word) for word in detections.labels.words], np.bool_)
-        counts = is_wanted[detections.labels.codes] & ~(detections.scores < self._least_score)
-        if self._scope.is_bounded:
-            # The newest first, as it reads what the other topic said.
-            holds = [self._scope.holds_at(time) for time in times[::-1].tolist()]
-            counts &= np.array(holds[::-1], np.bool_)[detections.rows]
-        rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
-        labels = detections.labels.words
-        if rows.size:
-            pairs, counts_at_once = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
-            for code, at_once in zip(pairs[1].tolist(), counts_at_once.tolist(), strict=True):
-                self.most_at_once[labels[code]] = max(self.most_at_once[labels[code]], at_once)
-            self.most_at_once_of_all = max(self.most_at_once_of_all, int(np.bincount(rows).max()))
-        visible = visible_in(times, rows, codes, detections.scores[counts], labels)
-        return IntervalPart(int(times[0]), int(times[-1]), visible)
+    Raises:
+        QueryTimeoutError: the call's time runs out before any result.
+    """
+    least_score = condition.least_score if condition.min_score > 0 else -math.inf
+
+    def newest_first() -> Iterator[tuple[Ns, tuple[str, IntervalPart, Counter[str], int]]]:
+        for nth, window in enumerate(scope.narrowed()):
+            sources = (_detection_blocks(view, topic, window) for topic in topics)
+            for topic, detected in heapq.merge(*sources, key=lambda of: -of[1].log_times[-1]):
+                seen = _seen_in_block(detected, scope, least_score, wanted)
+                reached = detected.log_times[0 if len(topics) == 1 else -1]
+                yield int(reached), (f"{nth} {topic}", *seen)
+
+    found, since = in_time(view, newest_first(), READING_S)
+    parts: defaultdict[str, list[IntervalPart]] = defaultdict(list)
+    most_at_once = Counter[str]()
+    for source, part, at_once, _ in found:
+        parts[source].append(part)
+        most_at_once |= at_once
+    visible = united([joined(of_source[::-1]).visible for of_source in parts.values()])
+    return SeenLabels(visible, most_at_once, max((most for *_, most in found), default=0), since)
+
+
+def _seen_in_block(
+    detected: Detected, scope: Scope, least_score: float, wanted: Callable[[str], bool]
+) -> tuple[IntervalPart, Counter[str], int]:
+    """Returns when wanted labels were in view in a block, by detections that count.
+
+    With them how many of each, and of all together, one message has at most.
+    """
+    times, detections = detected.log_times, detected.found
+    labels = detections.labels.words
+    is_wanted = np.array([wanted(word) for word in labels], np.bool_)
+    counts = is_wanted[detections.labels.codes] & ~(detections.scores < least_score)
+    if scope.is_bounded:
+        # The newest first, as it reads what the other topic said.
+        holds = [scope.holds_at(time) for time in times[::-1].tolist()]
+        counts &= np.array(holds[::-1], np.bool_)[detections.rows]
+    rows, codes = detections.rows[counts], detections.labels.codes[counts].astype(np.int64)
+    at_once = Counter[str]()
+    pairs, sizes = np.unique(np.stack((rows, codes)), axis=1, return_counts=True)
+    for code, size in zip(pairs[1].tolist(), sizes.tolist(), strict=True):
+        at_once[labels[code]] = max(at_once[labels[code]], size)
+    visible = visible_in(times, rows, codes, detections.scores[counts], labels)
+    part = IntervalPart(int(times[0]), int(times[-1]), visible)
+    return part, at_once, int(np.bincount(rows).max(initial=0))
 
 
 def _detection_blocks(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[str, Detected]]:
@@ -612,7 +621,7 @@ def count_values(
         about=(topic,),
         start=start,
         end=stop - 1,
-        columns=(("count", "count"), ("seconds", "duration"), ("first", "time"), ("last", "time")),
+        columns=_COLUMNS[:4],
         rows=tuple(rows[:_MOST_VALUES]),
         all=(
             sum(count for _, (count, *_) in rows),

@@ -298,16 +298,6 @@ class Segment:
         """Returns what the bags hold of a topic; None where nothing."""
         return _topic_columns(self).of(topic)
 
-    def bounds_in(self, topics: Collection[str], window: TimeWindow) -> NDArray[np.int64]:
-        """Returns the first and last log time of topics (2 x N) in each bag that has any there."""
-        firsts, lasts = np.full(len(self.bags), MAX_NS), np.full(len(self.bags), MIN_NS)
-        is_inside = np.zeros(len(self.bags), np.bool_)
-        for column in filter(None, map(self.column, topics)):
-            rows = (column.firsts < window.stop) & (column.lasts >= window.start)
-            is_inside[column.bags[rows]] = True
-            np.minimum.at(firsts, column.bags, column.firsts)
-            np.maximum.at(lasts, column.bags, column.lasts)
-        return np.stack((firsts, lasts))[:, is_inside]
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:

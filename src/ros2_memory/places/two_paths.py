@@ -173,12 +173,7 @@ def placed_standstills(
     is_known = _is_known(track, at)
     has_known = is_known.any(axis=1)
     ends, at, is_known = ends[has_known], at[has_known], is_known[has_known]
-    since = track.times[0]
-    times = (track.times - since).astype(np.float64)
-    x, y = (
-        np.nanmedian(np.where(is_known, np.interp(at - since, times, axis), np.nan), axis=1)
-        for axis in (track.x, track.y)
-    )
+    x, y = (np.nanmedian(np.where(is_known, axis, np.nan), axis=1) for axis in track.at(at)[:2])
     rows = zip(x.tolist(), y.tolist(), ends[:, 0].tolist(), ends[:, 1].tolist(), strict=True)
     for here, there, start, stop in rows:
         if region is None or region.contains(here, there):

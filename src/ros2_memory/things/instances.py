@@ -12,7 +12,7 @@ import math
 from collections import Counter
 from dataclasses import dataclass, field, replace
 from itertools import chain, groupby
-from operator import itemgetter
+from operator import attrgetter, itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -592,11 +592,7 @@ def _remove_false_stays(
     What a thing was called wrongly is counted in `PlacedStay.also`.
     """
     stays = [(group, stay) for group in groups for stay in group.stays]
-    candidates = _Hosts(stays, observed, keys)
-    hosts: dict[int, list[int]] = {}
-    for begin in range(0, len(stays), _STAYS_AT_ONCE):
-        observed.go_on()
-        hosts.update(candidates.of(np.arange(begin, min(begin + _STAYS_AT_ONCE, len(stays)))))
+    hosts = dict(_hosts(stays, observed, keys))
     taken: set[int] = set()
     for number in sorted(hosts, key=lambda number: (stays[number][1].count, number)):
         host = next((host for host in hosts[number] if host not in taken), None)
@@ -612,76 +608,82 @@ def _remove_false_stays(
             group.stays.append(stay)
 
 
-class _Hosts:
-    """Finds the stays that others may be a wrong name of, or the noise around."""
+def _hosts(
+    stays: Sequence[tuple[_Group, PlacedStay]], observed: _Observations, keys: Sequence[str]
+) -> Iterator[tuple[int, list[int]]]:
+    """Yields which stays may be a wrong name of others, or noise around them, with these.
 
-    def __init__(
-        self,
-        stays: Sequence[tuple[_Group, PlacedStay]],
-        observed: _Observations,
-        keys: Sequence[str],
-    ) -> None:
-        self._stays = [stay for _, stay in stays]
-        self._beside = Tally.of(observed.sights.beside, len(observed.sights.spots))
-        distinct = [*dict.fromkeys(keys)]
-        self._key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
-        rows = [
-            (
-                *(distinct.index(group.key), group.epoch, stay.count, stay.first, stay.last),
-                *(stay.weak, stay.stay.first_slice, stay.stay.last_slice + 1),
-            )
-            for group, stay in stays
-        ]
-        columns = np.array(rows, np.int64).reshape(-1, 8).T
-        self._key, self._epoch, self._count, self._first, self._last, self._weak = columns[:6]
-        self._slices = columns[6:]
-        places = [(stay.x, stay.y, stay.z) for stay in self._stays]
-        self._places = np.array(places, np.float64).reshape(-1, 3).T
-        self._order = np.argsort(self._places[0], kind="stable")
-        # The spots of all stays, as numbers in order, and how often these and those before count.
-        sizes = [len(stay.spots) for stay in self._stays]
-        number = np.repeat(np.arange(len(stays)), sizes)
-        spots = np.concatenate([np.zeros(0, np.int64), *(stay.spots for stay in self._stays)])
-        self._width = observed.sights.slices + 1
-        self._seen = number * self._width + observed.sights.spots[spots, Spot.SLICE]
-        self._times = np.append(0, np.cumsum(observed.counts[spots]))
-        together = observed.sights.spots[spots, Spot.TOGETHER] > 1
-        self._are_several = 2 * np.bincount(number, together, len(stays)) >= sizes
-
-    def of(self, numbers: Ints) -> Iterator[tuple[int, list[int]]]:
-        """Yields which of some stays may be part of others, with these, the likeliest first."""
-        one, other, away_mm = self._near(numbers)
-        begin, end = (
-            np.searchsorted(self._seen, other * self._width + at[one]) for at in self._slices
-        )
-        count, hosted = self._count[one], self._times[end] - self._times[begin]
-        is_same = self._key[one] == self._key[other]
-        is_tiny = (count <= hosted) & (count <= _TINY_SHARE * self._count[other])
+    The likeliest of these first.
+    """
+    table, beside = _StayTable.of(stays), Tally.of(observed.sights.beside, len(observed.counts))
+    names = [*dict.fromkeys(keys)]
+    key_of_label = np.array([names.index(key) for key in keys], np.int64)
+    key = np.array([names.index(group.key) for group, _ in stays], np.int64)
+    # The spots of all stays, as numbers in order, and how often these and those before count.
+    sizes = [len(stay.spots) for _, stay in stays]
+    number = np.repeat(np.arange(len(stays)), sizes)
+    rows = np.concatenate([np.zeros(0, np.int64), *(stay.spots for _, stay in stays)])
+    spots, width = observed.sights.spots[rows], observed.sights.slices + 1
+    seen = number * width + spots[:, Spot.SLICE]
+    times = np.append(0, np.cumsum(observed.counts[rows]))
+    are_several = 2 * np.bincount(number, spots[:, Spot.TOGETHER] > 1, len(stays)) >= sizes
+    for begin in range(0, len(stays), _STAYS_AT_ONCE):
+        observed.go_on()
+        numbers = np.arange(begin, min(begin + _STAYS_AT_ONCE, len(stays)))
+        one, other, away_mm = table.near(numbers)
+        slices = (table.first_slice, table.last_slice + 1)
+        start, end = (np.searchsorted(seen, other * width + at[one]) for at in slices)
+        count, hosted = table.n[one], times[end] - times[start]
+        is_same = key[one] == key[other]
+        is_tiny = (count <= hosted) & (count <= _TINY_SHARE * table.n[other])
         # Where most messages that have one have both of them, this one is no noise.
-        is_tiny &= ~(self._are_several[one] & is_same) | (2 * count <= hosted)
+        is_tiny &= ~(are_several[one] & is_same) | (2 * count <= hosted)
         is_part = is_tiny | (count <= hosted * np.where(is_same, _HALO_SHARE, _SMALL_SHARE))
         is_part &= (is_same | (away_mm <= _SAME_PLACE_MM)) & (hosted > 0)
         order = np.lexsort((other, -hosted, one))
         order = order[is_part[order]]
         pairs = zip(one[order].tolist(), other[order].tolist(), strict=True)
-        for number, hosts in groupby(pairs, itemgetter(0)):
+        for nth, hosts in groupby(pairs, itemgetter(0)):
             # How often its detections had labels of each key beside them.
-            _, label, n = self._beside.rows_of(self._stays[number].spots)
-            beside = np.bincount(self._key_of_label[label], n, len(self._key_of_label))
-            is_apart = beside >= _BESIDE_SHARE * self._count[number]
-            is_apart[self._key[number]] = False
-            yield number, [host for _, host in hosts if not is_apart[self._key[host]]]
+            _, label, n = beside.rows_of(stays[nth][1].spots)
+            is_apart = np.bincount(key_of_label[label], n, len(names))
+            is_apart = is_apart >= _BESIDE_SHARE * table.n[nth]
+            is_apart[key[nth]] = False
+            yield nth, [host for _, host in hosts if not is_apart[key[host]]]
 
-    def _near(self, numbers: Ints) -> tuple[Ints, Ints, Floats]:
+
+class _StayTable(NamedTuple):
+    """Columns of stays: see `_Group`, `PlacedStay` and `Stay`. `by_x` is their order."""
+
+    epoch: Ints
+    n: Ints
+    first: Ints
+    last: Ints
+    weak: Ints
+    first_slice: Ints
+    last_slice: Ints
+    places: Floats
+    by_x: Ints
+
+    @classmethod
+    def of(cls, stays: Sequence[tuple[_Group, PlacedStay]]) -> _StayTable:
+        names = attrgetter("count", "first", "last", "weak", "stay.first_slice", "stay.last_slice")
+        rows = [(group.epoch, *names(stay)) for group, stay in stays]
+        places = np.array([(stay.x, stay.y, stay.z) for _, stay in stays], np.float64)
+        places = places.reshape(-1, 3).T
+        by_x = np.argsort(places[0], kind="stable")
+        return cls._make((*np.array(rows, np.int64).reshape(-1, 7).T, places, by_x))
+
+    def near(self, numbers: Ints) -> tuple[Ints, Ints, Floats]:
         """Returns some stays and others near each at that time, as pairs, and how far (mm)."""
-        x, y, z = self._places
+        x, y, z = self.places
         ends = (x[numbers] - _HALO_MM, x[numbers] + _HALO_MM)
-        start, stop = (np.searchsorted(x[self._order], end) for end in ends)
-        one, other = np.repeat(numbers, stop - start), self._order[in_ranges(start, stop - start)]
+        start, stop = (np.searchsorted(x[self.by_x], end) for end in ends)
+        one, other = np.repeat(numbers, stop - start), self.by_x[in_ranges(start, stop - start)]
         away = np.hypot(x[other] - x[one], y[other] - y[one])
         is_near = (away <= _HALO_MM) & (np.abs(z[other] - z[one]) <= STOREY_MM) & (other != one)
-        is_near &= (self._first[other] <= self._last[one]) & (self._last[other] >= self._first[one])
-        is_near &= (self._epoch[other] == self._epoch[one]) & (self._weak[other] == 0)
+        is_near &= (self.first[other] <= self.last[one]) & (self.last[other] >= self.first[one])
+        is_near &= (self.epoch[other] == self.epoch[one]) & (self.weak[other] == 0)
         return one[is_near], other[is_near], away[is_near]
 
 
@@ -719,9 +721,7 @@ def _chained(group: _Group, stays: Sequence[PlacedStay], *, proven: bool) -> lis
         ]
         if ended:
             lasts = [instance.stays[-1] for instance in ended]
-            preferred = [
-                (last.place == stay.place, _has_ended(last, stay), last.last) for last in lasts
-            ]
+            preferred = [(last.place == stay.place, last.last) for last in lasts]
             ended[preferred.index(max(preferred))].stays.append(stay)
         else:
             instances.append(Instance(group.key, group.epoch, [stay]))

@@ -29,6 +29,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
+from ros2_memory.analysis.intervals import running_end
 from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Sights, Spot
 from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.timebase import NS_PER_S
@@ -128,15 +129,9 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
 
 def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
     """Returns where the peak is that the first of some cells lies at: the mean of those near it."""
-    peak: Floats = centre[0]
-    for _ in range(3):
-        near = np.flatnonzero(is_free & (_away_squared(centre, peak) <= _PEAK_MM**2))
-        if not len(near):
-            break
-        # As `numpy.average`, which takes ten times as long for few rows.
-        before, peak = peak, mass[near] @ centre[near] / mass[near].sum()
-        if (before == peak).all():
-            break
+    near = np.flatnonzero(is_free & (_away_squared(centre, centre[0]) <= _PEAK_MM**2))
+    # As `numpy.average`, which takes ten times as long for few rows.
+    peak: Floats = mass[near] @ centre[near] / mass[near].sum()
     return peak
 
 
@@ -217,13 +212,9 @@ class Sightings(NamedTuple):
 
 def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     """Returns the number of the visit of each sighting, of things in ascending order."""
-    # The latest so far of a thing, as its place among all: these are small numbers.
-    order = np.argsort(last, kind="stable")
-    rank = np.empty(len(last), np.int64)
-    rank[order] = np.arange(len(last))
-    offset = np.broadcast_to(thing, len(last)) * len(last)
-    latest = last[order][np.maximum.accumulate(rank + offset) - offset]
-    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (offset[1:] != offset[:-1])
+    things = np.broadcast_to(thing, len(last))
+    latest = running_end(things, last)
+    begins = (first[1:] > latest[:-1] + _PAUSE_NS) | (things[1:] != things[:-1])
     return np.concatenate(([0], np.cumsum(begins)))
 
 

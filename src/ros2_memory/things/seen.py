@@ -16,20 +16,21 @@ from typing import TYPE_CHECKING, Final, Generic, NamedTuple, TypeVar, cast
 import numpy as np
 
 from ros2_memory.analysis.frames import static_in
-from ros2_memory.analysis.sights import SLICE_NS, Flags, Ints
+from ros2_memory.analysis.sights import SLICE_NS
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import packed, united
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
-from ros2_memory.history.scan import remembered, scan
+from ros2_memory.history.scan import open_scan, remembered, scan
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.scan import Scan
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
@@ -138,14 +139,11 @@ class _Surroundings(NamedTuple):
     Attributes:
         window: the stretch.
         bags: that reach into it, or nearly so.
-        parts: the parts of their topics there; None where not all of their rows are in parts, or
-            some of these do not count.
         sessions: those that the bags are of, in the order of their names.
     """
 
     window: TimeWindow
     bags: Sequence[BagFile]
-    parts: tuple[int, ...] | None
     sessions: Sequence[_Lending]
 
 
@@ -175,7 +173,9 @@ class Watching:
         ]
         limits = view.limits
         localisers = (topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic))
-        self._needed = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
+        topics = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
+        self._needed = tuple(dict.fromkeys(topics))
+        self._scans: list[Scan] = []
         self._may_be_kept = not view.stream.may_be_repeated(self._topics)
         self._digested: tuple[object, str] = None, ""
         self._newest = max((segment.latest for segment in timeline.segments), default=MIN_NS)
@@ -214,7 +214,7 @@ class Watching:
             if is_joined and window.covers(start, start + STRETCH_NS - 1):
                 self._joined(together)
             for around in together:
-                if not is_joined and around.parts is not None:
+                if not is_joined and self._parts_around(around.window) is not None:
                     self._seen_in(around)
                 yield around.window.start
 
@@ -229,15 +229,30 @@ class Watching:
         if not self._topics:
             return
         whole = window.widened(AROUND_NS)
-        parts = _Parts.of(self._view, self._needed, whole)
+        if self._view.memory.scanner.store is not None:
+            reach = whole.widened(SIGHTS_NS)
+            self._scans = [open_scan(self._view, t, reach, copies=True) for t in self._needed]
         by_bag = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
         for number in sorted({*chain.from_iterable(by_bag)}, reverse=True):
             stretch = _window(number)
             if not stretch.intersect(window).empty:
                 self._view.bags.check_deadline()
-                near = stretch.widened(AROUND_NS).intersect(whole)
-                bags = self._bags_in(near)
-                yield self._around(stretch, bags, parts and parts.around(near, bags))
+                yield self._around(stretch, self._bags_in(stretch.widened(AROUND_NS)))
+
+    def _parts_around(self, window: TimeWindow) -> tuple[int, ...] | None:
+        """Returns the parts that what is seen in a window follows from; None where not they alone.
+
+        Those of all topics that places and looks need.
+        """
+        if not self._scans:
+            return None
+        numbers: set[int] = set()
+        for opened in self._scans:
+            parts = opened.whole_parts(window.widened(AROUND_NS))
+            if parts is None:
+                return None
+            numbers.update(parts)
+        return tuple(sorted(numbers))
 
     def _bags_in(self, window: TimeWindow) -> list[BagFile]:
         """Returns the bags in a window.
@@ -278,9 +293,7 @@ class Watching:
             self._session_of[bag.recording] = self._sessions.of(bag.recording)
         return self._session_of[bag.recording]
 
-    def _around(
-        self, window: TimeWindow, bags: Sequence[BagFile], parts: tuple[int, ...] | None
-    ) -> _Surroundings:
+    def _around(self, window: TimeWindow, bags: Sequence[BagFile]) -> _Surroundings:
         first_bags: dict[Session, BagFile] = {}
         for bag in bags:
             first_bags.setdefault(self._session(bag), bag)
@@ -292,7 +305,7 @@ class Watching:
         ]
         if not is_alone:
             sessions.sort(key=lambda lending: (min(lending.session), lending.slices or ()))
-        return _Surroundings(window, bags, parts, sessions)
+        return _Surroundings(window, bags, sessions)
 
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
@@ -320,9 +333,9 @@ class Watching:
         None where it is not over, or does not follow from parts alone.
         """
         start = together[-1].window.start // STRETCH_NS * STRETCH_NS
-        parts = [around.parts for around in together if around.parts is not None]
         is_over = start + STRETCH_NS <= self._newest
-        if not (is_over and self._may_be_kept and len(parts) == len(together)):
+        parts = self._parts_around(TimeWindow(start, start + STRETCH_NS)) if is_over else None
+        if parts is None or not self._may_be_kept:
             return None
         in_time = chain.from_iterable(around.sessions for around in reversed(together))
         sessions = sorted(dict.fromkeys(session for session, *_ in in_time), key=min)
@@ -335,17 +348,15 @@ class Watching:
 
         def make() -> Joined[Seen]:
             # Which topics are of detectors shows in all of a history, so these stay apart.
-            alike: dict[
-                tuple[int, str, tuple[tuple[str, ...], ...]], list[SeenStretch[Session]]
-            ] = {}
-            for around in reversed(together):
-                for stretch in self._seen_in(around):
-                    topics = tuple(of_topic.topics for of_topic in stretch.sights)
-                    key = numbers[stretch.session], stretch.frame_id, topics
-                    alike.setdefault(key, []).append(stretch)
-            return Joined([Seen(tuple(_as_one(key[0], alike[key]) for key in sorted(alike)))])
+            def kind(stretch: SeenStretch[Session]) -> tuple[int, str, list[tuple[str, ...]]]:
+                topics = [of_topic.topics for of_topic in stretch.sights]
+                return numbers[stretch.session], stretch.frame_id, topics
 
-        key = FragmentKey(start, digest, tuple(sorted({*chain.from_iterable(parts)})))
+            seen = [part for around in reversed(together) for part in self._seen_in(around)]
+            by_kind = groupby(sorted(seen, key=kind), kind)
+            return Joined([Seen(tuple(_as_one(of[0], [*alike]) for of, alike in by_kind))])
+
+        key = FragmentKey(start, digest, parts)
         [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
         return seen.of(sessions)
 
@@ -359,8 +370,9 @@ class Watching:
         if is_open or not self._may_be_kept:
             return self._read(around)
         digest = self._digest(around)
-        if around.parts is not None:
-            part_key = FragmentKey(around.window.start, digest, around.parts)
+        parts = self._parts_around(around.window)
+        if parts is not None:
+            part_key = FragmentKey(around.window.start, digest, parts)
             return remembered(
                 self._view,
                 SIGHTS,
@@ -471,72 +483,6 @@ def spots_in(stretches: Iterable[SeenStretch[S]]) -> int:
 
 def _hashed(value: object) -> str:
     return blake2b(repr(value).encode(), digest_size=12).hexdigest()
-
-
-class _Parts(NamedTuple):
-    """The parts of some topics in a window, as arrays.
-
-    Attributes:
-        merged: the bags that are in parts.
-        firsts: of each part, the first log time, ascending.
-        lasts: likewise the last one.
-        latest: the latest of the parts so far.
-        numbers: of the parts.
-        all_count: whether all rows of the part do.
-    """
-
-    merged: frozenset[str]
-    firsts: Ints
-    lasts: Ints
-    latest: Ints
-    numbers: Ints
-    all_count: Flags
-
-    @classmethod
-    def of(cls, view: View, topics: Sequence[str], window: TimeWindow) -> _Parts | None:
-        """Returns the parts of some topics, and which bags are in parts.
-
-        None without a store, and where it failed meanwhile.
-        """
-        scanner = view.memory.scanner
-        if scanner.store is None:
-            return None
-        failures = scanner.store.failures
-        # Before the parts: what is merged meanwhile is in none of those that are known.
-        unmerged = scanner.store.unmerged()
-        coverage = scanner.coverage(view.timeline)
-        if coverage is None:
-            return None
-        merged = frozenset(
-            bag.file
-            for part in coverage.segments
-            if window.overlaps(part.segment.bags[0].start, part.segment.latest)
-            for bag, number in zip(part.segment.bags, part.numbers.tolist(), strict=True)
-            if number >= 0 and number not in unmerged
-        )
-        heads = [
-            head
-            for topic in {*topics}
-            for head in scanner.parts(topic, window, coverage)
-            if head.is_whole
-        ]
-        if scanner.store.failures != failures:
-            return None
-        heads.sort(key=lambda head: head.first)
-        bounds = [(head.first, head.last, head.number) for head in heads]
-        firsts, lasts, numbers = np.array(bounds, np.int64).reshape(-1, 3).T
-        counting = coverage.counts([head.bags for head in heads])
-        all_count = counting == [head.bags.size for head in heads]
-        return cls(merged, firsts, lasts, np.maximum.accumulate(lasts), numbers, all_count)
-
-    def around(self, window: TimeWindow, bags: Sequence[BagFile]) -> tuple[int, ...] | None:
-        """Returns the parts in a window; None where not all rows of its bags count or are there."""
-        begin = int(np.searchsorted(self.latest, window.start))
-        end = int(np.searchsorted(self.firsts, window.stop))
-        here = begin + np.flatnonzero(self.lasts[begin:end] >= window.start)
-        if not (self.merged.issuperset(bag.file for bag in bags) and self.all_count[here].all()):
-            return None
-        return tuple(np.sort(self.numbers[here]).tolist())
 
 
 def _window(number: int) -> TimeWindow:

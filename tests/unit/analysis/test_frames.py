@@ -338,43 +338,6 @@ def test_a_tree_on_log_time_is_asked_in_log_time() -> None:
 # Many times at once
 
 
-@given(st.data())
-def test_the_poses_at_many_times_are_those_of_each_time(data: st.DataObject) -> None:
-    """Odometry, corrections of the map, a cup that changes hands, and silences."""
-    found: list[StampedTransform] = []
-    for parents, child in ((["map"], "odom"), (["odom"], "base"), (["base", "map"], "cup")):
-        at = data.draw(st.integers(0, S))
-        for shift_m, parent, step in data.draw(
-            st.lists(
-                st.tuples(
-                    st.floats(-3, 3),
-                    st.sampled_from(parents),
-                    st.sampled_from([S // 5, S, 3 * S, 11 * S]),
-                ),
-                min_size=1,
-                max_size=12,
-            )
-        ):
-            turned = (0.0, 0.0, math.sin(shift_m), math.cos(shift_m))
-            found.append(edge(parent, child, at, Transform((shift_m, 0.1, 0.2), turned)))
-            at += step
-    tree = Tree([*found, edge("cup", "tea", 0, 0.3, static=True)])
-    times = data.draw(st.lists(st.integers(-3 * S, 60 * S), min_size=1, max_size=20))
-    for target, source in (("map", "tea"), ("base", "tea"), ("tea", "map"), ("odom", "base")):
-        poses = tree.frames(target).poses(source, np.array(times, np.int64))
-        assert poses is not None
-        for nth, at in enumerate(times):
-            try:
-                expected = tree.lookup(target, source, at)
-            except NoDataError:
-                assert not poses.valid[nth]
-            else:
-                assert poses.valid[nth]
-                one = poses.at(nth)
-                assert one.translation == pytest.approx(expected.translation, abs=1e-9)
-                assert one.rotation == pytest.approx(expected.rotation, abs=1e-9)
-
-
 def held(tree: Tree, target: str, source: str, times: Sequence[int]) -> list[float | None]:
     """How far along x a frame is at some times; None where it is not known."""
     poses = tree.frames(target, HOLD_NS).poses(source, np.array(times, np.int64))

@@ -54,12 +54,6 @@ def test_detections_that_lie_together_are_one_spot_at_their_mean() -> None:
     assert spot[Spot.DEV] == 115  # the root of (2 * (0.1^2 + 0.1^2)) / 3, in mm
 
 
-def test_two_detections_of_one_message_are_never_one_spot() -> None:
-    found = sights_of(*[[mug(1.0), mug(1.3)]] * 5)
-    assert sorted(found.spots[:, Spot.X].tolist()) == [1000, 1300]
-    assert found.spots[:, Spot.TOGETHER].tolist() == [2, 2]
-
-
 def test_spots_that_grew_together_are_one_where_no_message_has_both() -> None:
     far_apart_at_first = [[mug(1.0)], [mug(1.8)], *[[mug(1.3)]] * 8, *[[mug(1.5)]] * 8]
     found = sights_of(*far_apart_at_first)
@@ -137,19 +131,6 @@ def test_sights_are_joined_in_any_order(
     forward, backward = joined_of(parts)[0], joined_of(parts[::-1])[0]
     assert forward.topics == backward.topics
     for table, same in zip(forward.tables, backward.tables, strict=True):
-        assert table.tolist() == same.tolist()
-
-
-@given(messages)
-def test_sights_cut_between_slices_are_those_of_the_whole(
-    seen: list[tuple[int, None, list[PlacedDetection]]],
-) -> None:
-    parts = [
-        built("/a", [each for each in seen if each[0] // (10 * SECOND) == number])
-        for number in range(7)
-    ]
-    whole, cut = joined_of([built("/a", seen)])[0], joined_of(parts)[0]
-    for table, same in zip(whole.tables, cut.tables, strict=True):
         assert table.tolist() == same.tolist()
 
 

@@ -119,30 +119,6 @@ def test_a_boolean_is_counted_where_it_toggles_and_lasts_in_every_bin(
 
 
 @pytest.mark.parametrize("by", BYS)
-def test_all_ways_to_store_a_history_give_the_same_counts(memories: list[Memory], by: str) -> None:
-    def answers(memory: Memory) -> list[Bins]:
-        return [
-            count_matches(memory, Call(), OBJECTS, "contains", "cup", by=by),  # type: ignore[arg-type]
-            count_matches(memory, Call(), "/odom", "above", 20, field="position.x", by=by),  # type: ignore[arg-type]
-            count_path(memory, Call(), everything(), by),  # type: ignore[arg-type]
-            count_range(memory, Call(), OBJECTS, everything(), by),  # type: ignore[arg-type]
-        ]
-
-    first, *others = map(answers, memories)
-    assert whole(first[0], "count") == 39
-    for other in others:
-        for one, again in zip(first, other, strict=True):
-            assert one.columns == again.columns
-            assert one.notes == again.notes
-            for (name, values), (same, others_) in zip(one.rows, again.rows, strict=True):
-                assert name == same
-                assert others_ == pytest.approx(values)
-        # Asked again, from what is remembered of whole segments.
-    for memory, known in zip(memories, [first, *others], strict=True):
-        assert answers(memory) == known
-
-
-@pytest.mark.parametrize("by", BYS)
 def test_the_metres_of_all_bins_are_those_of_the_way(memories: list[Memory], by: str) -> None:
     for memory in memories:
         answer = count_path(memory, Call(), everything(), by)  # type: ignore[arg-type]

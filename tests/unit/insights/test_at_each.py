@@ -4,19 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from random import Random
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from ros2_memory.core.errors import NoDataReason
 from tests.support.bags import detections, odom, tf, transform, write_mcap
-from tests.support.examples import examples
-from tests.support.memories import asked, memory_of, replied, with_store
-from tests.support.random_histories import write_history
+from tests.support.memories import asked, memory_of, replied
 
 if TYPE_CHECKING:
     from ros2_memory.history.context import Memory
@@ -113,27 +107,3 @@ def test_a_note_on_several_of_them_is_told_once(tmp_path: Path) -> None:
     alone = asked(memory, tmp_path, "get_position_at", timestamps=[T0, T0 + 3])
     assert [each.get("notes") for each in alone["results"]] == [told["notes"], None]
     assert "notes" not in alone
-
-
-@settings(max_examples=examples(25), deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), data=st.data())
-def test_in_odd_histories_each_is_answered_as_alone_with_and_without_the_catalogue(
-    seed: int, data: st.DataObject
-) -> None:
-    with TemporaryDirectory() as folder:
-        bag_dir = Path(folder)
-        written = write_history(bag_dir, Random(seed))
-        times = data.draw(
-            st.lists(st.sampled_from(sorted(written.moments)), min_size=1, max_size=5)
-        )
-        given = {"topic": "/odom", "tolerance_s": 1.0}
-        several = {"timestamps": [each / S for each in times], **given}
-        plain = memory_of(bag_dir)
-        told = asked(plain, bag_dir, "get_topic_at_time", **several)
-        assert told == asked(with_store(plain, bag_dir), bag_dir, "get_topic_at_time", **several)
-        rows = told.get("results", [told] * len(times))
-        for time, row in zip(times, rows, strict=True):
-            alone = asked(plain, bag_dir, "get_topic_at_time", timestamp=time / S, **given)
-            assert row.get("error") == alone.get("error")
-            assert row.get("value") == alone.get("value")
-            assert row.get("timestamp") == alone.get("timestamp")

@@ -584,23 +584,6 @@ def test_a_recorded_session_is_reported_as_it_happened(tmp_path: Path) -> None:
             assert abs(unix_from_ns(event.end - event.start) - length) < 0.05
 
 
-@pytest.mark.parametrize("split_s", [10, 1000])
-@pytest.mark.parametrize(("hz", "hole_s"), [(10, 25), (10, 60), (0.5, 0), (0.2, 0)])
-def test_mean_speed_does_not_depend_on_how_files_are_split(
-    tmp_path: Path, split_s: int, hz: float, hole_s: int
-) -> None:
-    """A robot that drives at 0.5 m/s; poses are missing for a while, or come seldom."""
-    at = [n / hz for n in range(round(200 * hz)) if not 30 <= n / hz < 30 + hole_s]
-    poses = [odom(BEGIN + round(each * S), each / 2, 0.0, vx=0.5) for each in at]
-    flags = [boolean(BEGIN + n * S, False, "/bumper") for n in range(200)]
-    write_splits(tmp_path, [*poses, *flags], split_s)
-    window = {"start": BEGIN / S, "end": BEGIN / S + 200}
-    path = asked(memory_of(tmp_path), tmp_path, "trajectory_summary", **window)
-    assert path["avg_speed"] == pytest.approx(0.5, abs=0.001)
-    unrecorded_s = path["duration_s"] - path.get("recorded_s", path["duration_s"])
-    assert unrecorded_s == pytest.approx(hole_s, abs=0.11)
-
-
 def test_a_gap_in_the_memory_is_reported(tmp_path: Path) -> None:
     seconds = [*range(10), *range(100, 110)]
     write_splits(tmp_path, [odom(BEGIN + t * S, 0.1 * t, 0.0, 0.0) for t in seconds])

@@ -9,34 +9,19 @@ from typing import TYPE_CHECKING
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.history.context import Call, Memory, QuerySettings
+from ros2_memory.history.context import Call, QuerySettings
 from ros2_memory.insights.sightings import find_matches
-from tests.support.bags import Msg, detections, log_entry, make, write_mcap
+from tests.support.bags import Msg, log_entry, make, write_mcap
 from tests.support.examples import examples
 from tests.support.memories import each_way, memory_of, with_store
 
 if TYPE_CHECKING:
-    from ros2_memory.results import Sightings
+    pass
 
 S = 10**9
 BEGIN = 1_784_000_000 * S
-TOPIC = "/vision/scene/scene_objects"
 FLOAT = "std_msgs/msg/Float64"
 LATEST = QuerySettings(now="latest")
-LABELS = ("cup", "teacup", "fork")
-
-
-def seen(draw: Random) -> list[tuple[Msg, bool]]:
-    """What a detector sees that misses things, and is silent at times; and whether it is a cup."""
-    at, labels = BEGIN, [*LABELS]
-    messages = []
-    for _ in range(draw.randint(1, 60)):
-        at += draw.choice([S // 3, S // 3, 2 * S, SILENCE_NS, SILENCE_NS + 1, 40 * S])
-        if draw.random() < 0.3:
-            labels = draw.sample(LABELS, draw.randint(0, 3))
-        messages.append((detections(at, labels), any("cup" in each for each in labels)))
-    return messages
 
 
 def write(folder: Path, messages: list[Msg], draw: Random) -> None:
@@ -57,53 +42,6 @@ def write(folder: Path, messages: list[Msg], draw: Random) -> None:
         if draw.random() < 0.4:
             recording, number = recording + 1, 0
             again = [each for each in some[-3:] if some[-1].log_time - each.log_time < S]
-
-
-def count_of(messages: list[tuple[Msg, bool]]) -> int:
-    """How many sightings of a cup there are."""
-    count, before = 0, None
-    for each, is_cup in messages:
-        if is_cup and (before is None or each.log_time - before > SILENCE_NS):
-            count += 1
-        before = each.log_time if is_cup else None
-    return count
-
-
-def asked(
-    memory: Memory, limit: int, span: tuple[float | None, float | None], *, oldest_first: bool
-) -> Sightings:
-    start_s, end_s = span
-    return find_matches(
-        memory,
-        Call(),
-        TOPIC,
-        "contains",
-        "cup",
-        start_s=start_s,
-        end_s=end_s,
-        limit=limit,
-        oldest_first=oldest_first,
-    )
-
-
-@settings(deadline=None, max_examples=examples(30), suppress_health_check=[HealthCheck.too_slow])
-@given(seed=st.integers(0, 2**32), part=st.sampled_from([0.5, 1.0]), limit=st.integers(1, 6))
-def test_sightings_are_the_same_whatever_is_stored(seed: int, part: float, limit: int) -> None:
-    draw = Random(seed)
-    messages = seen(draw)
-    with TemporaryDirectory() as folder:
-        bags = Path(folder)
-        write(bags, [each for each, _ in messages], draw)
-        plain = memory_of(bags, limits=LATEST)
-        known = with_store(plain, bags, part=part)
-        start, end = sorted(draw.choice(messages)[0].log_time / S for _ in range(2))
-        for oldest_first in (False, True):
-            for span in ((None, None), (start, end)):
-                answer = asked(plain, limit, span, oldest_first=oldest_first)
-                for _ in range(2):
-                    assert asked(known, limit, span, oldest_first=oldest_first) == answer
-                if oldest_first and span == (None, None):
-                    assert answer.total == count_of(messages)
 
 
 @settings(deadline=None, max_examples=examples(20), suppress_health_check=[HealthCheck.too_slow])

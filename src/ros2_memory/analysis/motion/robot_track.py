@@ -78,6 +78,14 @@ class RobotTrack:
         """The first and the last time of each piece (ns, inclusive)."""
         return self.times[self.begins], self.times[self.ends]
 
+    def at(self, times: Times) -> tuple[Floats, Floats, Floats]:
+        """Returns x, y (m) and heading (rad) at some times; there must be a vertex."""
+        # From the first vertex, so that numbers are small enough for a double to be exact.
+        since = self.times[0]
+        columns = (self.x, self.y, self.heading)
+        x, y, heading = (np.interp(times - since, self.times - since, axis) for axis in columns)
+        return x, y, heading
+
 
 class PartialTrack(NamedTuple):
     """The track by some poses, in order of time, before it is joined with those before and after.
@@ -296,10 +304,5 @@ def cut(track: RobotTrack, window: TimeWindow) -> RobotTrack:
     if 0 < last < len(times) and not track.begins[last] and at[-1:] != [window.stop - 1]:
         at, begins = [*at, window.stop - 1], [*begins, False]
     moments = np.array(at, np.int64)
-    # From the first vertex, so that numbers are small enough for a double to be exact.
-    since = times[0] if len(times) else 0
-    x, y, heading = (
-        np.interp(moments - since, times - since, column) if len(at) else column[:0]
-        for column in (track.x, track.y, track.heading)
-    )
-    return RobotTrack(moments, x, y, heading, np.array(begins, np.bool_), track.fastest_mps)
+    places = track.at(moments) if at else (track.x[:0], track.y[:0], track.heading[:0])
+    return RobotTrack(moments, *places, np.array(begins, np.bool_), track.fastest_mps)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import math
 import random
-from itertools import accumulate, count, pairwise
+from itertools import count, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -172,21 +172,6 @@ def test_of_more_jumps_than_can_be_drawn_the_longest_are() -> None:
     jumped = [point.position[0] for point in found.waypoints if point.jump]
     assert len(jumped) == 5
     assert 131.0 in jumped
-
-
-@given(
-    st.lists(st.sampled_from([0.0, 0.5, 1.0, 40.0, 90.0]), min_size=2, max_size=40),
-    st.integers(1, 38),
-)
-def test_jumps_are_drawn_alike_pose_by_pose_and_from_parts(steps: list[float], cut: int) -> None:
-    poses = driven(along_x(*accumulate(steps)))
-    cut = min(cut, len(poses) - 1)
-    whole, joined = (summarise(poses, at_most=200, cuts=cuts) for cuts in ([], [cut]))
-    parts = poses.rows(slice(cut)), poses.rows(slice(cut, None))
-    drawable = all(len(summarise(part, at_most=200).waypoints) <= 100 for part in parts)
-    assert [point.position for point in joined.waypoints if point.jump] == [
-        point.position for point in whole.waypoints if point.jump
-    ] or not drawable
 
 
 @pytest.mark.parametrize(
