@@ -45,7 +45,7 @@ from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
@@ -471,8 +471,8 @@ def build_memory(
     reader = BagDirReader(shared.reader, bag_dir)
     columns = build_columns(settings, reader)
 
-    def known_files() -> dict[str, BagFile]:
-        return {} if columns is None else columns.known_files(bag_dir)
+    def known_files(paths: Iterable[str]) -> dict[str, BagFile]:
+        return {} if columns is None else columns.known_files(bag_dir, paths)
 
     index = IndexManager(
         bag_dir,

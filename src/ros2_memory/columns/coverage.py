@@ -7,29 +7,23 @@ timeline serves every later timeline that still has it.
 from __future__ import annotations
 
 from itertools import chain
-from operator import attrgetter
 from threading import Lock
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.columns.store import ColumnStore, Key, State, relative
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
 
+    from ros2_memory.columns.store import ColumnStore, State
     from ros2_memory.index.segment import Segment
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
-
-_FEW: Final = 8
-"""Segments that are looked up one by one; for more of them all stored bags are read at once."""
-_NONE: Final = (-1, 0)
-_stamps = attrgetter("size", "mtime_ns", "sidecar_ns", "start", "end")
 
 
 class CoveredSegment(NamedTuple):
@@ -165,26 +159,19 @@ class Covering:
             and not (has_changed and covered.missing)
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
-        stored: Mapping[Key, tuple[int, int]] = {}
-        if len(unknown) > _FEW:
-            stored = self.store.bags()
-        elif unknown:
-            bags = chain.from_iterable(segment.bags for segment in unknown)
-            stored = self.store.bags([relative(bag.file, self._root) for bag in bags])
-        return [
-            remembered.get(id(segment)) or self._covered_segment(segment, stored)
-            for segment in timeline.segments
-        ]
+        bags = [bag for segment in unknown for bag in segment.bags]
+        rows = self.store.rows_of(bags, self._root, state.deletion)
+        begin = 0
+        for segment in unknown:
+            end = begin + len(segment.bags)
+            remembered[id(segment)] = self._covered_segment(segment, rows[begin:end])
+            begin = end
+        return [remembered[id(segment)] for segment in timeline.segments]
 
-    def _covered_segment(
-        self, segment: Segment, stored: Mapping[Key, tuple[int, int]]
-    ) -> CoveredSegment:
-        keys = [(relative(bag.file, self._root), *_stamps(bag)) for bag in segment.bags]
-        rows = [
-            stored.get(key, _NONE) if bag.state is BagState.CLOSED else _NONE
-            for key, bag in zip(keys, segment.bags, strict=True)
-        ]
-        numbers, hashed = np.array(rows, np.int64).T
-        missing = tuple(bag for bag, row in zip(segment.bags, rows, strict=True) if row is _NONE)
-        numbers = np.where(numbers < 0, -1, numbers + self.store.offset)
-        return CoveredSegment(segment, numbers, hashed > 0, missing)
+    def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
+        """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
+        is_closed = np.array([bag.state is BagState.CLOSED for bag in segment.bags], np.bool_)
+        is_stored: NDArray[np.bool_] = is_closed & (rows >= 0)
+        missing = tuple(segment.bags[nth] for nth in np.flatnonzero(~is_stored).tolist())
+        numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)
+        return CoveredSegment(segment, numbers, is_stored & (rows & 1 > 0), missing)

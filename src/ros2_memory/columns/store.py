@@ -19,6 +19,7 @@ import json
 import os
 from functools import partial
 from itertools import accumulate, pairwise
+from operator import attrgetter
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
@@ -62,6 +63,10 @@ _ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 
+_FEW: Final = 2048
+"""Bags that are looked up one by one; for more of them all stored ones are read."""
+_stamps = attrgetter("size", "mtime_ns", "sidecar_ns", "start", "end")
+
 T = TypeVar("T")
 DefinitionOf: TypeAlias = "Callable[[Channel], Definition | None]"
 Key: TypeAlias = "tuple[str, int, Ns, Ns, Ns, Ns]"
@@ -99,6 +104,8 @@ def relative(path: str, bag_dir: str) -> str:
 
 
 _KEY: Final = ", ".join(BagKey._fields)
+_ROW: Final = "2 * id + (hashed > 0)"
+"""A bag in one number, of which a week is read."""
 
 
 class State(NamedTuple):
@@ -146,6 +153,14 @@ class PartHead(NamedTuple):
     is_whole: bool
 
 
+class _Known(NamedTuple):
+    """The bags that the index has as they are stored, and the rows of these; see `rows_of`."""
+
+    deletion: int
+    bags: tuple[BagFile, ...]
+    rows: IntArray
+
+
 class ColumnStore(Database):
     """Stores the columns of bags, and finds them again.
 
@@ -175,6 +190,7 @@ class ColumnStore(Database):
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
         self._layouts = Layouts()
+        self._known: _Known | None = None
 
     # Reading
 
@@ -182,18 +198,20 @@ class ColumnStore(Database):
         """Returns what tells whether anything has changed."""
 
         def ask(connection: sqlite3.Connection) -> State:
-            newest = connection.execute(
-                "SELECT (SELECT max(id) FROM part), (SELECT max(id) FROM deletion)"
-            ).fetchone()
-            part, deletion = (self.offset + int(number or 0) for number in newest)
+            [part] = connection.execute("SELECT max(id) FROM part").fetchone()
             [others] = connection.execute("PRAGMA data_version").fetchone()
-            return State(part, deletion, (others, connection.total_changes))
+            change = others, connection.total_changes
+            return State(self.offset + int(part or 0), self._deletion(connection), change)
 
         return self.read(ask, State(-1, -1, (-1, -1)))
 
-    def known_files(self, bag_dir: Path) -> dict[str, BagFile]:
-        """Returns every bag that is stored as it was indexed, by its whole path."""
+    def known_files(self, bag_dir: Path, paths: Iterable[str]) -> dict[str, BagFile]:
+        """Returns which bags of some whole paths are stored, as they were indexed, by their paths.
+
+        `rows_of` returns their rows the next time without a look at the file.
+        """
         root = f"{bag_dir}{os.sep}"
+        files = {path: path for path in paths}  # a week would take 8 MB more with its own
 
         def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
             schemas = {
@@ -201,30 +219,55 @@ class ColumnStore(Database):
                 for number, topics in connection.execute("SELECT id, topics FROM summary")
             }
             rows = connection.execute(
-                "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns"
-                " FROM bag WHERE size >= 0"
+                "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns,"
+                f" iif(definitions IN ('', ?), {_ROW}, -1) FROM bag WHERE size >= 0",
+                (self._definitions,),
             )
             bags: dict[str, BagFile] = {}
-            for path, size, mtime, schema, counts, *times in rows:
-                file, summary = root + path, BagSummary.decoded(schemas[schema], counts)
-                bags[file] = BagFile(file, size, mtime, BagState.CLOSED, summary, *times)
+            numbers: list[int] = []
+            for path, size, mtime, schema, counts, first, last, sidecar, row in rows:
+                file = files.get(root + path)
+                if file is not None:
+                    summary = BagSummary.decoded(schemas[schema], counts)
+                    times = first, last, sidecar
+                    bags[file] = BagFile(file, size, mtime, BagState.CLOSED, summary, *times)
+                    numbers.append(row)
+            stored = np.array(numbers, np.int64)
+            self._known = _Known(self._deletion(connection), (*bags.values(),), stored)
             return bags
 
         return self.read(ask, {})
 
-    def bags(self, paths: Sequence[str] | None = None) -> Mapping[Key, tuple[int, int]]:
-        """Returns the bags that are stored, by what a `BagKey` has; among some, or all of them.
+    def _deletion(self, connection: sqlite3.Connection) -> int:
+        [number] = connection.execute("SELECT max(id) FROM deletion").fetchone()
+        return self.offset + int(number or 0)
 
-        Of each its number less the `offset`, and whether copies of its messages can be recognised.
+    def rows_of(self, bags: Sequence[BagFile], bag_dir: str, deletion: int) -> IntArray:
+        """Returns twice the number less the `offset` of each bag; -1 where it is not stored.
+
+        One more where copies of its messages can be recognised. `deletion` is that of the `state`
+        of the moment.
         """
-        condition = "" if paths is None else "AND path IN (SELECT value FROM json_each(?))"
-        size = len(BagKey._fields)
-        return self._asked(
-            lambda rows: {row[:size]: row[size:] for row in rows},
-            {},
-            f"SELECT {_KEY}, id, hashed FROM bag WHERE definitions IN ('', ?) {condition}",
-            *(self._definitions, *(() if paths is None else (json.dumps(paths),))),
-        )
+        if not bags:
+            return np.empty(0, np.int64)
+        known, self._known = self._known, None
+        rows: dict[int, int] = {}
+        if known is not None and known.deletion == deletion:
+            rows = dict(zip(map(id, known.bags), known.rows.tolist(), strict=True))
+        others = [bag for bag in bags if id(bag) not in rows]
+        if others:
+            keys = [(relative(bag.file, bag_dir), *_stamps(bag)) for bag in others]
+            query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
+            given = [self._definitions]
+            if len(others) <= _FEW:
+                query += " AND path IN (SELECT value FROM json_each(?))"
+                given.append(json.dumps([path for path, *_ in keys]))
+            stored = self._asked(
+                lambda found: {row[1:]: row[0] for row in found}, dict[Key, int](), query, *given
+            )
+            for bag, key in zip(others, keys, strict=True):
+                rows[id(bag)] = stored.get(key, -1)
+        return np.array([rows[id(bag)] for bag in bags], np.int64)
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""

@@ -82,8 +82,8 @@ class BagTable:
     Args:
         bag_dir: the directory.
         reader: reads its bags.
-        known: returns, by path, closed files that were read earlier: they are not read again while
-            they are unchanged.
+        known: returns those of some paths that are closed files which were read earlier, by path:
+            they are not read again while they are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
         packs: whether the summaries of bags that will not change are packed.
         setting: the one that names the directory, for sentences.
@@ -94,7 +94,7 @@ class BagTable:
         bag_dir: Path,
         reader: BagReader,
         *,
-        known: Callable[[], Mapping[str, BagFile]] | None,
+        known: Callable[[Iterable[str]], Mapping[str, BagFile]] | None,
         only: Sequence[str] = (),
         packs: bool = False,
         setting: str = BAG_DIR_SETTING,
@@ -124,7 +124,7 @@ class BagTable:
         scanned = self._tree.scan(context.now, [*self._watched, *patrol])
         self._reactivate_changed(scanned, context)
         is_first = not (self._files or self._unchanged)
-        known = self._known() if self._known is not None and is_first else {}
+        known = self._known(scanned.stamps) if self._known is not None and is_first else {}
         unchanged = self._take_known(scanned.stamps, known, context)
         changed = self._drop(scanned.gone) | self._examine(
             scanned.stamps, known, context, unchanged if is_first else None

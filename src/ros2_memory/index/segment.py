@@ -298,7 +298,6 @@ class Segment:
         """Returns what the bags hold of a topic; None where nothing."""
         return _topic_columns(self).of(topic)
 
-
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
         """By topic, the types of its messages."""

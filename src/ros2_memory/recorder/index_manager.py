@@ -29,7 +29,7 @@ from ros2_memory.index.scan import BAG_DIR_SETTING
 from ros2_memory.index.snapshot import Snapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
     from pathlib import Path
 
     from structlog.typing import FilteringBoundLogger
@@ -51,8 +51,8 @@ class IndexManager:
         clock: the wall clock.
         refresh_s: how old a snapshot may become before a query has it renewed.
         split_duration_s: how long the recorder writes one file.
-        known: gives, by path, closed files that were read earlier. A first scan does not read them
-            again if they are unchanged.
+        known: gives those of some paths that are closed files which were read earlier, by path. A
+            first scan does not read them again if they are unchanged.
         include_active: whether the readable part of a file that is being written answers, too. Not
             for programs that delete, repair or save bags, which work on finished files.
         trusts_mtime: whether a young file without an end is being written; else it may be a copy,
@@ -76,7 +76,7 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
-        known: Callable[[], Mapping[str, BagFile]] | None = None,
+        known: Callable[[Iterable[str]], Mapping[str, BagFile]] | None = None,
         include_active: bool = False,
         trusts_mtime: bool = True,
         only: str | None = None,

@@ -76,7 +76,7 @@ def test_known_files_are_the_bags_as_they_were_indexed(tmp_path: Path) -> None:
     world.fill()
     store = ColumnStore([store_file(tmp_path)], lambda _: None)
     indexed = {bag.file: bag for bag in world.memory.index.snapshot().bags}
-    assert store.known_files(tmp_path) == indexed
+    assert store.known_files(tmp_path, indexed) == indexed
     assert len(indexed) == 3
 
 

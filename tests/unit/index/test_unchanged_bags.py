@@ -54,7 +54,7 @@ class Start:
             FixedClock(NOW),
             refresh_s=5.0,
             split_duration_s=10.0,
-            known=(lambda: self.known) if knowing else None,
+            known=(lambda _: self.known) if knowing else None,
         )
         return index, reader
 
