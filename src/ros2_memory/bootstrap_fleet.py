@@ -15,6 +15,7 @@ import yaml
 
 from ros2_memory.bootstrap import (
     SharedParts,
+    build_backfill,
     build_columns,
     build_memory,
     instantiated,
@@ -257,17 +258,14 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
             "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
         )
 
-    robots = {name: robot_settings(settings, name) for name in settings.fleet.robots}
-    return [
-        RobotBags(
-            name,
-            build_memory(own, shared, setting=ROBOTS_SETTING),
-            shared.reader,
-            reading_of(own, shared.schemas),
-            settings.lake.messages,
-        )
-        for name, own in robots.items()
-    ]
+    def built(name: str) -> RobotBags:
+        own = robot_settings(settings, name)
+        memory = build_memory(own, shared, setting=ROBOTS_SETTING)
+        filling = build_backfill(own, memory).filling
+        reading = reading_of(own, shared.schemas)
+        return RobotBags(name, memory, shared.reader, reading, settings.lake.messages, filling)
+
+    return [*map(built, settings.fleet.robots)]
 
 
 def _require_only_reading(settings: Settings) -> None:

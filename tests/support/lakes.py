@@ -58,7 +58,8 @@ def robot_bags(
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    return RobotBags(name, memory, McapReader(), "test", messages)
+    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
+    return RobotBags(name, memory, McapReader(), "test", messages, filling)
 
 
 def location(folder: Path) -> LakeLocation:

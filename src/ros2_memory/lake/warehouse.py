@@ -264,7 +264,7 @@ class LakeTables:
         """Replaces rows by others, in one transaction."""
         table = self.current(name)
         with self.location.translated(f"writing the lake's {name}"):
-            table.overwrite(rows, overwrite_filter=condition)
+            table.overwrite(TABLES[name].sorted(rows), overwrite_filter=condition)
 
     def delete(self, name: str, condition: BooleanExpression) -> None:
         """Deletes rows from the newest version; `expire` deletes those before."""

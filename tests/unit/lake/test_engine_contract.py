@@ -43,7 +43,7 @@ def select(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Sele
                 for nth, (label, score) in enumerate([*seen, ("unscored", None)])
             ]
             path = folder / f"{len(locations)}.parquet"
-            pq.write_table(table.filled({}, rows), path)
+            pq.write_table(table.filled(rows), path)
             locations.append(path.as_uri())
     files = DataFiles(table.arrow_schema, tuple(locations), {})
 
@@ -80,7 +80,7 @@ def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
     tmp_path: Path, engine: LakeEngine
 ) -> None:
     row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
-    whole = TABLES["things"].filled({}, [{**row, "label": "cup", "spread_m": 0.1}])
+    whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
     path = tmp_path / "old.parquet"
     pq.write_table(whole.drop_columns(["spread_m"]), path)
     files = DataFiles(TABLES["things"].arrow_schema, (path.as_uri(),), {})
