@@ -153,9 +153,10 @@ class DetectionColumns:
         definition, sources = table.definition, self._sources.of(table)
         if definition is None or sources is None:
             return None
-        values = Values(table)
-        header_frames = _header_frames(definition)
-        try:
+
+        def found() -> StampedDetections:
+            values = Values(table)
+            header_frames = _header_frames(definition)
             detections = joined_detections(
                 [part for source in sources for part in found_in(values, source, places=True)]
             )
@@ -165,6 +166,9 @@ class DetectionColumns:
                 _stamps(values, definition),
                 _frames_at(values, ROWS, np.arange(values.rows), header_frames),
             )
+
+        try:
+            return table.remember("detections", found, _bytes_of)
         except UnknownShapeError:
             return None
 
@@ -185,6 +189,10 @@ class DetectionColumns:
                 return True
             possible = possible | _may_be_json(table_or_parts, source.leaf)
         return possible
+
+
+def _bytes_of(stamped: StampedDetections) -> int:
+    return 1000 + 60 * len(stamped.detections.rows) + 12 * len(stamped.frames)
 
 
 def detections_by(by_message: Sequence[Sequence[Detection]]) -> Detections:

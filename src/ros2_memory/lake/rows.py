@@ -49,10 +49,11 @@ from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import pyarrow as pa
+    from numpy.typing import NDArray
 
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.analysis.sights import Sights
@@ -69,6 +70,7 @@ _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"
 """The map of `messages` that has values of a type."""
 _LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
+_NOWHERE: Final = (math.nan, math.nan)
 _MM: Final = 1000.0
 _ANGLE_DIGITS: Final = 9
 _SCORE_UNIT: Final = 1000.0
@@ -211,28 +213,29 @@ class RowMaker:
         same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
         # In a track it goes on beyond half a turn, as it did since the first vertex.
         turned = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
-        columns = (track.times, track.x, track.y, track.begins, turned.round(_ANGLE_DIGITS))
-        for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
-            row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
-            yield {**same, **row, "heading": None if math.isnan(heading) else heading}
+        heading = turned.round(_ANGLE_DIGITS)
+        begins, x, y = track.begins, track.x, track.y
+        return _rows(same, time_ns=track.times, x=x, y=y, begins=begins, heading=heading)
 
     def _things(self, frame: str, sights: Sights) -> Iterator[Row]:
-        for spot in sights.spots.tolist():
-            best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
-            yield {
-                "topic": sights.topics[spot[Spot.TOPIC]],
-                "label": label,
-                "thing": self._thing(label),
-                "count": spot[Spot.N],
-                "first_ns": spot[Spot.FIRST],
-                "last_ns": spot[Spot.LAST],
-                "frame_id": frame,
-                "x": spot[Spot.X] / _MM,
-                "y": spot[Spot.Y] / _MM,
-                "z": spot[Spot.Z] / _MM,
-                "spread_m": spot[Spot.DEV] / _MM,
-                "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
-            }
+        spots = sights.spots
+        labels = [sights.labels[code] for code in spots[:, Spot.LABEL].tolist()]
+        x, y, z, spread_m = spots[:, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].T / _MM
+        best = spots[:, Spot.BEST]
+        return _rows(
+            {"frame_id": frame},
+            topic=[sights.topics[number] for number in spots[:, Spot.TOPIC].tolist()],
+            label=labels,
+            thing=map(self._thing, labels),
+            count=spots[:, Spot.N],
+            first_ns=spots[:, Spot.FIRST],
+            last_ns=spots[:, Spot.LAST],
+            x=x,
+            y=y,
+            z=z,
+            spread_m=spread_m,
+            best_score=np.where(best == _NO_SCORE, math.nan, best / _SCORE_UNIT),
+        )
 
     def _driven(self, poses: Poses | None) -> tuple[Row, list[Row]]:
         """Returns what the row of a bag has of its poses, and their standstills and drops."""
@@ -297,34 +300,27 @@ class RowMaker:
                 undecodable += lost
                 number = np.searchsorted(times, detected.log_times)
                 number += 0 if lost else rows.ranks
-                found, kind = detected.found, rows.table.channel.type
-                for at, label, score, place, of_place in zip(
-                    found.rows.tolist(),
-                    found.labels.values(),
-                    found.scores.tolist(),
-                    found.places.tolist(),
-                    found.frames.values(),
-                    strict=True,
-                ):
-                    time = int(detected.log_times[at])
-                    robot = place_at(track, time) or (None, None)
-                    where = (None,) * 3 if math.isnan(sum(place)) else place
-                    sightings.append(
-                        {
-                            "topic": topic,
-                            "type": kind,
-                            "time_ns": time,
-                            "message": int(number[at]),
-                            "label": label,
-                            "thing": self._thing(label),
-                            "score": None if math.isnan(score) else score,
-                            "frame_id": of_place,
-                            **dict(zip("xyz", where, strict=True)),
-                            "robot_frame": None if robot[0] is None else frame,
-                            "robot_x": robot[0],
-                            "robot_y": robot[1],
-                        }
-                    )
+                found, at = detected.found, detected.found.rows
+                places = [place_at(track, time) for time in detected.log_times.tolist()]
+                robot_x, robot_y = (
+                    np.array([place or _NOWHERE for place in places]).reshape(-1, 2).T
+                )
+                labels, (x, y, z) = found.labels.values(), found.places.T
+                sightings += _rows(
+                    {"topic": topic, "type": rows.table.channel.type},
+                    time_ns=detected.log_times[at],
+                    message=number[at],
+                    label=labels,
+                    thing=map(self._thing, labels),
+                    score=found.scores,
+                    frame_id=found.frames.values(),
+                    x=x,
+                    y=y,
+                    z=z,
+                    robot_frame=[frame if places[message] else None for message in at.tolist()],
+                    robot_x=robot_x[at],
+                    robot_y=robot_y[at],
+                )
         return sightings, undecodable
 
     def _messages(self, bag: BagFile) -> Iterator[Row]:
@@ -384,6 +380,14 @@ def _drop_payloads(channels: Collection[_Messages]) -> None:
         largest = max(droppable, key=attrgetter("size"))
         largest.payloads, largest.size = None, 0
         droppable.remove(largest)
+
+
+def _rows(same: Row, **columns: IntArray | NDArray[np.float64] | Iterable[object]) -> Iterator[Row]:
+    """Yields rows with what is the `same` in all, and a value of each column."""
+    values = (
+        column.tolist() if isinstance(column, np.ndarray) else column for column in columns.values()
+    )
+    return ({**same, **dict(zip(columns, row, strict=True))} for row in zip(*values, strict=True))
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:

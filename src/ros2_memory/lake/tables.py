@@ -123,7 +123,7 @@ class LakeTable:
         return rows.sort_by([(name, "ascending") for name in self.order])
 
     def filled(self, rows: Iterable[Row]) -> pa.Table:
-        """Returns rows as Arrow has them."""
+        """Returns rows as Arrow has them; NaN is null."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
         for row in rows:
@@ -131,11 +131,18 @@ class LakeTable:
             time = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
             key = str(row.get("topic", "")).strip("/").replace("/", ".")
             whole.append({"topic_key": key, **time, **row})
-        try:
-            return pa.Table.from_pylist(whole, self.arrow_schema)
-        except UnicodeEncodeError:
-            # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
-            return pa.Table.from_pylist([*map(_encodable, whole)], self.arrow_schema)
+        columns = [
+            _column(field, [row.get(field.name) for row in whole]) for field in self.arrow_schema
+        ]
+        return pa.Table.from_arrays(columns, schema=self.arrow_schema)
+
+
+def _column(field: pa.Field, values: list[object]) -> pa.Array:
+    try:
+        return pa.array(values, field.type, from_pandas=True)
+    except UnicodeEncodeError:
+        # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
+        return pa.array([*map(_encodable, values)], field.type)
 
 
 _DECLARED: Final = yaml.safe_load(files(__package__).joinpath("tables.yaml").read_text("utf-8"))

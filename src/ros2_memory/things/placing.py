@@ -140,8 +140,9 @@ class Placer:
         target, frames = self._frames(lender, window, self._poses(session, window))
         for bag, units in units_of_bags.items():
             for topic, messages in self._detected(units)[0].items():
-                nowhere = np.full((len(messages.log_times), 5), math.nan)
-                yield bag, target, _sights_of(topic, messages, frames, nowhere)
+                if messages.found.rows.size:
+                    nowhere = np.full((len(messages.log_times), 5), math.nan)
+                    yield bag, target, _sights_of(topic, messages, frames, nowhere)
 
     def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
         """Returns the messages by topic, and which topics are surely of detectors."""
