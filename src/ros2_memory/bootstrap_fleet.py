@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.engine import DuckdbEngine
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import Lake, LakeLocation
 
@@ -112,7 +112,7 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     return Lake(catalog, engine, location.translated)
 
 
-def engine_of(node: DuckdbNode) -> LakeEngine:
+def engine_of(node: DuckdbNode) -> DuckdbEngine:
     """Returns the engine of the settings.
 
     Raises:
@@ -123,9 +123,9 @@ def engine_of(node: DuckdbNode) -> LakeEngine:
             "lake: duckdb needs the optional part of this package (no duckdb): "
             "pip install '.[lake]'"
         )
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.engine import DuckdbEngine
 
-    return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
+    return instantiated("lake.engine", node, DuckdbEngine)
 
 
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this

@@ -131,7 +131,10 @@ def events_by_bag(
     for rows in tables:
         stated = _stated_in_rows(view, columns, rows)
         for bag, positions in rows.bag_rows(files):
-            stated_of_bags[bag.file].append(stated.at(positions))
+            is_whole = len(stated.times) == len(rows)  # else some are undecodable
+            some = rows.some(positions)
+            of_bag = stated.at(positions) if is_whole else _stated_in_rows(view, columns, some)
+            stated_of_bags[bag.file].append(of_bag)
     return {
         file: events
         for file, parts in stated_of_bags.items()
