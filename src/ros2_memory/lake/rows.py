@@ -12,6 +12,8 @@ import json
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from functools import cache
+from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -120,7 +122,7 @@ class RowMaker:
         self._view = View(memory, Call())
         self._watching = Watching(self._view)
         self._detections = DetectionRows(self._view)
-        self._thing = Labels(memory.limits.labels).key
+        self._thing = cache(Labels(memory.limits.labels).key)
 
     def made_of(self, bag: BagFile) -> str:
         """Returns a digest of all inputs of a bag's rows besides its bytes.
@@ -153,19 +155,16 @@ class RowMaker:
         things: dict[BagFile, list[Row]] = defaultdict(list)
         for bag, frame, sights in self._watching.by_bag([*bags]):
             things[bag] += self._things(frame, sights)
-        seen: dict[str, list[tuple[str, list[Rows]]]] = defaultdict(list)
-        for topic in {topic: None for _, topics in events.values() for topic in topics}:
-            tables: dict[str, list[Rows]] = defaultdict(list)
+        seen: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
+        for topic in dict.fromkeys(chain(*(topics for _, topics in events.values()))):
+            among = {file for file, (_, topics) in events.items() if topic in topics}
             for rows_of_bags in scan(self._view, topic, window, copies=True):
-                for bag, positions in rows_of_bags.bag_rows(files):
-                    tables[bag.file].append(rows_of_bags.some(positions))
-            for file, of_bag in tables.items():
-                if topic in events[file][1]:
-                    seen[file].append((topic, of_bag))
+                for bag, positions in rows_of_bags.bag_rows(among):
+                    seen[bag][topic].append(rows_of_bags.some(positions))
         for bag, shipped in bags.items():
             tracks = self._tracks(bag, window)
             map_frame, track = tracks[0] if tracks else (None, empty_track())
-            sightings, undecodable = self._sightings(seen[bag.file], map_frame, track)
+            sightings, undecodable = self._sightings(seen[bag], map_frame, track)
             driven, stood = self._driven(poses.get(bag.file))
             joined = self._memory.index.joined_with(bag.recording)
             of_bag_alone = {
@@ -286,13 +285,13 @@ class RowMaker:
 
     def _sightings(
         self,
-        rows_of_topics: Sequence[tuple[str, Sequence[Rows]]],
+        rows_of_topics: Mapping[str, Sequence[Rows]],
         frame: str | None,
         track: RobotTrack,
     ) -> tuple[list[Row], int]:
         """Returns the detections in a bag, and how many messages of its topics are undecodable."""
         sightings, undecodable = list[Row](), 0
-        for topic, of_topic in rows_of_topics:
+        for topic, of_topic in rows_of_topics.items():
             times = np.sort(np.concatenate([rows.times for rows in of_topic]))
             for rows in of_topic:
                 detected = self._detections.of(rows)
