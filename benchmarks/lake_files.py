@@ -48,7 +48,7 @@ def main() -> None:
         folder = Path(name)
         with LakeLocation(folder.as_uri(), folder / "state").writable() as lake:
             for day in range(DAYS):
-                lake.tables[TABLE].append(TABLES[TABLE].filled({}, rows_of(day)))
+                lake.tables[TABLE].append(TABLES[TABLE].filled(rows_of(day)))
             until = WallClock().now() + NS_PER_S
             expire(lake, until)
             table = lake.current(TABLE)

@@ -14,6 +14,7 @@ import yaml
 
 from ros2_memory.bootstrap import (
     SharedParts,
+    build_backfill,
     build_columns,
     build_memory,
     instantiated,
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.engine import DuckdbEngine
     from ros2_memory.lake.shipper import RobotBags
     from ros2_memory.lake.warehouse import Lake, LakeLocation
 
@@ -107,16 +108,16 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     return Lake(catalog, engine, location.translated)
 
 
-def engine_of(node: DuckdbNode) -> LakeEngine:
+def engine_of(node: DuckdbNode) -> DuckdbEngine:
     """Returns the engine of the settings.
 
     Raises:
         ConfigError: its extra is missing, or it cannot be built.
     """
     require_extra("lake: duckdb", "lake", "duckdb")
-    from ros2_memory.lake.engines.base import LakeEngine
+    from ros2_memory.lake.engine import DuckdbEngine
 
-    return instantiated("lake.engine", node, LakeEngine)  # type: ignore[type-abstract]  # only compared with
+    return instantiated("lake.engine", node, DuckdbEngine)
 
 
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this
@@ -249,17 +250,14 @@ def build_robots(settings: Settings, shared: SharedParts) -> list[RobotBags]:
             "MEMORY_DEPLOYMENT=lake, and give fleet.robots={r1: /data/r1/bags, ...} or /data/*/bags"
         )
 
-    robots = {name: robot_settings(settings, name) for name in settings.fleet.robots}
-    return [
-        RobotBags(
-            name,
-            build_memory(own, shared, setting=ROBOTS_SETTING),
-            shared.reader,
-            reading_of(own, shared.schemas),
-            settings.lake.messages,
-        )
-        for name, own in robots.items()
-    ]
+    def built(name: str) -> RobotBags:
+        own = robot_settings(settings, name)
+        memory = build_memory(own, shared, setting=ROBOTS_SETTING)
+        filling = build_backfill(own, memory).filling
+        reading = reading_of(own, shared.schemas)
+        return RobotBags(name, memory, shared.reader, reading, settings.lake.messages, filling)
+
+    return [*map(built, settings.fleet.robots)]
 
 
 def _require_only_reading(settings: Settings) -> None:

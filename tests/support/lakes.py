@@ -20,8 +20,7 @@ from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
-from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, LakeReader
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.upkeep import Tombstone
@@ -58,7 +57,8 @@ def robot_bags(
     """A robot whose bags are shipped."""
     bag_dir.mkdir(parents=True, exist_ok=True)
     memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    return RobotBags(name, memory, McapReader(), "test", messages)
+    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
+    return RobotBags(name, memory, McapReader(), "test", messages, filling)
 
 
 def location(folder: Path) -> LakeLocation:
@@ -143,7 +143,7 @@ def lake_in(folder: Path) -> SqlCatalog:
 
 def lake_robots(
     catalog: Catalog,
-    engine: LakeEngine,
+    engine: DuckdbEngine,
     names: Sequence[str],
     stores: Path | None = None,
     *,
@@ -165,7 +165,7 @@ def lake_robots(
     return {name: memory(name) for name in names}
 
 
-def lake_robot(folder: Path, engine: LakeEngine, **how: Any) -> Memory:
+def lake_robot(folder: Path, engine: DuckdbEngine, **how: Any) -> Memory:
     """The robot `hall` of the lake in a folder; see `lake_robots`."""
     return lake_robots(lake_in(folder), engine, ["hall"], **how)["hall"]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
 from operator import itemgetter
@@ -14,9 +15,8 @@ from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.units import BagUnit, Rows
+from ros2_memory.columns.units import Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
-from ros2_memory.core.model import BagFile, Pose, TimeWindow
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
     blocks,
@@ -26,9 +26,11 @@ from ros2_memory.history.scan import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Container, Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import Pose, TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.robots import ParallelRecordings
     from ros2_memory.history.view import View
@@ -108,17 +110,30 @@ def poses_of(samples: Sequence[tuple[Ns, Pose, float | None]]) -> Poses:
     )
 
 
-def poses_of_bag(view: View, bag: BagFile, topic: str) -> Poses | None:
-    """Returns the poses of a topic in a bag; None without any, and where some message has none."""
+def poses_by_bag(view: View, tables: Iterable[Rows], files: Container[str]) -> dict[str, Poses]:
+    """Returns the poses of each of some bags, by their files; of none in which a message has none.
+
+    Args:
+        view: of the call.
+        tables: all rows of a topic, of these bags and of others.
+        files: of the bags.
+    """
     failures: list[UndecodableError] = []
     reader = PoseReader(view, failures)
-    tables = view.bags.tables(bag, topic, TimeWindow.everything())
-    units = [BagUnit(bag, table, nth) for nth, table in enumerate(tables) if len(table)]
-    try:
-        poses = joined_poses([reader.poses(Rows(unit, lambda: None)) for unit in units])
-    except InvalidArgumentsError:
-        return None
-    return poses if len(poses) and not failures else None
+    parts: dict[str, list[Poses]] = defaultdict(list)
+    for rows in tables:
+        try:
+            poses = reader.poses(rows)
+        except InvalidArgumentsError:
+            return {}
+        for bag, positions in rows.bag_rows(files):
+            if failures:
+                failures.clear()
+                own = reader.poses(rows.some(positions))
+            else:
+                own = poses.rows(positions)
+            parts[bag.file].append(joined_poses([]) if failures else own)
+    return {file: joined_poses(of_bag) for file, of_bag in parts.items() if all(map(len, of_bag))}
 
 
 class PoseReader:

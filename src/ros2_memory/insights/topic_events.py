@@ -10,6 +10,7 @@ messages, since what a server lists says nothing of when it happened.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 from heapq import merge
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -24,11 +25,9 @@ from ros2_memory.analysis.topic_events import (
     events_of,
     joined_events,
 )
-from ros2_memory.columns.decode import undecoded
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.kinds import EVENTS
 from ros2_memory.columns.stated import StatedColumns
-from ros2_memory.columns.units import BagUnit, Rows
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.text import Reason, counted
@@ -43,11 +42,12 @@ from ros2_memory.history.scan import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.columns.scan import Stretch
-    from ros2_memory.core.model import BagFile, TimeWindow
+    from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import TimeWindow
     from ros2_memory.core.timebase import Ns
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -116,22 +116,28 @@ def events_of_messages(view: View, messages: Iterable[StoredMessage]) -> TopicEv
     return events_of(_stated_in_messages(view, messages))
 
 
-def events_of_bag(view: View, bag: BagFile, topics: Sequence[str]) -> dict[str, TopicEvents]:
-    """Returns the events of those topics that have a message in a bag, read at once.
+def events_by_bag(
+    view: View, tables: Iterable[Rows], files: Container[str]
+) -> dict[str, TopicEvents]:
+    """Returns the events that a topic has in each of some bags alone, by their files.
 
-    Raises:
-        BagError: the bag cannot be read.
+    Args:
+        view: of the call.
+        tables: all rows of the topic, of these bags and of others.
+        files: of the bags.
     """
-    reader, columns = view.memory.reader, StatedColumns(view.extractor)
-    stated_of_topics: dict[str, list[Stated]] = {}
-    for group in undecoded(reader, bag.path, topics=topics) if topics else ():
-        for nth, table in enumerate(group.tables()):
-            rows = Rows(BagUnit(bag, table, nth), lambda: None)
-            stated = _stated_in_rows(view, columns, rows)
-            stated_of_topics.setdefault(table.channel.topic, []).append(stated)
+    columns = StatedColumns(view.extractor)
+    stated_of_bags: dict[str, list[Stated]] = defaultdict(list)
+    for rows in tables:
+        stated = _stated_in_rows(view, columns, rows)
+        for bag, positions in rows.bag_rows(files):
+            is_whole = len(stated.times) == len(rows)  # else some are undecodable
+            some = rows.some(positions)
+            of_bag = stated.at(positions) if is_whole else _stated_in_rows(view, columns, some)
+            stated_of_bags[bag.file].append(of_bag)
     return {
-        topic: events
-        for topic, parts in stated_of_topics.items()
+        file: events
+        for file, parts in stated_of_bags.items()
         if (events := events_of(joined_stated(parts))) is not None
     }
 

@@ -1,4 +1,4 @@
-"""The rows of one closed bag.
+"""The rows of closed bags.
 
 The bag is the one that the memory sees: messages that count in another recording are left out, as
 in answers. Its channels are the robot's own bytes: whatever is asked of them is asked as of the
@@ -12,7 +12,8 @@ import json
 import math
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from itertools import chain, starmap
+from functools import cache
+from itertools import chain
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
@@ -38,22 +39,27 @@ from ros2_memory.core.errors import UndecodableError
 from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns, unix_from_ns
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.history.poses import poses_of_bag
+from ros2_memory.history.detections import DetectionRows
+from ros2_memory.history.poses import poses_by_bag
+from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
-from ros2_memory.insights.topic_events import events_of_bag, toggled
+from ros2_memory.insights.topic_events import events_by_bag, toggled
 from ros2_memory.lake.tables import KEYS, ROWS_VERSION, TABLES, Row, ShippedBag, packed_messages
-from ros2_memory.messages.detections import Detection, detections_of
 from ros2_memory.places.pose_frames import robot_places
 from ros2_memory.places.robot_tracks import TrackReader
 from ros2_memory.things.labels import Labels
 from ros2_memory.things.seen import Watching, may_have_detections
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     import pyarrow as pa
+    from numpy.typing import NDArray
 
+    from ros2_memory.analysis.poses import Poses
+    from ros2_memory.analysis.sights import Sights
+    from ros2_memory.columns.units import Rows
     from ros2_memory.storage.base import Batch, Channel, IntArray
 
 _MOST_OF_MESSAGE: Final = 512
@@ -66,7 +72,9 @@ _MAP_OF: Final = {bool: "flags", int: "integers", float: "numbers", str: "texts"
 """The map of `messages` that has values of a type."""
 _LARGEST: Final = 1 << 63
 _NO_SCORE: Final = -1
+_NOWHERE: Final = (math.nan, math.nan)
 _MM: Final = 1000.0
+_ANGLE_DIGITS: Final = 9
 _SCORE_UNIT: Final = 1000.0
 _Rows: TypeAlias = "np.ndarray[tuple[int, int], np.dtype[np.int64]]"
 
@@ -113,7 +121,8 @@ class RowMaker:
         self._memory, self._config, self._whole = memory, config, whole
         self._view = View(memory, Call())
         self._watching = Watching(self._view)
-        self._thing = Labels(memory.limits.labels).key
+        self._detections = DetectionRows(self._view)
+        self._thing = cache(Labels(memory.limits.labels).key)
 
     def made_of(self, bag: BagFile) -> str:
         """Returns a digest of all inputs of a bag's rows besides its bytes.
@@ -131,95 +140,109 @@ class RowMaker:
         joined = self._memory.index.joined_with(bag.recording)
         return _digest([*settings, statics, sorted(self._whole), counted, *joined])
 
-    def rows(self, bag: BagFile, shipped: ShippedBag) -> dict[str, pa.Table]:
-        """Returns the rows of a bag, by table.
+    def rows(self, bags: Mapping[BagFile, ShippedBag]) -> dict[str, pa.Table]:
+        """Returns the rows of some bags, which lie close together in time, by table.
 
         Raises:
-            BagError: the bag, or a part of it, cannot be read.
+            BagError: one of them, or a part of it, cannot be read.
         """
-        tracks = self._tracks(bag)
-        map_frame, track = tracks[0] if tracks else (None, empty_track())
-        # What the events of a topic rule out is not decoded.
-        events, seen = self._events(bag)
-        driven, stood = self._driven(bag)
-        sightings, messages, undecodable = self._messages(bag, seen, map_frame, track)
-        of_bag = {
-            **shipped._asdict(),
-            "recording": bag.recording.name,
-            "messages": bag.summary.count,
-            "undecodable": undecodable,
-            "detections": len(sightings),
-            "pose_topic": self._view.pose_topic,
-            "map_frame": map_frame,
-            **driven,
-            "summary": bag.summary.schema.to_json(),
-            "counts": bag.summary.packed,
-            "joined": "/".join(self._memory.index.joined_with(bag.recording)) or None,
-        }
-        rows: dict[str, Iterable[Row]] = {
-            "channels": self._channels(bag),
-            "poses": chain.from_iterable(starmap(self._poses, tracks)),
-            "sightings": sightings,
-            "things": self._things(bag),
-            "events": [*stood, *events],
-            "messages": messages,
-            "bags": [of_bag],
-        }
-        keys = {name: getattr(shipped, name) for name in KEYS}
-        # As Python has them, they take many times as much.
-        return {name: table.filled(keys, rows[name]) for name, table in TABLES.items()}
+        rows: dict[str, list[Row]] = {name: [] for name in TABLES}
+        window = TimeWindow(min(bag.start for bag in bags), max(bag.end for bag in bags) + 1)
+        files = {bag.file for bag in bags}
+        posed = scan(self._view, self._view.pose_topic, window, copies=True)
+        poses = poses_by_bag(self._view, posed, files)
+        events = self._events(window, files)
+        things: dict[BagFile, list[Row]] = defaultdict(list)
+        for bag, frame, sights in self._watching.by_bag([*bags]):
+            things[bag] += self._things(frame, sights)
+        seen: dict[BagFile, dict[str, list[Rows]]] = defaultdict(lambda: defaultdict(list))
+        for topic in dict.fromkeys(chain(*(topics for _, topics in events.values()))):
+            among = {file for file, (_, topics) in events.items() if topic in topics}
+            for rows_of_bags in scan(self._view, topic, window, copies=True):
+                for bag, positions in rows_of_bags.bag_rows(among):
+                    seen[bag][topic].append(rows_of_bags.some(positions))
+        for bag, shipped in bags.items():
+            tracks = self._tracks(bag, window)
+            map_frame, track = tracks[0] if tracks else (None, empty_track())
+            sightings, undecodable = self._sightings(seen[bag], map_frame, track)
+            driven, stood = self._driven(poses.get(bag.file))
+            joined = self._memory.index.joined_with(bag.recording)
+            of_bag_alone = {
+                "recording": bag.recording.name,
+                "messages": bag.summary.count,
+                "undecodable": undecodable,
+                "detections": len(sightings),
+                "pose_topic": self._view.pose_topic,
+                "map_frame": map_frame,
+                **driven,
+                "summary": bag.summary.schema.to_json(),
+                "counts": bag.summary.packed,
+                "joined": "/".join(joined) or None,
+            }
+            made = {
+                "channels": self._channels(bag),
+                "poses": (row for of_frame in tracks for row in self._poses(*of_frame)),
+                "sightings": sightings,
+                "things": things[bag],
+                "events": (*stood, *events.get(bag.file, ([], ()))[0]),
+                "messages": self._messages(bag),
+                "bags": (shipped._asdict() | of_bag_alone,),
+            }
+            keys = {name: getattr(shipped, name) for name in KEYS}
+            for name, of_table in made.items():
+                rows[name] += ({**keys, **row} for row in of_table)
+        return {name: table.filled(rows[name]) for name, table in TABLES.items()}
 
-    def _tracks(self, bag: BagFile) -> list[tuple[str, RobotTrack]]:
+    def _tracks(self, bag: BagFile, around: TimeWindow) -> list[tuple[str, RobotTrack]]:
         """Returns the robot's track in the bag, with its frame: in the map, and in the poses' own.
 
-        The first of them has the place that other rows name.
+        The first of them has the place that other rows name. That `around` is made once.
         """
         window = TimeWindow(bag.start, bag.end + 1)
         places = robot_places(self._view, window)
         if places is None:
             return []
-        # That of the bags beside it is the same one, which is made once.
-        around = window.aligned(PART_NS)
         tracks = [
-            (frame, cut(TrackReader(self._view, frame).over(around).track, window))
+            (frame, cut(TrackReader(self._view, frame).over(around.aligned(PART_NS)).track, window))
             for frame in dict.fromkeys((places.map_frame, places.pose_frame))
         ]
         return [(frame, track) for frame, track in tracks if len(track.times)]
 
     def _poses(self, frame: str, track: RobotTrack) -> Iterator[Row]:
         same = {"topic": self._view.pose_topic, "frame_id": frame, "error_m": TOLERANCE_M}
-        columns = (track.times, track.x, track.y, track.begins, track.heading)
-        for *vertex, heading in zip(*(column.tolist() for column in columns), strict=True):
-            row = dict(zip(("time_ns", "x", "y", "begins"), vertex, strict=True))
-            yield {**same, **row, "heading": None if math.isnan(heading) else heading}
+        # In a track it goes on beyond half a turn, as it did since the first vertex.
+        turned = np.remainder(track.heading + math.pi, 2 * math.pi) - math.pi
+        heading = turned.round(_ANGLE_DIGITS)
+        begins, x, y = track.begins, track.x, track.y
+        return _rows(same, time_ns=track.times, x=x, y=y, begins=begins, heading=heading)
 
-    def _things(self, bag: BagFile) -> Iterator[Row]:
-        for in_view in self._watching.in_bag(bag):
-            for sights in in_view.sights:
-                for spot in sights.spots.tolist():
-                    best, label = spot[Spot.BEST], sights.labels[spot[Spot.LABEL]]
-                    yield {
-                        "topic": sights.topics[spot[Spot.TOPIC]],
-                        "label": label,
-                        "thing": self._thing(label),
-                        "count": spot[Spot.N],
-                        "first_ns": spot[Spot.FIRST],
-                        "last_ns": spot[Spot.LAST],
-                        "frame_id": in_view.frame_id,
-                        "x": spot[Spot.X] / _MM,
-                        "y": spot[Spot.Y] / _MM,
-                        "z": spot[Spot.Z] / _MM,
-                        "spread_m": spot[Spot.DEV] / _MM,
-                        "best_score": None if best == _NO_SCORE else best / _SCORE_UNIT,
-                    }
+    def _things(self, frame: str, sights: Sights) -> Iterator[Row]:
+        spots = sights.spots
+        labels = [sights.labels[code] for code in spots[:, Spot.LABEL].tolist()]
+        x, y, z, spread_m = spots[:, [Spot.X, Spot.Y, Spot.Z, Spot.DEV]].T / _MM
+        best = spots[:, Spot.BEST]
+        return _rows(
+            {"frame_id": frame},
+            topic=[sights.topics[number] for number in spots[:, Spot.TOPIC].tolist()],
+            label=labels,
+            thing=map(self._thing, labels),
+            count=spots[:, Spot.N],
+            first_ns=spots[:, Spot.FIRST],
+            last_ns=spots[:, Spot.LAST],
+            x=x,
+            y=y,
+            z=z,
+            spread_m=spread_m,
+            best_score=np.where(best == _NO_SCORE, math.nan, best / _SCORE_UNIT),
+        )
 
-    def _driven(self, bag: BagFile) -> tuple[Row, list[Row]]:
-        """Returns what the row of the bag has of its poses, and their standstills and drops."""
+    def _driven(self, poses: Poses | None) -> tuple[Row, list[Row]]:
+        """Returns what the row of a bag has of its poses, and their standstills and drops."""
         topic = self._view.pose_topic
-        poses = poses_of_bag(self._view, bag, topic)
         if poses is None:
             return {}, []
-        whole = path_slice(poses, self._memory.limits.max_plausible_speed_mps).trajectory(0)
+        fastest_mps = self._memory.limits.max_plausible_speed_mps
+        whole = path_slice(poses, fastest_mps, draws=False).trajectory(0)
         driven = {
             "poses": whole.poses,
             "distance_m": whole.totals.distance_m,
@@ -260,58 +283,82 @@ class RowMaker:
         for number, messages in enumerate(order):
             yield messages.row(number, tied)
 
-    def _messages(
-        self, bag: BagFile, seen: Collection[str], frame: str | None, track: RobotTrack
-    ) -> tuple[list[Row], list[Row], int]:
-        """Returns the detections of the topics `seen`, and the messages that are shipped whole.
+    def _sightings(
+        self,
+        rows_of_topics: Mapping[str, Sequence[Rows]],
+        frame: str | None,
+        track: RobotTrack,
+    ) -> tuple[list[Row], int]:
+        """Returns the detections in a bag, and how many messages of its topics are undecodable."""
+        sightings, undecodable = list[Row](), 0
+        for topic, of_topic in rows_of_topics.items():
+            times = np.sort(np.concatenate([rows.times for rows in of_topic]))
+            for rows in of_topic:
+                detected = self._detections.of(rows)
+                lost = len(rows) - len(detected.log_times)
+                undecodable += lost
+                number = np.searchsorted(times, detected.log_times)
+                number += 0 if lost else rows.ranks
+                found, at = detected.found, detected.found.rows
+                places = [place_at(track, time) for time in detected.log_times.tolist()]
+                robot_x, robot_y = (
+                    np.array([place or _NOWHERE for place in places]).reshape(-1, 2).T
+                )
+                labels, (x, y, z) = found.labels.values(), found.places.T
+                sightings += _rows(
+                    {"topic": topic, "type": rows.table.channel.type},
+                    time_ns=detected.log_times[at],
+                    message=number[at],
+                    label=labels,
+                    thing=map(self._thing, labels),
+                    score=found.scores,
+                    frame_id=found.frames.values(),
+                    x=x,
+                    y=y,
+                    z=z,
+                    robot_frame=[frame if places[message] else None for message in at.tolist()],
+                    robot_x=robot_x[at],
+                    robot_y=robot_y[at],
+                )
+        return sightings, undecodable
 
-        The number is how many messages of the former cannot be decoded.
-        """
-        sightings, messages, undecodable = list[Row](), list[Row](), 0
-        numbers = Counter[str]()
-        topics, window = {*self._whole, *seen}, TimeWindow.everything()
+    def _messages(self, bag: BagFile) -> Iterator[Row]:
+        """Yields the messages of the topics that are shipped whole."""
         reader, extractor = self._memory.reader, self._memory.extractor
-        for record in reader.records(bag.path, topics, window):
-            topic, kind, time = record.channel.topic, record.channel.type, record.log_time
-            detections: Sequence[Detection] = ()
-            row = {"topic": topic, "type": kind, "time_ns": time, "message": numbers[topic]}
-            numbers[topic] += 1
+        numbers = Counter[str]()
+        topics = {*self._whole}.intersection(topic.topic for topic in bag.summary.topics)
+        for record in reader.records(bag.path, topics, TimeWindow.everything()) if topics else ():
+            topic, kind = record.channel.topic, record.channel.type
             try:
-                message = reader.decode(record)
-                shown = extractor.exact(message, kind)
+                value = taken_apart(extractor.exact(reader.decode(record), kind))
             except UndecodableError as error:
-                undecodable += topic in seen
-                value: Row = {"undecodable": error.reason}
-            else:
-                value = taken_apart(shown) if topic in self._whole else {}
-                detections = detections_of(shown, extractor.frame(message)) if topic in seen else ()
-            if topic in self._whole:
-                messages.append({**row, "publish_ns": record.publish_time, **value})
-            at = place_at(track, time) if detections else None
-            if at is not None:
-                row |= {"robot_frame": frame, "robot_x": at[0], "robot_y": at[1]}
-            for detection in detections:
-                label, place = detection.label, detection.place or ()
-                named = {"label": label, "thing": self._thing(label), "score": detection.score}
-                where = {"frame_id": detection.frame_id, **dict(zip("xyz", place, strict=False))}
-                sightings.append({**row, **named, **where})
-        return sightings, messages, undecodable
+                value = {"undecodable": error.reason}
+            times = {"time_ns": record.log_time, "publish_ns": record.publish_time}
+            yield {"topic": topic, "type": kind, **times, "message": numbers[topic], **value}
+            numbers[topic] += 1
 
-    def _events(self, bag: BagFile) -> tuple[list[Row], set[str]]:
-        """Returns the events of topics, and those that may have detections in the bag."""
-        types = defaultdict[str, list[str]](list)
-        for counted in bag.summary.topics:
-            types[counted.topic].append(counted.type)
-        topics = [topic for topic in types if any(map(has_events, types[topic]))]
-        rows, seen = list[Row](), set[str]()
-        for topic, of_topic in events_of_bag(self._view, bag, topics).items():
-            events = of_topic.limited(MAX_PER_BAG, MAX_PER_BAG)
-            rows += self._events_of(topic, events)
-            if (events.visible.size or events.left_out) and any(
-                map(may_have_detections, types[topic])
-            ):
-                seen.add(topic)
-        return rows, seen
+    def _events(
+        self, window: TimeWindow, files: Collection[str]
+    ) -> dict[str, tuple[list[Row], list[str]]]:
+        """Returns the events in each of some bags, and the topics that may have detections there.
+
+        By their files.
+        """
+        found: dict[str, tuple[list[Row], list[str]]] = defaultdict(lambda: ([], []))
+        for topic in self._view.timeline.topics():
+            types = self._view.timeline.types_of(topic)
+            if not any(map(has_events, types)):
+                continue
+            may_be_seen = any(map(may_have_detections, types))
+            tables = scan(self._view, topic, window, copies=True)
+            for file, of_bag in events_by_bag(self._view, tables, files).items():
+                events = of_bag.limited(MAX_PER_BAG, MAX_PER_BAG)
+                rows, seen = found[file]
+                rows += self._events_of(topic, events)
+                # What the events of a topic rule out is not decoded.
+                if may_be_seen and (events.visible.size or events.left_out):
+                    seen.append(topic)
+        return found
 
     def _events_of(self, topic: str, events: TopicEvents) -> Iterator[Row]:
         for seen in events.visible.intervals():
@@ -332,6 +379,14 @@ def _drop_payloads(channels: Collection[_Messages]) -> None:
         largest = max(droppable, key=attrgetter("size"))
         largest.payloads, largest.size = None, 0
         droppable.remove(largest)
+
+
+def _rows(same: Row, **columns: IntArray | NDArray[np.float64] | Iterable[object]) -> Iterator[Row]:
+    """Yields rows with what is the `same` in all, and a value of each column."""
+    values = (
+        column.tolist() if isinstance(column, np.ndarray) else column for column in columns.values()
+    )
+    return ({**same, **dict(zip(columns, row, strict=True))} for row in zip(*values, strict=True))
 
 
 def _event(topic: str, kind: str, first: Ns, text: str, **more: object) -> Row:
@@ -381,7 +436,9 @@ class _Messages:
         """Takes more messages."""
         self.parts.append(np.stack((batch.log_times, batch.places, batch.publish_times)))
         if self.payloads is not None:
-            self.payloads += map(batch.payload, range(batch.sizes.size))
+            buffer, starts, sizes = batch.buffer, batch.starts, batch.sizes
+            spans = zip(starts.tolist(), (starts + sizes).tolist(), strict=True)
+            self.payloads += [buffer[begin:end] for begin, end in spans]
             self.size += int(batch.sizes.sum())
 
     def row(self, number: int, tied: IntArray) -> Row:

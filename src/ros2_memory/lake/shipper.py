@@ -34,6 +34,7 @@ from ros2_memory.bag_dir.state_files import (
 )
 from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.store import relative
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import BagError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.fill import Batch, Filling
     from ros2_memory.history.context import Memory
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.lake.warehouse import LakeTables
@@ -86,13 +88,20 @@ class _KnownState(NamedTuple):
     is_forgotten: bool
 
 
-class _PreparedBag(NamedTuple):
-    """A bag of a batch, its rows, and what the lake has of it, under other days and ids perhaps."""
+class _BagToShip(NamedTuple):
+    """A bag, its row, and what the lake has of it, under other days and ids perhaps."""
+
+    file: BagFile
+    bag: ShippedBag
+    replaced: Sequence[ShippedBag]
+
+
+class _PreparedBags(NamedTuple):
+    """Bags of one robot, and their rows."""
 
     robot: RobotBags
-    bag: ShippedBag
+    bags: Sequence[_BagToShip]
     rows: Mapping[str, pa.Table]
-    replaced: Sequence[ShippedBag]
 
 
 @dataclass(eq=False, repr=False)
@@ -136,15 +145,16 @@ class Shipper:
             LakeError: the lake cannot be read or written; what is not committed is tried again.
         """
         done = Shipped()
-        batch: list[_PreparedBag] = []
-        size = 0
+        batch: list[_PreparedBags] = []
+        size = bags = 0
         robots = [robot for robot in self.robots if self._forget(robot, done)]
         for ready in chain.from_iterable(robot.ready(self, done) for robot in robots):
             batch.append(ready)
+            bags += len(ready.bags)
             size += sum(rows.nbytes for rows in ready.rows.values())
-            if len(batch) >= self.most_bags or size >= MOST_BYTES:
+            if bags >= self.most_bags or size >= MOST_BYTES:
                 self._commit(batch, done, is_full=True)
-                batch, size = [], 0
+                batch, size, bags = [], 0, 0
         if batch:
             self._commit(batch, done, is_full=False)
         return done
@@ -152,9 +162,13 @@ class Shipper:
     def keep_up(self, grace: Ns) -> None:
         """Puts closed days together, and deletes files that nothing needed for longer than `grace`.
 
+        What robots have stored of bags that are gone is deleted, too.
+
         Raises:
             LakeError: the lake cannot be read or written.
         """
+        for robot in self.robots:
+            robot.prune()
         now = self.clock.now()
         compact(self.lake, now, self.alive)
         expire(self.lake, now - grace if grace else MAX_NS)
@@ -190,33 +204,33 @@ class Shipper:
             self.look_again()
         return True
 
-    def _commit(self, batch: Sequence[_PreparedBag], done: Shipped, *, is_full: bool) -> None:
+    def _commit(self, batch: Sequence[_PreparedBags], done: Shipped, *, is_full: bool) -> None:
         """Commits a batch.
 
         Raises:
             LakeError: the lake cannot be written; it is not known how far that came.
         """
         self.before_commit(is_full)
-        bags = [bag for ready in batch for bag in (ready.bag, *ready.replaced)]
+        to_ship = [to_ship for ready in batch for to_ship in ready.bags]
+        bags = [bag for of_file in to_ship for bag in (of_file.bag, *of_file.replaced)]
         # Few files have to be looked at for it.
         condition = of_bags((bag.robot, bag.day, bag.bag_id) for bag in bags)
         rows = 0
         try:
-            for name, table in TABLES.items():
-                whole = table.sorted(pa.concat_tables([ready.rows[name] for ready in batch]))
+            for name in TABLES:
+                whole = pa.concat_tables([ready.rows[name] for ready in batch])
                 rows += whole.num_rows
                 self.lake.replace(name, condition, whole)
         except LakeError:
             self.look_again()
             raise
-        done.bags += len(batch)
+        done.bags += len(to_ship)
         done.rows += rows
-        log.info("bags_shipped", bags=len(batch), rows=rows)
-        for robot in self.robots:
-            of_robot = [ready for ready in batch if ready.robot is robot]
-            for bag in (bag for ready in of_robot for bag in ready.replaced):
+        log.info("bags_shipped", bags=len(to_ship), rows=rows)
+        for robot, of_robot, _ in batch:
+            for bag in (bag for of_file in of_robot for bag in of_file.replaced):
                 robot.known.pop(bag.bag_id, None)
-            robot.confirm([ready.bag for ready in of_robot], self, done)
+            robot.confirm([of_file.bag for of_file in of_robot], self, done)
 
 
 @dataclass(eq=False, repr=False)
@@ -232,6 +246,8 @@ class RobotBags:
         reader: reads whole files, also messages that count in another recording.
         config: names the settings that rows depend on.
         messages: topics whose messages are shipped whole.
+        filling: stores the columns of bags before their rows are made of these; None: they are read
+            for each row anew.
     """
 
     name: str
@@ -239,6 +255,7 @@ class RobotBags:
     reader: BagReader
     config: str
     messages: Sequence[str] = ()
+    filling: Filling | None = None
     _looking: threading.Thread | None = field(default=None, init=False)
 
     def answers(self, patience_s: float) -> bool:
@@ -268,7 +285,13 @@ class RobotBags:
         self.known: dict[str, ShippedBag] = {}
         self._confirmed: set[ShippedBag] = set()
 
-    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBag]:
+    def prune(self) -> None:
+        """Deletes what is stored of bags that are gone."""
+        snapshot = self.memory.index.snapshot()
+        if self.filling is not None and snapshot.problem is None:
+            self.filling.prune(snapshot.timeline)
+
+    def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBags]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
         snapshot = self.memory.index.refresh()
         if snapshot.problem is not None:
@@ -276,6 +299,22 @@ class RobotBags:
             return
         bags = self._settled(snapshot, done)
         self._load_known(bags, shipper.lake)
+        batches = [] if self.filling is None else self.filling.batches(snapshot.timeline)
+        waiting = {bag.file: batch for batch in batches for bag in batch.bags}
+        group: list[_BagToShip] = []
+        for to_ship in self._to_ship(bags, shipper, done):
+            if group and not _are_made_together([*group, to_ship], shipper.most_bags):
+                yield from self._made(group, waiting, done)
+                group = []
+            group.append(to_ship)
+        if group:
+            yield from self._made(group, waiting, done)
+        self._drop_gone(bags)
+
+    def _to_ship(
+        self, bags: Sequence[BagFile], shipper: Shipper, done: Shipped
+    ) -> Iterator[_BagToShip]:
+        """Yields those of some bags that are to be shipped; the others are confirmed at the end."""
         by_file = {shipped.file: shipped for shipped in self.known.values()}
         ids, confirmed = set[str](), list[ShippedBag]()
         copies = {bag.file for bag in bags if self.name_of(bag).startswith(f"{MOMENTS_FOLDER}/")}
@@ -296,18 +335,15 @@ class RobotBags:
                     continue
                 ids.add(bag_id)
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
-                # The rows of a copy are the same, which has another path and mtime.
-                if before and before == shipped._replace(
-                    mtime_ns=before.mtime_ns, file=before.file
-                ):
-                    confirmed.append(shipped)
-                    continue
-                same_file = by_file.get(shipped.file)
-                if same_file is not None and self._is_cut(same_file, bag):
-                    continue
-                rows = maker.rows(bag, shipped)
             except (BagError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
+                continue
+            # The rows of a copy are the same, which has another path and mtime.
+            if before and before == shipped._replace(mtime_ns=before.mtime_ns, file=before.file):
+                confirmed.append(shipped)
+                continue
+            same_file = by_file.get(shipped.file)
+            if same_file is not None and self._is_cut(same_file, bag):
                 continue
             replaced = {before} if before is not None else set()
             # As where its first messages were deleted by request: what is left lies within it.
@@ -315,9 +351,45 @@ class RobotBags:
                 same_file.start_ns <= shipped.start_ns and shipped.end_ns <= same_file.end_ns
             ):
                 replaced.add(same_file)
-            yield _PreparedBag(self, shipped, rows, [*replaced])
+            yield _BagToShip(bag, shipped, [*replaced])
         self.confirm(confirmed, shipper, done)
-        self._drop_gone(bags)
+
+    def _made(
+        self, group: Sequence[_BagToShip], waiting: dict[str, Batch], done: Shipped
+    ) -> Iterator[_PreparedBags]:
+        """Yields bags with their rows; those of which rows cannot be made are reported.
+
+        `waiting`: what is yet to be stored, by the files of bags.
+        """
+        if self.filling is not None:
+            self._store(self.filling, [to_ship.file for to_ship in group], waiting)
+        maker = RowMaker(self.memory, self.config, self.messages)
+        try:
+            rows = maker.rows({to_ship.file: to_ship.bag for to_ship in group})
+        except (BagError, OSError, ValueError) as error:
+            if len(group) == 1:
+                done.problems.append(f"{self.name}: {error}")
+                return
+            for alone in group:
+                yield from self._made([alone], waiting, done)
+        else:
+            yield _PreparedBags(self, group, rows)
+
+    def _store(self, filling: Filling, bags: Sequence[BagFile], waiting: dict[str, Batch]) -> None:
+        """Stores the columns of bags, and of those in the same parts, if they are `waiting`.
+
+        Those of the bags before are cut to their share first, since their rows are made.
+        """
+        filling.whole_since()
+        filling.thin()
+        filling.trim()
+        timeline = self.memory.index.snapshot().timeline
+        for bag in bags:
+            batch = waiting.get(bag.file)
+            if batch is not None:
+                filling.fill(batch, timeline)
+                for stored in batch.bags:
+                    waiting.pop(stored.file, None)
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
         """Returns the bags that change no more; reports the others."""
@@ -365,7 +437,8 @@ class RobotBags:
         state = (bag.size, bag.mtime_ns, bag.sidecar_ns)
         known = self._states.get(bag.file)
         if known is None or known.state != state:
-            summary = self.reader.summarize(bag.path)
+            # Without a handover all of its messages count.
+            summary = self.reader.summarize(bag.path) if bag.sidecar_ns else bag.summary
             if summary.empty:
                 raise BagError(bag.file, "it holds no message")
             bag_id = bag_id_of(self.name, bag.recording.name, bag.path.name, summary.start)
@@ -415,6 +488,16 @@ class RobotBags:
         except OSError as error:
             what = f"no receipts can be written into {self.bag_dir} ({error.strerror or error})"
             done.problems.append(f"{self.name}: {what}: its recorder cannot wait for shipping")
+
+
+def _are_made_together(bags: Sequence[_BagToShip], most: int) -> bool:
+    """Returns whether the rows of bags may be made at once: few, small, and close together."""
+    *_, before, last = (to_ship.file for to_ship in bags)
+    return (
+        len(bags) <= min(most, _TOGETHER)
+        and sum(to_ship.file.size for to_ship in bags) <= MOST_BYTES
+        and before.start <= last.start <= before.end + PART_NS
+    )
 
 
 def _list_one(folder: Path) -> None:

@@ -106,7 +106,7 @@ class LakeTable:
         return schema_to_pyarrow(self.schema, include_field_ids=False)
 
     def create(self, catalog: IcebergCatalog, identifier: str) -> IcebergTable:
-        """Creates the table, partitioned by robot and day, in the order that `filled` keeps."""
+        """Creates the table, partitioned by robot and day, in the order that `sorted` makes."""
         ids = {name: self.schema.find_field(name).field_id for name in self.columns}
         same, keys = IdentityTransform[Any](), enumerate(_PARTITIONED_BY)
         parts = (PartitionField(ids[name], 1000 + nth, same, name) for nth, name in keys)
@@ -122,21 +122,27 @@ class LakeTable:
         """Returns rows in the order of the table."""
         return rows.sort_by([(name, "ascending") for name in self.order])
 
-    def filled(self, keys: Row, rows: Iterable[Row]) -> pa.Table:
-        """Returns rows that have these keys, sorted as the table is."""
+    def filled(self, rows: Iterable[Row]) -> pa.Table:
+        """Returns rows as Arrow has them; NaN is null."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
         for row in rows:
             # `time` repeats the first time, in microseconds.
             time = {"time": cast("int", row[first]) // NS_PER_US} if first else {}
             key = str(row.get("topic", "")).strip("/").replace("/", ".")
-            whole.append({**keys, "topic_key": key, **time, **row})
-        try:
-            table = pa.Table.from_pylist(whole, self.arrow_schema)
-        except UnicodeEncodeError:
-            # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
-            table = pa.Table.from_pylist([*map(_encodable, whole)], self.arrow_schema)
-        return self.sorted(table)
+            whole.append({"topic_key": key, **time, **row})
+        columns = [
+            _column(field, [row.get(field.name) for row in whole]) for field in self.arrow_schema
+        ]
+        return pa.Table.from_arrays(columns, schema=self.arrow_schema)
+
+
+def _column(field: pa.Field, values: list[object]) -> pa.Array:
+    try:
+        return pa.array(values, field.type, from_pandas=True)
+    except UnicodeEncodeError:
+        # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
+        return pa.array([*map(_encodable, values)], field.type)
 
 
 _DECLARED: Final = yaml.safe_load(files(__package__).joinpath("tables.yaml").read_text("utf-8"))

@@ -67,11 +67,11 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     """
     closed = day_of(now - _DAY_NS)
     done = 0
-    for name, table in TABLES.items():
+    for name in TABLES:
         for day, robots in _to_compact(lake.current(name), closed):
             alive()
             condition = of_robots(robots, day)
-            lake.replace(name, condition, table.sorted(lake.rows(name, condition)))
+            lake.replace(name, condition, lake.rows(name, condition))
             done += len(robots)
     if done:
         log.info("days_compacted", days=done)

@@ -54,7 +54,6 @@ from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.bag_dir.lock import read_holder, write_holder
 from ros2_memory.core.errors import LakeError, RefusedError
 from ros2_memory.core.timebase import NS_PER_MS, Ns, WallClock
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 from ros2_memory.storage.cache import ByteLru
 
@@ -65,6 +64,8 @@ if TYPE_CHECKING:
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.expressions import BooleanExpression
     from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.lake.engine import DuckdbEngine
 
 
 _LOCK_FILE: Final = "writer.lock"
@@ -264,7 +265,7 @@ class LakeTables:
         """Replaces rows by others, in one transaction."""
         table = self.current(name)
         with self.location.translated(f"writing the lake's {name}"):
-            table.overwrite(rows, overwrite_filter=condition)
+            table.overwrite(TABLES[name].sorted(rows), overwrite_filter=condition)
 
     def delete(self, name: str, condition: BooleanExpression) -> None:
         """Deletes rows from the newest version; `expire` deletes those before."""
@@ -369,6 +370,21 @@ def _id_in(state_dir: Path) -> str:
         raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
 
 
+@dataclass(frozen=True, slots=True)
+class DataFiles:
+    """Some data files of one table.
+
+    Attributes:
+        schema: all columns of the table; a file may be older, and lack some.
+        locations: of the Parquet files, as URIs; files that are local have `file`.
+        store: the properties by which pyiceberg opens them, where they are not local.
+    """
+
+    schema: pa.Schema
+    locations: tuple[str, ...]
+    store: Mapping[str, str] = field(repr=False)
+
+
 class LakeFile(NamedTuple):
     """A Parquet file, how many rows it has, and its size (bytes).
 
@@ -382,6 +398,7 @@ class LakeFile(NamedTuple):
     last: str = _LAST
 
 
+Parameters: TypeAlias = "Mapping[str, str | int | float | Sequence[str]]"
 Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
 """The files of one robot in one table by day, in order of the days."""
 
@@ -454,7 +471,7 @@ class Lake:
     """
 
     catalog: IcebergCatalog
-    engine: LakeEngine
+    engine: DuckdbEngine
     translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext()
     messages: ByteLru[bytes] = field(default_factory=lambda: ByteLru(_MESSAGE_BYTES), init=False)
     _lock: threading.Lock = field(default_factory=threading.Lock, init=False)
@@ -491,7 +508,7 @@ class Lake:
     def select(
         self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
     ) -> pa.Table:
-        """Returns the rows of a select (see `LakeEngine`) over some files of a table."""
+        """Returns the rows of a select (see `DuckdbEngine`) over some files of a table."""
         with self._looking():
             table = self._loaded_table(name)
         store = {} if table is None else dict(table.io.properties)

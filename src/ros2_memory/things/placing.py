@@ -39,7 +39,10 @@ from ros2_memory.history.scan import messages_of, scan
 from ros2_memory.history.transforms import frames_over
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
     from ros2_memory.columns.units import Rows
+    from ros2_memory.core.model import BagFile
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
 
@@ -115,24 +118,31 @@ class Placer:
         poses = self._poses(session, window)
         target, frames = self._frames(lender, window, poses)
         sights = [
-            sights_of(
-                topic,
-                DetectorMessages(
-                    times=messages.log_times,
-                    robot=_robot_at(poses, messages, frames),
-                    rows=messages.found.rows,
-                    labels=messages.found.labels.codes.astype(np.int64),
-                    names=messages.found.labels.words,
-                    places=_places_in_target(messages, frames),
-                    scores=messages.found.scores,
-                ),
-            )
+            _sights_of(topic, messages, frames, _robot_at(poses, messages, frames))
             for topic, messages in detected.items()
         ]
         if target == self._view.limits.map_frame and len(poses):
             times = np.concatenate([messages.log_times for messages in detected.values()])
             sights.append(self._fixes(session, poses.frames.words[0], frames, times))
         return SessionSights(target, tuple(sights), frozenset(detectors))
+
+    def spots_by_bag(
+        self,
+        window: TimeWindow,
+        session: Session,
+        lender: Session,
+        units_of_bags: Mapping[BagFile, Sequence[Rows]],
+    ) -> Iterator[tuple[BagFile, str, Sights]]:
+        """Yields the sights of each topic in each bag, with the frame that their places are in.
+
+        Takes what `placed` takes. Where the robot was is not in them.
+        """
+        target, frames = self._frames(lender, window, self._poses(session, window))
+        for bag, units in units_of_bags.items():
+            for topic, messages in self._detected(units)[0].items():
+                if messages.found.rows.size:
+                    nowhere = np.full((len(messages.log_times), 5), math.nan)
+                    yield bag, target, _sights_of(topic, messages, frames, nowhere)
 
     def _detected(self, units: Iterable[Rows]) -> tuple[dict[str, Detected], set[str]]:
         """Returns the messages by topic, and which topics are surely of detectors."""
@@ -240,6 +250,20 @@ class Placer:
         said.sort()
         times = np.array([time for time, _ in said], np.int64)
         return times, np.array([sigma for _, sigma in said], np.float64)
+
+
+def _sights_of(topic: str, messages: Detected, frames: FrameTree, robot: Floats) -> Sights:
+    found = messages.found
+    seen = DetectorMessages(
+        times=messages.log_times,
+        robot=robot,
+        rows=found.rows,
+        labels=found.labels.codes.astype(np.int64),
+        names=found.labels.words,
+        places=_places_in_target(messages, frames),
+        scores=found.scores,
+    )
+    return sights_of(topic, seen)
 
 
 def _places_in_target(detected: Detected, frames: FrameTree) -> Floats:

@@ -24,12 +24,13 @@ from ros2_memory.columns.sights import packed, united
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import open_scan, remembered, scan
-from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer, SessionSights
+from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
 
+    from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.scan import Scan
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
@@ -266,27 +267,27 @@ class Watching:
             if not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
         ]
 
-    def in_bag(self, bag: BagFile) -> list[SessionSights]:
-        """Returns the sights of the messages of one bag that count, in each stretch.
+    def by_bag(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str, Sights]]:
+        """Yields the spots of the messages of each of some bags that count, in each stretch.
+
+        With the frame of their places. Robot poses are not looked for.
 
         Raises:
-            QueryTimeoutError: the deadline has passed.
+            QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        session = self._session(bag)
-        sights: list[SessionSights] = []
-        for number in _numbers_of(self._view, self._topics, bag):
-            window = _window(number).intersect(TimeWindow(bag.start, bag.end + 1))
-            units = [
-                rows.some(positions)
-                for rows in self._rows(window)
-                for source, positions in rows.bag_rows()
-                if source.file == bag.file
-            ]
-            lender = self._transforms_of(session, bag, window)
-            placed = self._placer.placed(window, session, lender, units)
-            if placed is not None:
-                sights.append(placed)
-        return sights
+        files = {bag.file for bag in bags}
+        by_bag = (_numbers_of(self._view, self._topics, bag) for bag in bags)
+        for number in sorted({*chain.from_iterable(by_bag)}):
+            window = _window(number)
+            by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
+            for rows in self._rows(window):
+                for bag, positions in rows.bag_rows(files):
+                    session = self._session(bag)
+                    lender = self._transforms_of(session, bag, window)
+                    of_bags = by_lender.setdefault((session, lender), {})
+                    of_bags.setdefault(bag, []).append(rows.some(positions))
+            for lending, of_bags in by_lender.items():
+                yield from self._placer.spots_by_bag(window, *lending, of_bags)
 
     def _session(self, bag: BagFile) -> Session:
         if bag.recording not in self._session_of:

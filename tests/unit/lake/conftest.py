@@ -6,12 +6,11 @@ from collections.abc import Iterator
 
 import pytest
 
-from ros2_memory.lake.engines.base import LakeEngine
-from ros2_memory.lake.engines.duckdb_engine import DuckdbEngine
+from ros2_memory.lake.engine import DuckdbEngine
 
 
 @pytest.fixture(scope="session")
-def engine() -> Iterator[LakeEngine]:
+def engine() -> Iterator[DuckdbEngine]:
     engine = DuckdbEngine(memory_mb=256, threads=1)
     yield engine
     engine.close()

@@ -19,10 +19,10 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.memory import newest
 from ros2_memory.lake.tables import day_of
-from ros2_memory.lake.warehouse import Days, LakeFile
+from ros2_memory.lake.warehouse import DataFiles, Days, LakeFile, Parameters
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
@@ -33,10 +33,10 @@ from tests.support.lakes import lake_robot, robot_bags, ship
 DAY_S = 86_400
 
 
-class WatchedEngine(LakeEngine):
+class WatchedEngine(DuckdbEngine):
     """Keeps which files were read."""
 
-    def __init__(self, engine: LakeEngine) -> None:
+    def __init__(self, engine: DuckdbEngine) -> None:
         self._engine = engine
         self.read: set[str] = set()
 
@@ -55,7 +55,7 @@ class WatchedEngine(LakeEngine):
 class Shipping:
     """A robot whose bags are shipped a few at a time."""
 
-    def __init__(self, folder: Path, engine: LakeEngine) -> None:
+    def __init__(self, folder: Path, engine: DuckdbEngine) -> None:
         self._folder = folder
         self.engine = WatchedEngine(engine)
         self._passes = 0
@@ -75,7 +75,7 @@ class Shipping:
 
 
 @pytest.fixture
-def shipping(tmp_path: Path, engine: LakeEngine) -> Shipping:
+def shipping(tmp_path: Path, engine: DuckdbEngine) -> Shipping:
     return Shipping(tmp_path, engine)
 
 
@@ -155,7 +155,7 @@ def test_days_that_are_looked_at_late_show_nothing_about_the_robots_clock(
 
 
 def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_robot(
-    tmp_path: Path, engine: LakeEngine
+    tmp_path: Path, engine: DuckdbEngine
 ) -> None:
     bags = tmp_path / "bags"
     for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):
@@ -220,7 +220,7 @@ DAYS = 7
 
 
 @pytest.fixture(scope="module")
-def memory(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+def memory(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.

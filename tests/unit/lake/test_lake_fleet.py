@@ -21,8 +21,8 @@ from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.lake.engines.base import DataFiles
 from ros2_memory.lake.tables import TABLES
+from ros2_memory.lake.warehouse import DataFiles
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply

@@ -15,7 +15,7 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.engines.base import LakeEngine
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.memory import LakeIndex
 from ros2_memory.lake.tables import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
@@ -39,7 +39,7 @@ EVERYTHING = TimeWindow.everything()
 CHANNEL = Channel("/any", "cdr", Schema("any"))
 
 
-def shipped(folder: Path, engine: LakeEngine) -> tuple[Memory, Memory]:
+def shipped(folder: Path, engine: DuckdbEngine) -> tuple[Memory, Memory]:
     """The memory over a robot's bags, and over the lake that they were shipped into."""
     robot = robot_bags("hall", folder / "bags")
     assert ship(folder / "lake", [robot]).bags == 2
@@ -47,7 +47,7 @@ def shipped(folder: Path, engine: LakeEngine) -> tuple[Memory, Memory]:
 
 
 @pytest.fixture
-def both(engine: LakeEngine, tmp_path: Path) -> tuple[Memory, Memory]:
+def both(engine: DuckdbEngine, tmp_path: Path) -> tuple[Memory, Memory]:
     """Two recordings whose messages are of equal and of unlike sizes, and images."""
     draw = Random(3)
     for recording in range(2):
@@ -88,7 +88,7 @@ def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> l
 
 
 def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
-    engine: LakeEngine, tmp_path: Path
+    engine: DuckdbEngine, tmp_path: Path
 ) -> None:
     names = ("one", "two")
     for number, name in enumerate(names):
@@ -112,7 +112,7 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
 
 
 def test_copies_among_images_are_told_by_their_publish_times(
-    engine: LakeEngine, tmp_path: Path
+    engine: DuckdbEngine, tmp_path: Path
 ) -> None:
     for recording, beats in enumerate((range(20), range(10, 30))):
         messages: list[Msg] = []
@@ -154,7 +154,7 @@ def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
 
 
 def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
-    engine: LakeEngine, tmp_path: Path
+    engine: DuckdbEngine, tmp_path: Path
 ) -> None:
     write_bag(tmp_path / "hall", 0)
     ship_from(tmp_path)
@@ -171,7 +171,7 @@ def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
 
 
 def test_messages_of_one_log_time_keep_the_order_of_the_file(
-    engine: LakeEngine, tmp_path: Path
+    engine: DuckdbEngine, tmp_path: Path
 ) -> None:
     """Those of a topic with two channels, and of several topics."""
     draw, stamped = Random(5), "ros2_vision_interfaces/msg/StampedString"

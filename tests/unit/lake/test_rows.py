@@ -1,6 +1,7 @@
 """The rows of bags in a lake say what the memory answers about them."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from random import Random
 
@@ -13,6 +14,7 @@ from tests.support.bags import Msg, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
 from tests.support.lakes import lake_rows, robot_bags, ship
+from tests.support.memories import memory_of
 from tests.support.unlike_robots import ROBOTS
 
 ROBOT = seeded("kitchen")
@@ -58,15 +60,18 @@ def test_poses_are_within_their_error_of_what_the_robot_drove(lake: tuple[Path, 
 def test_rows_of_a_bag_are_the_same_whatever_bags_they_are_made_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """And whether their columns are stored."""
     ROBOTS["twin"](tmp_path / "twin")
     found = []
-    for together in (1, 3, 64):
-        monkeypatch.setattr("ros2_memory.lake.shipper._TOGETHER", together)
-        lake = tmp_path / f"lake_{together}"
-        ship(lake, [robot_bags("twin", tmp_path / "twin")], most_bags=100)
+    for together in (1, 3, 64, 0):
+        monkeypatch.setattr("ros2_memory.lake.shipper._TOGETHER", together or 64)
+        lake, robot = tmp_path / f"lake_{together}", robot_bags("twin", tmp_path / "twin")
+        if not together:
+            robot = replace(robot, memory=memory_of(tmp_path / "twin"), filling=None)
+        ship(lake, [robot], most_bags=100)
         found.append({name: sorted(map(str, lake_rows(lake, name))) for name in TABLES})
     assert len(found[0]["poses"]) > len(found[0]["bags"]) > 3
-    assert found[1:] == found[:1] * 2
+    assert found[1:] == found[:1] * 3
 
 
 def test_messages_of_a_chosen_topic_are_whole(lake: tuple[Path, Memory]) -> None:

@@ -24,7 +24,8 @@ def catalog(tmp_path: Path) -> SqlCatalog:
 def test_rows_are_sorted_and_lie_by_robot_and_day_in_zstd(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["events"])["events"]
     row = {**KEYS, "topic": "/wheel/odom", "kind": "stop", "first_ns": 5_000_000_123, "x": 1.5}
-    table.append(TABLES["events"].filled({}, [row, {**row, "first_ns": 1_000_000_000}]))
+    events = TABLES["events"]
+    table.append(events.sorted(events.filled([row, {**row, "first_ns": 1_000_000_000}])))
     before, found = table.scan().to_arrow().to_pylist()
     assert before["time"].timestamp() == 1.0
     assert {name: found[name] for name in row} == row
@@ -55,14 +56,14 @@ def test_bags_of_years_are_deleted_at_once(catalog: SqlCatalog) -> None:
     table = open_tables(catalog, ["events"])["events"]
     days = [DAY + timedelta(days=nth) for nth in (0, 1, 1199, 1200)]
     rows = [{**KEYS, "day": day, "topic": "/odom", "first_ns": 0} for day in days]
-    table.append(TABLES["events"].filled({}, rows))
+    table.append(TABLES["events"].filled(rows))
     table.delete(of_bags(("hall", days[0] + timedelta(days=nth), "a") for nth in range(1200)))
     assert table.scan().to_arrow()["day"].to_pylist() == [days[-1]]
 
 
 def test_lone_surrogates_of_a_hostile_bag_are_escaped() -> None:
     texts = {"value": "bad \udc80", "texts": [("\udc80", "\udc81")]}
-    table = TABLES["messages"].filled({}, [{**KEYS, "topic": "/\udc80", "time_ns": 1, **texts}])
+    table = TABLES["messages"].filled([{**KEYS, "topic": "/\udc80", "time_ns": 1, **texts}])
     assert table["value"].to_pylist() == ["bad \\udc80"]
     assert table["topic_key"].to_pylist() == ["\\udc80"]
     assert table["texts"].to_pylist() == [[("\\udc80", "\\udc81")]]

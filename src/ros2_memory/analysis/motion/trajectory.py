@@ -238,8 +238,8 @@ class PathSlice:
         )
 
 
-def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
-    """Measures poses, which are in order, and draws them within 1.75 cm.
+def path_slice(poses: Poses, fastest_mps: float, *, draws: bool = True) -> PathSlice:
+    """Measures poses, which are in order, and draws them within 1.75 cm, if it `draws`.
 
     A step that would take a higher speed than `fastest_mps` is a jump.
     """
@@ -250,7 +250,8 @@ def path_slice(poses: Poses, fastest_mps: float) -> PathSlice:
     if len(placed):
         measured = measured_path(placed.times, placed.positions, fastest_mps)
         totals, step_mps = measured.totals, measured.step_mps
-        line, error_m = _line_through(placed, measured)
+        if draws:
+            line, error_m = _line_through(placed, measured)
     return PathSlice(
         int(poses.times[0]) if len(poses) else 0,
         int(poses.times[-1]) if len(poses) else 0,

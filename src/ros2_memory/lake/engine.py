@@ -1,8 +1,12 @@
-"""DuckDB, inside of this process: the default engine. It loads no extension."""
+"""DuckDB, inside of this process, runs SQL over data files of a lake. It loads no extension.
+
+It is given the data files that hold what a question is about, and never looks at the lake's
+catalogue itself.
+"""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import duckdb
 import pyarrow as pa
@@ -11,7 +15,9 @@ from pyiceberg.io.pyarrow import PyArrowFileIO
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+
+if TYPE_CHECKING:
+    from ros2_memory.lake.warehouse import DataFiles, Parameters
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
@@ -26,8 +32,10 @@ _LOCAL: Final = (
 log = get_logger(__name__)
 
 
-class DuckdbEngine(LakeEngine):
+class DuckdbEngine:
     """Reads local files itself, within its limits, and those of a store through Arrow.
+
+    Safe to use from several threads at once.
 
     Args:
         memory_mb: how much memory it may use.
@@ -41,9 +49,17 @@ class DuckdbEngine(LakeEngine):
         self._connection = duckdb.connect(config={**settings})
 
     def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
-        """Runs the select in a cursor of its own, which alone knows the table."""
+        """Returns the rows of one select `FROM` the table, in no order without `ORDER BY`.
+
+        A column that a file lacks is null there, and the table may have no file at all. `$name` is
+        the parameter of that name, whose text is never SQL; a list is for `IN $name`.
+
+        Raises:
+            RefusedError: a file cannot be read; the log has why.
+        """
         bound: dict[str, object] = {**parameters}
         try:
+            # A cursor of its own, which alone knows the table.
             with self._connection.cursor() as cursor:
                 rows, local = _opened(files)
                 cursor.register("in_store", rows)

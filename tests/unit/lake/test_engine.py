@@ -1,4 +1,4 @@
-"""What `lake/engines/base.py` promises of a `LakeEngine`, checked with every adapter."""
+"""What the engine of a lake promises: SQL over files of which some lack columns, or are gone."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.lake.engines.base import DataFiles, LakeEngine, Parameters
+from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.tables import TABLES, Row
+from ros2_memory.lake.warehouse import DataFiles, Parameters
 
 DAY = date(2026, 11, 20)
 ROBOTS = ("attic", "hall", "it's")
@@ -24,7 +25,7 @@ Select = Callable[..., pa.Table]
 
 
 @pytest.fixture(scope="module")
-def select(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Select:
+def select(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Select:
     """Runs a select over all files of `sightings`: of three robots, each with two days."""
     folder, table = tmp_path_factory.mktemp("lake"), TABLES["sightings"]
     locations: list[str] = []
@@ -43,7 +44,7 @@ def select(engine: LakeEngine, tmp_path_factory: pytest.TempPathFactory) -> Sele
                 for nth, (label, score) in enumerate([*seen, ("unscored", None)])
             ]
             path = folder / f"{len(locations)}.parquet"
-            pq.write_table(table.filled({}, rows), path)
+            pq.write_table(table.filled(rows), path)
             locations.append(path.as_uri())
     files = DataFiles(table.arrow_schema, tuple(locations), {})
 
@@ -77,10 +78,10 @@ def test_a_text_is_never_sql(select: Select) -> None:
 
 
 def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
-    tmp_path: Path, engine: LakeEngine
+    tmp_path: Path, engine: DuckdbEngine
 ) -> None:
     row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
-    whole = TABLES["things"].filled({}, [{**row, "label": "cup", "spread_m": 0.1}])
+    whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
     path = tmp_path / "old.parquet"
     pq.write_table(whole.drop_columns(["spread_m"]), path)
     files = DataFiles(TABLES["things"].arrow_schema, (path.as_uri(),), {})
