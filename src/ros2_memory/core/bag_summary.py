@@ -11,14 +11,12 @@ import json
 import struct
 import sys
 from dataclasses import dataclass, replace
-from functools import cache, cached_property, lru_cache
+from functools import cached_property, lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
-from pydantic import TypeAdapter
 
-from ros2_memory.core.pauses import Absences, Pauses
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
@@ -26,9 +24,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.pauses import Absences, Pauses
+
     IntArray = NDArray[np.int64]
 
-SetBack: TypeAlias = tuple[Ns, Ns] | None
+SetBack: TypeAlias = "tuple[Ns, Ns] | None"
 """By how much log times go back, and the first one after that; None where they do not."""
 OUT_OF_ORDER_NS: Final[Ns] = NS_PER_S
 """Messages are written out of order by less than this, also across two splits."""
@@ -68,12 +68,6 @@ class TopicHeader(NamedTuple):
     type: str
     encoding: str
     latched: bool
-
-
-_StoredSchema: TypeAlias = tuple[
-    tuple[TopicHeader, ...], tuple[str, ...], bool, tuple[str, ...], SetBack, Pauses, Absences
-]
-"""The fields of a `SummarySchema`."""
 
 
 @dataclass(frozen=True)
@@ -121,13 +115,26 @@ class SummarySchema:
 
         Raises:
             ValueError: the text is not valid.
+            TypeError: likewise.
         """
-        return shared_schema(SummarySchema(*_stored_schema().validate_json(text)))
-
-
-@cache
-def _stored_schema() -> TypeAdapter[_StoredSchema]:
-    return TypeAdapter(_StoredSchema)
+        topics, silent, complete, notes, set_back, pauses, absences = json.loads(text)
+        return shared_schema(
+            SummarySchema(
+                tuple(
+                    TopicHeader(topic, type_name, encoding, bool(latched))
+                    for topic, type_name, encoding, latched in topics
+                ),
+                tuple(silent),
+                bool(complete),
+                tuple(notes),
+                set_back and (int(set_back[0]), int(set_back[1])),
+                tuple((int(start), int(end)) for start, end in pauses),
+                tuple(
+                    (topic, tuple((int(start), int(end), int(sent)) for start, end, sent in listed))
+                    for topic, listed in absences
+                ),
+            )
+        )
 
 
 WRONG_STATISTICS: Final = "its own statistics are wrong"

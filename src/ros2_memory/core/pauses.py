@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-Pauses: TypeAlias = tuple[tuple[Ns, Ns], ...]
+Pauses: TypeAlias = "tuple[tuple[Ns, Ns], ...]"
 """From the log time of the last message before each to that of the first after it, in order."""
-CountedPause: TypeAlias = tuple[Ns, Ns, int]
+CountedPause: TypeAlias = "tuple[Ns, Ns, int]"
 """A pause, and how many messages the bag has before it."""
-Absences: TypeAlias = tuple[tuple[str, tuple[CountedPause, ...]], ...]
+Absences: TypeAlias = "tuple[tuple[str, tuple[CountedPause, ...]], ...]"
 """By topic, the pauses of that topic which may be silences, in order."""
 
 SHORTEST_PAUSE_NS: Final[Ns] = NS_PER_S // 2

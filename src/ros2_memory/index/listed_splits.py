@@ -6,13 +6,11 @@ since, or never copied, leave no other trace.
 
 from __future__ import annotations
 
+import json
 import os
 from collections import Counter
-from functools import cache
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
-
-from pydantic import TypeAdapter
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
 from ros2_memory.bag_dir.layout import HANDOVER_FILE, METADATA_FILE, bag_kind
@@ -22,13 +20,13 @@ from ros2_memory.bag_dir.state_files import read_deleted
 from ros2_memory.core.directories import opened
 from ros2_memory.core.model import SetAside
 from ros2_memory.core.text import MAX_NAMED, counted, listed
-from ros2_memory.core.timebase import Ns  # noqa: TC001 - a field of what is stored
 from ros2_memory.index.scan import settled
 from ros2_memory.index.segment import Tally
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence
 
+    from ros2_memory.core.timebase import Ns
     from ros2_memory.index.snapshot import Snapshot
 
 _MAX_CACHED_FOLDERS: Final = 65_536
@@ -81,23 +79,25 @@ Listings: TypeAlias = "dict[str, tuple[_Stamp, _FolderListing]]"
 """By folder: how it was when its metadata.yaml was read, and what that listed."""
 
 
-@cache
-def _stored_listing() -> TypeAdapter[tuple[_Stamp, _FolderListing]]:
-    return TypeAdapter(tuple[_Stamp, _FolderListing])
-
-
 def listing_to_json(stamp: _Stamp, listing: _FolderListing) -> str:
     """Returns what was read of a folder as one line."""
-    return _stored_listing().dump_json((stamp, listing)).decode()
+    return json.dumps([stamp, listing])
 
 
 def listing_from_json(text: str) -> tuple[_Stamp, _FolderListing]:
     """Returns what was read of a folder.
 
     Raises:
-        ValueError: the text is nothing of that kind.
+        ValueError, TypeError, OverflowError: the text is nothing of that kind.
     """
-    return _stored_listing().validate_json(text)
+    (mtime, size, folder), (first, later, bags, messages, is_total) = json.loads(text)
+    return _Stamp(mtime, size, folder), _FolderListing(
+        tuple((str(name), int(count)) for name, count in first),
+        tuple((str(name), int(count)) for name, count in later),
+        None if bags is None else int(bags),
+        None if messages is None else int(messages),
+        bool(is_total),
+    )
 
 
 def absent_splits(snapshot: Snapshot, bag_dir: Path, known: Listings) -> list[Absent]:

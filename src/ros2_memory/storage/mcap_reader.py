@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.storage.file_reader import FileReader
 
 if TYPE_CHECKING:
     from pathlib import Path
 
 
-class McapReader(Rosbag2Reader):
+class McapReader(FileReader):
     """Reads `.mcap` files alone, with or without metadata.yaml beside them."""
 
     def reads(self, path: Path) -> bool:
