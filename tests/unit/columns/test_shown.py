@@ -229,3 +229,12 @@ def test_a_mapped_path_that_leads_into_times_is_left_to_the_bag() -> None:
     extractor = SchemaExtractor({ODOMETRY: {"second": "header.stamp.sec"}}, 50)
     table = drawn_of(ODOMETRY, [message(ODOMETRY, Random(1))]).table
     assert numbers(table, "second", extractor) is None
+
+
+def test_the_numbers_of_an_array_that_is_a_point_keep_their_order() -> None:
+    kind = "px4_msgs/msg/VehicleOdometry"
+    odometry = message(kind, Random(1), is_odd=False)
+    odometry.position = np.arange(1, 4, dtype=np.float32)  # type: ignore[attr-defined]
+    table = drawn_of(kind, [odometry]).table
+    read = [numbers(table, f"position.{axis}", EXTRACTOR) for axis in "xyz"]
+    assert [found.numbers.tolist() for found in read if found is not None] == [[1.0], [2.0], [3.0]]
