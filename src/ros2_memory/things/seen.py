@@ -177,7 +177,7 @@ class Watching:
         topics = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
         self._needed = tuple(dict.fromkeys(topics))
         self._scans: list[Scan] = []
-        self._may_be_kept = not view.stream.may_be_repeated(self._topics)
+        self._may_be_repeated = view.stream.may_be_repeated(self._topics)
         self._digested: tuple[object, str] = None, ""
         self._newest = max((segment.latest for segment in timeline.segments), default=MIN_NS)
 
@@ -232,7 +232,10 @@ class Watching:
         whole = window.widened(AROUND_NS)
         if self._view.memory.scanner.store is not None:
             reach = whole.widened(SIGHTS_NS)
-            self._scans = [open_scan(self._view, t, reach, copies=True) for t in self._needed]
+            self._scans = [
+                open_scan(self._view, topic, reach, copies=topic not in self._topics)
+                for topic in self._needed
+            ]
         by_bag = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
         for number in sorted({*chain.from_iterable(by_bag)}, reverse=True):
             stretch = _window(number)
@@ -336,7 +339,7 @@ class Watching:
         start = together[-1].window.start // STRETCH_NS * STRETCH_NS
         is_over = start + STRETCH_NS <= self._newest
         parts = self._parts_around(TimeWindow(start, start + STRETCH_NS)) if is_over else None
-        if parts is None or not self._may_be_kept:
+        if parts is None:
             return None
         in_time = chain.from_iterable(around.sessions for around in reversed(together))
         sessions = sorted(dict.fromkeys(session for session, *_ in in_time), key=min)
@@ -368,7 +371,7 @@ class Watching:
     def _seen(self, around: _Surroundings) -> Seen:
         scanner = self._view.memory.scanner
         is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
-        if is_open or not self._may_be_kept:
+        if is_open:
             return self._read(around)
         digest = self._digest(around)
         parts = self._parts_around(around.window)
@@ -381,6 +384,8 @@ class Watching:
                 lambda: self._read(around),
                 also_before=_TOGETHER_NS,
             )
+        if self._may_be_repeated:
+            return self._read(around)
         # Parts, as these, are of certain recordings.
         key = (around.window.start, digest, tuple(bag.identity for bag in around.bags))
         cached = scanner.caches.sights.get(key)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.columns import scan
 from ros2_memory.columns.scanner import Scanner
 from ros2_memory.columns.sights import joined
 from ros2_memory.history.context import Call, Memory
@@ -18,7 +19,7 @@ from ros2_memory.history.view import View
 from ros2_memory.things import placing, seen
 from ros2_memory.things.find import find_things
 from ros2_memory.things.seen import SIGHTS_NS, Watching
-from tests.support.bags import write_splits
+from tests.support.bags import McapLayout, text, write_mcap, write_splits
 from tests.support.column_worlds import EVERYTHING, World, store_file
 from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked
 
@@ -91,6 +92,23 @@ def test_another_process_finds_stored_sights_and_reads_no_messages(
     world = made_in(tmp_path)
     assert {thing.label for thing in plain} == {"cup", "mug"}
     monkeypatch.delattr(placing, "sights_of")  # there is nothing to be made
+    assert things_in(another(world)) == plain
+
+
+def test_a_latched_text_that_each_recording_received_hinders_no_storing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scan, "STRETCH_NS", 14_400 * 10**9)
+    layout = McapLayout(latched=frozenset({"/tf_static", "/robot_description"}))
+    for nth in range(3):
+        messages = looked(nth * APART_S, nth * APART_S + 60, HERE, ("mug", 3.0, 0.5))
+        said = text(messages[0].log_time, "<robot/>", "/robot_description")
+        said = replace(said, publish_time=BEGIN * 10**9)
+        write_mcap(tmp_path / f"rec_{nth}" / f"rec_{nth}_0.mcap", [said, *messages], layout)
+    plain = things_in(World.of(tmp_path).memory)
+    world = made_in(tmp_path)
+    assert [thing.label for thing in plain] == ["mug"]
+    monkeypatch.delattr(placing, "sights_of")
     assert things_in(another(world)) == plain
 
 
