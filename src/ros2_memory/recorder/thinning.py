@@ -404,13 +404,13 @@ def _covering(named: Sequence[Mapping[Name, Scored]], seen: dict[Name, Scored]) 
         for names in named
     ]
     rows: list[int] = []
-    # Those first that show most.
-    for row in sorted(
-        range(len(shown)), key=lambda row: (-len(shown[row]), -sum(shown[row].values()))
-    ):
-        if not missing.keys().isdisjoint(shown[row]):
-            rows.append(row)
-            missing = {name: score for name, score in missing.items() if name not in shown[row]}
+    while missing:
+        best = max(range(len(shown)), key=lambda row: (len(shown[row]), sum(shown[row].values())))
+        rows.append(best)
+        for name in [*shown[best]]:
+            del missing[name]
+            for left in shown:
+                left.pop(name, None)
     return rows
 
 
