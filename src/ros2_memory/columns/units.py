@@ -197,21 +197,28 @@ class Rows:
         numbers = self.unit.bag_numbers()
         if self.index is not None:
             numbers = numbers[self.index]
-        bags = {number: self.unit.bag_of(number) for number in self.unit.numbers.tolist()}
         for number in np.unique(numbers).tolist():
-            if among is None or bags[number].file in among:
-                yield bags[number], np.flatnonzero(numbers == number)
+            bag = self.unit.bag_of(number)
+            if among is None or bag.file in among:
+                yield bag, np.flatnonzero(numbers == number)
 
     @property
     def ranks(self) -> IntArray:
         """For each row that counts, how many rows of its bag have its log time and precede it."""
-        times = self.unit.times()
+        times, numbers = self.unit.times(), self.unit.bag_numbers()
+        index = np.arange(times.size) if self.index is None else self.index
+        # Rows of one log time follow each other: those of other times are not looked at.
+        begin, end = 0, 0
+        if index.size:
+            begin = int(np.searchsorted(times, times[index[0]]))
+            end = int(np.searchsorted(times, times[index[-1]], side="right"))
+        times, numbers = times[begin:end], numbers[begin:end]
         if (np.diff(times) > 0).all():
-            return np.zeros(len(self), np.int64)
-        groups = Groups.of(distinct_rows((self.unit.bag_numbers(), times))[1])
+            return np.zeros(index.size, np.int64)
+        groups = Groups.of(distinct_rows((numbers, times))[1])
         ranks = np.empty_like(groups.order)
         ranks[groups.order] = within(groups.sizes)
-        return ranks if self.index is None else ranks[self.index]
+        return ranks[index - begin]
 
     def some(self, positions: IntArray) -> Rows:
         """Returns some of the rows, by their ascending positions among those that count."""
