@@ -14,7 +14,7 @@ from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from functools import partial
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Final, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ros2_memory.core.spans import (
     united,
     without,
 )
-from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.index.segment import TopicExtent
 
 if TYPE_CHECKING:
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.index.segment import Segment
 
-_COMPARED_NS: Final[Ns] = 10 * NS_PER_S
-"""For so much of overlapping recordings it is looked up at once which messages count."""
 _Row: TypeAlias = tuple[str, Ns, Ns, int]
 """Of a message of a topic: its file, log time, publish time, and the hash of its payload."""
 
@@ -147,9 +145,9 @@ class MergedStream:
         asked: dict[str, tuple[Ns, Counter[_Row]]] = {}
         for stored in messages:
             if lies_inside(shared, stored.time):
-                topic, begin = stored.topic, stored.time - stored.time % _COMPARED_NS
+                topic, begin = stored.topic, stored.time - stored.time % COPY_HORIZON_NS
                 if topic not in asked or asked[topic][0] != begin:
-                    part = TimeWindow(begin, begin + _COMPARED_NS).intersect(window)
+                    part = TimeWindow(begin, begin + COPY_HORIZON_NS).intersect(window)
                     asked[topic] = begin, self._copies(topic, part)
                 _, copies = asked[topic]
                 row = stored.bag.file, stored.time, *stored.identity
