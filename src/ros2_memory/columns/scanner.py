@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 T = TypeVar("T", bound="Sized")
 
 _HEAD_BYTES: Final = 400
-"""About how much memory what is known of a part takes."""
+"""About how much memory what is known of a part takes, besides the numbers of its bags."""
 _COLUMN_BYTES: Final = 300
 """About how much memory what is known of a column takes."""
 DAY_NS: Final[Ns] = 86_400 * NS_PER_S
@@ -255,7 +255,8 @@ class Scanner:
                 heads.sort(key=lambda head: (head.first, head.number))
             cached = _Heads.of(heads, coverage)
             if self.store.failures == failures:
-                self.caches.heads.put((topic, span), cached, 1000 + _HEAD_BYTES * len(heads))
+                size = sum(_HEAD_BYTES + head.bags.nbytes for head in heads)
+                self.caches.heads.put((topic, span), cached, 1000 + size)
         return cached.within(window)
 
     def matching(

@@ -109,6 +109,7 @@ def joined(
     for at in _IN_SLICES:
         tables[at][0], number = np.split(number, [tables[at].shape[1]])
     spots, looks, hits, scores, beside, unplaced, fixes = tables
+    tables.clear()  # what is ordered takes the place of what is not
     spots, place = _ordered(spots, 3)
     for table in (hits, scores, beside):
         table[0] = place[table[0]]
@@ -192,15 +193,16 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
     for block in planes:
         has_width = block.shape[1] == width
         wide.append(block if has_width else np.concatenate((block, np.zeros_like(block)), axis=1))
-    stacked = np.ascontiguousarray(np.concatenate(wide, axis=2).transpose(0, 2, 1))
-    coded = stacked.view(f"<u{width}")[:, :, 0]
-    steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
-    columns = np.empty(steps.shape, np.int64)
+    whole = np.concatenate(wide, axis=2)
+    columns = np.empty((len(whole), len(part)), np.int64)
     firsts = np.flatnonzero(np.diff(part, prepend=-1))
     sizes = np.diff(firsts, append=len(part))
-    for column, of_column in zip(columns, steps, strict=True):  # one is in the processor's cache
-        np.cumsum(of_column, out=column)
-        np.subtract(column, np.repeat(column[firsts] - of_column[firsts], sizes), out=column)
+    # One by one: a column is in the processor's cache, and all of a week would take 50 MB more.
+    for column, of_column in zip(columns, whole, strict=True):
+        coded = np.ascontiguousarray(of_column.T).view(f"<u{width}")[:, 0]
+        steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
+        np.cumsum(steps, out=column)
+        np.subtract(column, np.repeat(column[firsts] - steps[firsts], sizes), out=column)
     return columns
 
 
