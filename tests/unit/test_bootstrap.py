@@ -17,6 +17,7 @@ from ros2_memory.config import Settings, load_message_schemas, load_settings
 from ros2_memory.core.errors import ConfigError
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from tests.support.robot_run import ANSWERED, ask
 
 
 def settings(bag_dir: Path, *overrides: str) -> Settings:
@@ -95,3 +96,15 @@ async def test_the_server_is_built_as_configured(
         }
         assert info.version == version("ros2-memory") == package_version()
     assert expected in texts[key]
+
+
+async def test_an_empty_memory_answers_every_question(tmp_path: Path) -> None:
+    chosen = settings(tmp_path)
+    async with Client(build_server(chosen, build_memory(chosen))) as client:
+        for name, given, _ in ANSWERED:
+            reply, is_error = await ask(client, name, given)
+            assert not is_error
+            if name == "list_recorded_topics":
+                assert reply == []
+            elif name not in {"data_time_range", "memory_status"}:
+                assert reply["reason"] == "empty_memory", (name, reply)

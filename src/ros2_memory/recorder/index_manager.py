@@ -143,7 +143,7 @@ class IndexManager:
         only = *self._new_table.keywords["only"], recording
         alone._new_table = partial(
             self._new_table,
-            known=lambda: {bag.file: bag for bag in self.snapshot().bags},
+            known=lambda _: {bag.file: bag for bag in self.snapshot().bags},
             only=only,
         )
         alone._table = alone._new_table()

@@ -193,6 +193,17 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
 
 
+async def test_tools_are_listed_while_queries_run_and_wait() -> None:
+    held = Held()
+    stuck = tool("stuck", held.ask)
+    async with Client(served(stuck)) as client, anyio.create_task_group() as tasks:
+        for _ in range(2 * QUICK_AT_ONCE):
+            tasks.start_soon(client.call_tool, "stuck", {})
+        await anyio.wait_all_tasks_blocked()
+        assert len((await client.list_tools()).tools) == 1
+        held.released.set()
+
+
 async def test_a_quick_question_does_not_wait_for_the_blocking_ones() -> None:
     held = Held()
     slow, quick = tool("slow", held.ask, blocking=True), tool("quick", lambda _call: value(2))
