@@ -69,10 +69,8 @@ class Repairer:
             self._reader.channels(path)
         return is_closed
 
-    def repair(self, path: Path, progress: Callable[[int], None] | None = None) -> Repaired | None:
+    def repair(self, path: Path) -> Repaired | None:
         """Repairs one file; returns None if its writer had finished it.
-
-        `progress` is called with the number of bytes read so far.
 
         Raises:
             BagVanishedError: it does not exist.
@@ -80,7 +78,7 @@ class Repairer:
         """
         try:
             with opened_folder(self._root, path.absolute()) as here:
-                return self._rewrite_if_open(here, path, progress)
+                return self._rewrite_if_open(here, path)
         except BagError as error:
             # With the name of the file in place of that of the open directory.
             raise type(error)(str(path), error.reason) from error
@@ -96,9 +94,7 @@ class Repairer:
         with directories.opened(self._root, recording.absolute()):
             return correct(recording, self._reader)
 
-    def _rewrite_if_open(
-        self, here: Path, path: Path, progress: Callable[[int], None] | None
-    ) -> Repaired | None:
+    def _rewrite_if_open(self, here: Path, path: Path) -> Repaired | None:
         before = _status(here)
         if not before.st_size:
             here.unlink()
@@ -107,7 +103,7 @@ class Repairer:
         if self._reader.closing(path) is Closing.CLOSED:
             return None
         with beside(here) as new:
-            result = self._writer.rewrite(here, new, progress)
+            result = self._writer.rewrite(here, new)
             give_attributes(new, before, before.st_mtime_ns)
             after = _status(here)
             if any(getattr(after, key) != getattr(before, key) for key in _CONTENT):

@@ -491,15 +491,13 @@ class BagWriter(ABC):
         """
 
     @abstractmethod
-    def rewrite(
-        self, source: Path, target: Path, progress: Callable[[int], None] | None = None
-    ) -> Rewritten:
+    def rewrite(self, source: Path, target: Path) -> Rewritten:
         """Writes all that can be read of a file that was cut short into one that is whole.
 
         Schemas, channels, metadata, attachments, both times and sequence numbers are unchanged,
         as is the order; incomplete records are left out. The target was read back and
         compared with the source, and is on the disk, when this returns. There must be no file of
-        its name; the source is only read. `progress` is called with the bytes read so far.
+        its name; the source is only read.
 
         Raises:
             BagVanishedError: the source is not there.

@@ -9,6 +9,7 @@ from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.retention.repair import Repairer
 from ros2_memory.storage.base import Closing, Record
+from ros2_memory.storage.mcap.salvage import Salvage
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import McapLayout, odom, write_mcap
@@ -16,7 +17,10 @@ from tests.support.fakes import files_limited_to
 from tests.support.housekeepers import files_in
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
     from pathlib import Path
+
+    from mcap.records import McapRecord
 
 
 S = 10**9
@@ -73,40 +77,61 @@ def test_on_a_full_disk_the_original_stays_and_the_next_attempt_repairs_it(tmp_p
     assert repairer().repair(path) is not None
 
 
-def test_a_file_that_grows_meanwhile_stays_as_it_is(tmp_path: Path) -> None:
+def amid_reading(monkeypatch: pytest.MonkeyPatch, act: Callable[[], None]) -> None:
+    """Lets something happen after each record that a repair has read."""
+    records = Salvage.records
+
+    def acting(salvage: Salvage) -> Iterator[McapRecord]:
+        for record in records(salvage):
+            yield record
+            act()
+
+    monkeypatch.setattr(Salvage, "records", acting)
+
+
+def test_a_file_that_grows_meanwhile_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = left_open(tmp_path / "a_0.mcap")
     before = path.read_bytes()
 
-    def write_on(_: int) -> None:
+    def write_on() -> None:
         with path.open("ab") as stream:
             stream.write(b"\0")
 
+    amid_reading(monkeypatch, write_on)
     with pytest.raises(BagError, match="written to while it was being repaired"):
-        repairer().repair(path, write_on)
+        repairer().repair(path)
     assert path.read_bytes().startswith(before)
     assert files_in(tmp_path) == ["a_0.mcap"]
 
 
-def test_a_file_that_is_deleted_meanwhile_does_not_come_back(tmp_path: Path) -> None:
+def test_a_file_that_is_deleted_meanwhile_does_not_come_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = left_open(tmp_path / "a_0.mcap")
+    amid_reading(monkeypatch, lambda: path.unlink(missing_ok=True))
     with pytest.raises(BagVanishedError):
-        repairer().repair(path, lambda _: path.unlink(missing_ok=True))
+        repairer().repair(path)
     assert files_in(tmp_path) == []
 
 
-def test_what_does_not_hold_what_was_readable_does_not_take_its_place(tmp_path: Path) -> None:
+def test_what_does_not_hold_what_was_readable_does_not_take_its_place(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = left_open(tmp_path / "a_0.mcap")
     before = path.read_bytes()
 
-    def spoil(_: int) -> None:
+    def spoil() -> None:
         """Changes a byte of what was written, as a failing disk does."""
         with (tmp_path / ".a_0.mcap.repair").open("r+b") as stream:
             if stream.seek(0, os.SEEK_END) > 500:
                 stream.seek(400)
                 stream.write(b"\xff\xff\xff")
 
+    amid_reading(monkeypatch, spoil)
     with pytest.raises(BagError, match="what was written is not"):
-        repairer().repair(path, spoil)
+        repairer().repair(path)
     assert path.read_bytes() == before
     assert files_in(tmp_path) == ["a_0.mcap"]
 

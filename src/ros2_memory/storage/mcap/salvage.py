@@ -61,13 +61,8 @@ class Salvage:
         self._opener = ChunkOpener(file, SizeLimit(max_chunk_bytes))
         self.lost_bytes = 0
 
-    def records(
-        self, progress: Callable[[int], None] | None = None
-    ) -> Iterator[mcap_records.McapRecord]:
+    def records(self) -> Iterator[mcap_records.McapRecord]:
         """Yields each record that has content of its own, not of indexes; leaves out damaged ones.
-
-        Args:
-            progress: called with the number of bytes read so far, after each record of the file.
 
         Raises:
             UnreadableError: the file is not MCAP, or ends within its magic.
@@ -78,8 +73,6 @@ class Salvage:
             within = self._chunk if record.opcode == Opcode.CHUNK else self._whole
             yield from filter(None, starmap(decode_record, within(record)))
             read_to = min(record.end, self._file.size)
-            if progress is not None:
-                progress(read_to)
         if not has_ended:
             self.lost_bytes += self._file.size - read_to
 

@@ -76,16 +76,14 @@ class McapWriter(BagWriter):
                 writer.add_message(number, record.log_time, record.payload, record.publish_time)
             writer.finish()
 
-    def rewrite(
-        self, source: Path, target: Path, progress: Callable[[int], None] | None = None
-    ) -> Rewritten:
+    def rewrite(self, source: Path, target: Path) -> Rewritten:
         """Writes all that can be read of a file that was cut short into one that is whole."""
         with _written(target) as stream:
             with reading(source), OpenFile(source) as file:
                 salvage = Salvage(file, self._max_chunk_mb << 20)
                 copy = _Copy(_writer(stream))
                 digest = ContentDigest()
-                for record in salvage.records(progress):
+                for record in salvage.records():
                     if digest.add(record):
                         copy.put(record)
             copy.finish()
