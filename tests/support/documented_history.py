@@ -166,16 +166,9 @@ def replies(bag_dir: Path) -> dict[str, str]:
 def shown_files(bag_dir: Path) -> dict[str, str]:
     """The recorder's own files of that history, by name."""
     write_heartbeat(bag_dir, heartbeat(NOW))
-    cut = (START_S + 3) * NS_PER_S
-    write_handover(
-        bag_dir,
-        Handover(
-            previous="rec_20261120T075957Z",
-            counts_from=cut,
-            begin=Overlap(None, cut + NS_PER_S // 10, (f"{RECORDING}_0.mcap",)),
-            compared=True,
-        ),
-    )
+    cut = (START_S + 60) * NS_PER_S
+    overlap = Overlap(cut - 2 * NS_PER_S, cut + 2 * NS_PER_S, (f"{RECORDING}_5.mcap",))
+    write_handover(bag_dir, Handover(next="rec_20261120T080058Z", counts_until=cut, end=overlap))
     start = (START_S + 34) * NS_PER_S
     request = SaveRequest("5f0c" * 8, "scissors found", start, NOW, NOW)
     write_saved_moment(bag_dir, SavedMoment(request, pending=False))

@@ -7,14 +7,12 @@ in both, to the nanosecond; log time is not. Clocks step, so times alone prove n
 applies only in the files that were open, to messages with a log time in the overlap. Everywhere
 else every message counts.
 
-    rec_A: {"format": 1, "state": "counts", "next": "rec_B",
-            "counts_until_ns": 1795150000500000000, ...}
-    rec_B: {"format": 1, "state": "counts", "previous": "rec_A",
+    rec_A: {"format": 1, "state": "counts", "clock": "publish", "next": "rec_B",
+            "counts_until_ns": 1795150000500000000,
+            "end": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_A_59.mcap"]}, ...}
+    rec_B: {"format": 1, "state": "counts", "clock": "publish", "previous": "rec_A",
             "counts_from_ns": 1795150000500000000,
             "begin": {"log_from_ns": ..., "log_until_ns": ..., "files": ["rec_B_0.mcap"]}, ...}
-
-The old one counts up to its last message; in recordings of earlier versions the cut may lie before
-that, and `end` says where it applies there.
 
 A cut alone would hide what only one of the two has on disk, because the other stalled. So once the
 files on both sides are closed the recorder compares them (`recorder.handover`), and lists the
@@ -67,6 +65,13 @@ class Counting(StrEnum):
     VOID = "void"  # its handover failed: the previous recording went on, and has everything
 
 
+class CutClock(StrEnum):
+    """The clock of the cut; where publish and log times are equal, both give the same cut."""
+
+    PUBLISH = "publish"
+    LOG = "log"
+
+
 def _checked_name(value: str) -> str:
     if "/" in value or value in {"", ".", ".."}:
         raise ValueError("it must be the name of a recording")
@@ -111,6 +116,7 @@ class Handover:
     __pydantic_config__ = _KEYS
 
     state: Counting = Counting.COUNTS
+    clock: CutClock = CutClock.PUBLISH
     previous: _Name | None = None
     counts_from: _Time = None
     begin: Overlap | None = None

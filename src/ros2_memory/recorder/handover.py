@@ -2,19 +2,20 @@
 
 The new recorder is started beside the old one, and waits until it has subscribed to all topics of
 the old one, but not for ever, since a publisher may be gone. Then both run for `BOTH_S`, since who
-has subscribed receives nothing before the publishers discovered that, and the old one ends.
+has subscribed receives nothing before the publishers discovered that. The cut lies in the middle of
+those: messages published around it are in both recordings, so that a message in transit, or a clock
+that is off by less than a second, loses and doubles nothing.
 
 Each sidecar (`handover.json`) is written before it can matter: the old recording names the new one
-before that is started, the new one is marked as not counting as soon as it exists, and then as
-counting from the moment at which the old one is asked to end. When that has ended, by itself or
-not, it counts up to its last message, and the new one from there: the cut. So a crash at any moment
-leaves a pair of sidecars that are settled in the same way.
+before that is started, the new one is marked as not counting as soon as it exists, and the cut is
+written to the new one first. So a crash leaves a pair of sidecars that can be settled: the old
+recording counts up to its end, and the new one from there.
 
-A recorder that stalled lost what was published, and a message may be in transit at the cut: then it
-is in the other recording alone, and the cut hides it. So the files on both sides are compared once
-they are closed: a message is the same by topic, publish time and payload, and counts as often as in
-the recording that holds it most often. The sidecars then list the messages for which the cut is not
-the answer; mostly there are none.
+A recorder that stalled meanwhile lost what was published: where the recording that a message
+belongs to had stalled, the message is in the other alone, and the cut hides it. So the files on
+both sides are compared once they are closed: a message is the same by topic, publish time and
+payload, and counts as often as in the recording that holds it most often. The sidecars then list
+the messages for which the cut is not the answer; mostly there are none.
 
 What `recording.exclude_when` holds back counts as still being written: what is excluded of it must
 not be listed. The cut alone decides where messages have no publish time of their own (it is 0, or
@@ -26,13 +27,14 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import replace
 from enum import Enum, auto
-from itertools import groupby
+from itertools import groupby, islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
     Counting,
+    CutClock,
     Handover,
     MessageList,
     Overlap,
@@ -42,28 +44,30 @@ from ros2_memory.bag_dir.handover_file import (
     write_handover,
     write_handovers,
 )
-from ros2_memory.bag_dir.state_files import read_withheld
+from ros2_memory.bag_dir.state_files import NOTHING_WITHHELD, read_withheld
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagUnreachableError, RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.recorder.policies import ClockReading, set_back
 from ros2_memory.storage.base import BagReader, Closing, Record, or_errors
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Iterator
+    from collections.abc import Collection, Iterator
     from pathlib import Path
 
     from ros2_memory.core.bag_summary import BagSummary
-    from ros2_memory.recorder.process.topics import TopicsFile
     from ros2_memory.recorder.session import RecordingSession
+    from ros2_memory.recorder.sessions import Orders
 
 SUBSCRIBE_TIMEOUT_S: Final = 20.0
 READY_TIMEOUT_S: Final = 120.0
 """A recorder that has not started to record after this time is given up."""
 BOTH_S: Final = 5.0
 """Longer than the 3 s after which Fast DDS sends discovery again that was lost on the way."""
+LATE_MESSAGES_NS: Final[Ns] = 30 * NS_PER_S
+"""How long the old recorder may still receive messages after it was asked to end."""
 JITTER_NS: Final[Ns] = 100 * NS_PER_MS
 """Two recorders differ by less than this in when they received one message."""
 LONGEST_NS: Final[Ns] = 60 * NS_PER_S
@@ -72,6 +76,8 @@ STALL_NS: Final[Ns] = 5 * NS_PER_S
 """How much later than the other one a recorder may log a message."""
 FRESH_NS: Final[Ns] = NS_PER_S
 """A latched message logged later than this after it was published was received before."""
+SAMPLE: Final = 2000
+"""Messages read to find out whether publish times differ from log times."""
 MOST_LISTED: Final = 10_000
 """More messages are not listed in a sidecar: then all count, and queries leave out duplicates."""
 
@@ -81,12 +87,6 @@ _log = get_logger(__name__)
 def pending(old_name: str) -> Handover:
     """Returns the new sidecar as soon as its directory exists: until the cut it does not count."""
     return Handover(state=Counting.PENDING, previous=old_name)
-
-
-def taking_over(old_name: str, now: Ns, files: Collection[str]) -> Handover:
-    """Returns the new sidecar while the old recorder ends: what is published from now on counts."""
-    begin = Overlap(None, None, tuple(sorted(files)))
-    return Handover(previous=old_name, counts_from=now, begin=begin)
 
 
 def void(old_name: str) -> Handover:
@@ -100,6 +100,54 @@ def intended(old: Handover, new_name: str | None) -> Handover:
     None in place of its name withdraws it: the new recording did not take over.
     """
     return replace(old, next=new_name, counts_until=None, end=None)
+
+
+def complete_sidecars(
+    old: Handover,
+    old_name: str,
+    new_name: str,
+    *,
+    began: Ns,
+    both: Ns,
+    ended: Ns,
+    old_files: Collection[str],
+    new_files: Collection[str],
+    simulated: bool,
+    clock: CutClock,
+) -> tuple[Handover, Handover]:
+    """Returns the sidecars of the old and of the new recording after a complete handover.
+
+    The new one must be written first.
+
+    Args:
+        old: the present sidecar of the old recording.
+        old_name: the old recording.
+        new_name: the new recording.
+        began: when the new recorder was started.
+        both: since when both recorders received.
+        ended: until when they did; the cut lies between.
+        old_files: the bag files of the old recording that were open at any time in it.
+        new_files: the bag files of the new recording so far.
+        simulated: whether log times are those of a simulated clock.
+        clock: whether publish times differ from log times.
+    """
+    cut, notes = (both + ended) // 2, (LOG_CLOCK_NOTE,) * (clock is CutClock.LOG)
+    begin = Overlap(began, ended, tuple(sorted(new_files)))
+    end = Overlap(both, ended + LATE_MESSAGES_NS, tuple(sorted(old_files)))
+    if simulated:
+        begin, end = Overlap(None, None, begin.files), Overlap(None, None, end.files)
+    all_notes = tuple(dict.fromkeys((*old.notes, *notes)))
+    return (
+        replace(old, clock=clock, next=new_name, counts_until=cut, end=end, notes=all_notes),
+        Handover(
+            clock=clock,
+            previous=old_name,
+            counts_from=cut,
+            begin=begin,
+            notes=notes,
+            compared=False,
+        ),
+    )
 
 
 class Step(Enum):
@@ -119,22 +167,24 @@ class HandoverTransfer:
         old: the session that records.
         new: the session that takes over.
         began: the time just before the new recorder was started.
-        topics: what to record.
+        orders: what to record.
 
     Attributes:
         directories: the old and the new recording.
     """
 
     def __init__(
-        self, old: RecordingSession, new: RecordingSession, began: ClockReading, topics: TopicsFile
+        self, old: RecordingSession, new: RecordingSession, began: ClockReading, orders: Orders
     ) -> None:
-        self._topics = topics
+        self._orders = orders
         self.old = old
         self.new = new
         self.directories = old.splits.directory, new.splits.directory
         self._began = self._last = began
-        self._both_since_s: float | None = None
+        # Since when both record.
+        self._both_since: ClockReading | None = None
         self._marked = False
+        self._closed_before = old.splits.closed_names
 
     @staticmethod
     def announce(old: RecordingSession, new_name: str) -> None:
@@ -152,7 +202,7 @@ class HandoverTransfer:
     @property
     def missing(self) -> frozenset[str]:
         """Topics that the old recorder has subscribed to, and the new one has still to."""
-        is_listed = self._topics.selection.matches
+        is_listed = self._orders.topics.selection.matches
         return frozenset(filter(is_listed, self.old.subscribed - self.new.subscribed))
 
     def advance(self, now: ClockReading) -> Step:
@@ -169,16 +219,60 @@ class HandoverTransfer:
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
-        if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
+        if self.missing and age_s < self._orders.subscribe_timeout_s:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
-            self._both_since_s = None
-        elif self._both_since_s is None and is_ready:
-            self._both_since_s = now.monotonic_s
-        if self._both_since_s is None:
+            self._both_since = None
+        elif self._both_since is None and is_ready:
+            self._both_since = now
+        if self._both_since is None:
             return Step.WAIT if is_ready or age_s < READY_TIMEOUT_S else Step.ABANDON
-        is_over = now.monotonic_s - self._both_since_s >= BOTH_S
+        is_over = now.monotonic_s - self._both_since.monotonic_s >= BOTH_S
         return Step.COMPLETE if is_over else Step.WAIT
+
+    def complete(self, now: ClockReading) -> bool:
+        """Writes the cut if both recorders receive; returns False while they do not overlap.
+
+        Raises:
+            RecorderError: a sidecar cannot be written.
+        """
+        if self._both_since is None:
+            return False
+        old, new = self.directories
+        closed = self.old.splits.closed_names
+        clock = cut_clock(old / max(closed), self._orders.reader) if closed else CutClock.PUBLISH
+        if self._orders.simulated and clock is CutClock.LOG:
+            # No time of the wall clock separates them: the old one counts up to its end.
+            return True
+        of_old, of_new = complete_sidecars(
+            handover_to_change(old),
+            self.old.name,
+            self.new.name,
+            began=self._began.wall,
+            both=self._both_since.wall,
+            ended=now.wall,
+            old_files=self._old_files(),
+            new_files=self.new.splits.names(),
+            simulated=self._orders.simulated,
+            clock=clock,
+        )
+        write_handovers({new: of_new, old: of_old})
+        return True
+
+    def add_late_splits(self) -> None:
+        """Adds the splits that the old recorder opened after the cut, while it was ending.
+
+        Raises:
+            RecorderError: the sidecar cannot be written.
+        """
+        directory, _ = self.directories
+        handover = handover_to_change(directory)
+        if handover.end is not None:
+            files = tuple(sorted(self._old_files().union(handover.end.files)))
+            write_handover(directory, replace(handover, end=replace(handover.end, files=files)))
+
+    def _old_files(self) -> frozenset[str]:
+        return self.old.splits.names() - self._closed_before
 
 
 def unsettled_handovers(bag_dir: Path) -> list[tuple[Path, Path]]:
@@ -246,91 +340,98 @@ def give_up(old: Path, new: Path) -> None:
 
 
 def _write_cut(old: Path, new: Path, reader: BagReader) -> None:
-    """Writes the cut between two recordings, the old one of which has ended.
+    """Writes the cut of a handover that was interrupted, after the old recording has ended.
 
     The new one may itself have handed over since, if this could not be written at once: what its
     sidecar records about its own end is kept.
     """
     before = handover_to_change(old)
     after = handover_to_change(new) if is_folder(new) else void(old.name)
-    is_void = after.state is Counting.VOID
-    end = None if is_void else _end_of(old, reader)
-    counts = replace(after, state=Counting.COUNTS, previous=old.name)
-    if end is None:
-        if not is_void:
-            write_handover(new, replace(counts, counts_from=None, begin=None, compared=True))
-        write_handover(old, intended(before, None))
+    if after.state is Counting.COUNTS and after.counts_from is not None:
+        # The crash came between the two sidecars of a complete handover.
+        start = None if after.begin is None else after.begin.log_from
+        bags = bags_of(old, reader).items()
+        files = tuple(name for name, bag in bags if start is None or bag.end >= start)
+        end = Overlap(start, None, files)
+        write_handover(old, replace(before, counts_until=after.counts_from, end=end))
         return
-    cut = end.published + 1
-    after = replace(
-        counts,
-        counts_from=cut,
-        begin=_begin_of(new, end.logged, reader),
-        notes=(LOG_CLOCK_NOTE,) * end.is_by_log,
-        compared=False,
-    )
-    settled = replace(before, counts_until=cut, end=Overlap(None, None, ()))
-    write_handovers({new: after, old: settled})
+    last = None if after.state is Counting.VOID else _end_of(old, reader)
+    if last is not None:
+        published, logged = last
+        cut = replace(after, previous=old.name, counts_from=published + 1)
+        write_handover(new, _with_begin(cut, new, logged, reader))
+        end = Overlap(None, None, ())
+        write_handover(old, replace(before, counts_until=published + 1, end=end))
+        return
+    if after.state is not Counting.VOID:
+        counts = replace(after, state=Counting.COUNTS, previous=old.name, compared=True)
+        write_handover(new, counts)
+    write_handover(old, intended(before, None))
 
 
-def _begin_of(new: Path, logged: Ns, reader: BagReader) -> Overlap:
-    """Returns where the cut applies in a new recording.
+def _with_begin(cut: Handover, new: Path, logged: Ns, reader: BagReader) -> Handover:
+    """Returns the sidecar of a new recording with the files and times in which its cut applies.
 
-    `logged` is the last log time of the old one.
+    `logged` is the last log time of the old recording.
     """
-    bags = _bags_of(new, reader)
+    bags = bags_of(new, reader)
     first = min((bag.start for bag in bags.values()), default=logged)
     until = min(logged + JITTER_NS, first + LONGEST_NS)
     later = {name for name, bag in bags.items() if bag.start >= until}
     # A file that cannot be read yet is still being written.
-    names = (path.name for path in _bag_files(new, reader))
-    return Overlap(None, until, tuple(name for name in names if name not in later))
-
-
-class _End(NamedTuple):
-    """The newest publish time and log time of a recording, and whether they are of one clock."""
-
-    published: Ns
-    logged: Ns
-    is_by_log: bool
-
-
-def _end_of(recording: Path, reader: BagReader) -> _End | None:
-    """Returns how far a recording reaches; None if it has nothing but latched messages.
-
-    Those may be published long before, and received at any time.
-    """
-    files = sorted(_bag_files(recording, reader), key=lambda path: path.stat().st_mtime_ns)
-    newest = next(
-        (
-            (path, lasts)
-            for path, bag in _summaries(reversed(files), reader)
-            if (lasts := {topic.topic: topic.last for topic in bag.topics if not topic.latched})
-        ),
-        None,
+    names = tuple(path.name for path in _bag_files(new, reader) if path.name not in later)
+    clock = cut_clock(new / next(iter(bags)), reader) if bags else CutClock.PUBLISH
+    return replace(
+        cut,
+        state=Counting.COUNTS,
+        clock=clock,
+        begin=Overlap(None, until, names),
+        notes=(LOG_CLOCK_NOTE,) * (clock is CutClock.LOG),
+        compared=False,
     )
-    if newest is None:
+
+
+def _end_of(recording: Path, reader: BagReader) -> tuple[Ns, Ns] | None:
+    """Returns the newest publish time and log time in the last bag file that is not empty."""
+    bags = bags_of(recording, reader)
+    if not bags:
         return None
-    path, lasts = newest
-    logged = max(lasts.values())
-    # A publish time of 0 means that there is none.
-    times = [
-        (record.publish_time or record.log_time, record.log_time)
-        for record in _readable(
-            reader.records(path, lasts, TimeWindow(logged - FRESH_NS, logged + 1))
-        )
-    ]
-    return _End(
-        max((published for published, _ in times), default=logged),
-        logged,
-        is_by_log=bool(times) and all(published == logged for published, logged in times),
-    )
+    last = recording / max(bags, key=lambda name: bags[name].end)
+    published = logged = MIN_NS
+    for record in _readable(_unlatched_records(last, reader)):
+        # A publish time of 0 means that there is none.
+        published = max(published, record.publish_time or record.log_time)
+        logged = max(logged, record.log_time)
+    return None if logged == MIN_NS else (published, logged)
+
+
+def cut_clock(bag: Path, reader: BagReader) -> CutClock:
+    """Finds out whether a bag file has publish times of their own; yes if it is empty.
+
+    Raises:
+        RecorderError: the disk fails.
+    """
+    try:
+        records = list(islice(_unlatched_records(bag, reader), SAMPLE))
+    except BagUnreachableError as error:
+        raise RecorderError(str(error)) from error
+    except BagError:
+        return CutClock.PUBLISH
+    equal = bool(records) and all(record.publish_time in {0, record.log_time} for record in records)
+    return CutClock.LOG if equal else CutClock.PUBLISH
+
+
+def _unlatched_records(bag: Path, reader: BagReader) -> Iterator[Record]:
+    """Yields messages of topics that are not latched: latched ones may be published long before."""
+    topics = [topic.topic for topic in reader.summarize(bag).topics if not topic.latched]
+    return reader.records(bag, topics, TimeWindow.everything())
 
 
 _Copies: TypeAlias = "Counter[tuple[str, bool]]"
 """How often a recording holds one message, by file, and by whether the cut counts it there."""
 _Wrong: TypeAlias = "dict[bool, set[tuple[str, str, str]]]"
 """Messages for which the cut is wrong, as file, topic and identity, by whether they count."""
+_NOWHERE: Final[_Copies] = Counter()
 
 
 class _Side(NamedTuple):
@@ -353,6 +454,15 @@ class _Side(NamedTuple):
     def end(self) -> Ns:
         """The last log time."""
         return max(bag.end for bag in self.bags.values())
+
+    def hidden(self) -> Iterator[tuple[Ns, Ns]]:
+        """Yields between which log times the cut may hide messages, both included."""
+        for name, bag in self.bags.items():
+            rule = self.cut.rule(name)
+            for _, _, log_from, log_until in () if rule is None else rule.exclusions:
+                span = max(bag.start, log_from), min(bag.end, log_until)
+                if span[0] <= span[1]:
+                    yield span
 
     def copies(
         self, window: TimeWindow, reader: BagReader, *, latched: bool
@@ -395,7 +505,7 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
         old_cut = Handover(counts_until=before.counts_until, end=before.end)
     new_cut = Handover(state=after.state, counts_from=after.counts_from, begin=after.begin)
     old_side, new_side = (
-        _Side(path, cut, _bags_of(path, reader, only_closed=path in written))
+        _Side(path, cut, bags_of(path, reader, only_closed=path in written))
         for path, cut in ((old, old_cut), (new, new_cut))
     )
     ended, lasting = (new_side, old_side) if is_void else (old_side, new_side)
@@ -403,13 +513,16 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
         not lasting.bags or (ended.bags and lasting.end < ended.end + STALL_NS)
     ):
         return False
-    of_old, of_new = _against_the_cut(old_side, new_side, reader, is_void=is_void)
+    of_old, of_new = _against_the_cut(old_side, new_side, reader, latched=is_void)
     messages = sum(map(len, (*of_old.values(), *of_new.values())))
     if messages <= MOST_LISTED:
         settled, after = _with_listed(before, of_old), _with_listed(after, of_new)
     else:
         # Without a cut all of both count.
-        settled, after = before, replace(after, state=Counting.COUNTS, begin=None)
+        begin = None if after.begin is None else replace(after.begin, files=())
+        settled, after = before, replace(after, state=Counting.COUNTS, begin=begin)
+        if before.end is not None and before.next == new.name:
+            settled = replace(before, end=replace(before.end, files=()))
     changed = {new: replace(after, compared=True)}
     write_handovers(changed if settled == before else {**changed, old: settled})
     if messages:
@@ -418,30 +531,40 @@ def _compare(old: Path, new: Path, reader: BagReader, running: Collection[str]) 
 
 
 def _against_the_cut(
-    old: _Side, new: _Side, reader: BagReader, *, is_void: bool
+    old: _Side, new: _Side, reader: BagReader, *, latched: bool
 ) -> tuple[_Wrong, _Wrong]:
     """Returns what counts against the cut, for the sidecars of the old and the new recording.
 
-    Of latched messages, to which the cut does not apply, only where all of the new one is hidden.
+    `latched`: also of latched messages. The cut does not apply to them, but all of a recording
+    without effect is hidden.
     """
     of_old: _Wrong = {True: set(), False: set()}
     of_new: _Wrong = {True: set(), False: set()}
-    if not new.bags:
+    spans = [*old.hidden(), *new.hidden()]
+    if old.bags and new.bags and (start := max(old.start, new.start)) <= min(old.end, new.end):
+        spans.append((start, min(old.end, new.end)))
+    if not spans:
         return of_old, of_new
-    last = new.end if is_void or not old.bags else min(old.end, new.start + LONGEST_NS)
-    window = TimeWindow(new.start - STALL_NS, max(last, new.start) + STALL_NS + 1)
-    in_old, in_new = (side.copies(window, reader, latched=is_void) for side in (old, new))
+    first, last = min(start for start, _ in spans), max(end for _, end in spans)
+    window = TimeWindow(first - STALL_NS, last + STALL_NS + 1)
+    in_old, in_new = (side.copies(window, reader, latched=latched) for side in (old, new))
     for message in in_old.keys() | in_new.keys():
-        old_copies, new_copies = (side.get(message, Counter()) for side in (in_old, in_new))
+        old_copies, new_copies = in_old.get(message, _NOWHERE), in_new.get(message, _NOWHERE)
         if old_copies is None or new_copies is None:
             continue
-        is_old = old_copies.total() >= new_copies.total()
+        # Where both hold it as often, the cut decides.
+        is_old = _weight(old_copies) >= _weight(new_copies)
         for wrong, copies, counts in (
             (of_old, old_copies, is_old),
             (of_new, new_copies, not is_old),
         ):
             wrong[counts].update((file, *message) for file, by_cut in copies if by_cut != counts)
     return of_old, of_new
+
+
+def _weight(copies: _Copies) -> tuple[int, int]:
+    """Returns how often a recording holds a message, and how often the cut counts it there."""
+    return copies.total(), sum(times for (_, counts), times in copies.items() if counts)
 
 
 def _with_listed(handover: Handover, wrong: _Wrong) -> Handover:
@@ -475,7 +598,7 @@ def _readable(records: Iterator[Record]) -> Iterator[Record]:
             yield record
 
 
-def _bags_of(
+def bags_of(
     recording: Path, reader: BagReader, *, only_closed: bool = False
 ) -> dict[str, BagSummary]:
     """Returns the bag files that can be read and are not empty, by name.
@@ -486,21 +609,14 @@ def _bags_of(
         OSError: the recording cannot be listed.
         BagUnreachableError: the disk fails.
     """
-    files = _bag_files(recording, reader)
-    if only_closed:
-        withheld = read_withheld(recording.parent)
-        files = [path for path in files if not withheld.holds(recording.name, path.name)]
-    summaries = _summaries(files, reader, only_closed=only_closed)
-    return {path.name: bag for path, bag in summaries}
-
-
-def _summaries(
-    files: Iterable[Path], reader: BagReader, *, only_closed: bool = False
-) -> Iterator[tuple[Path, BagSummary]]:
-    """Yields those bag files that can be read and are not empty, with their summaries."""
-    for path in files:
+    summaries: dict[str, BagSummary] = {}
+    withheld = read_withheld(recording.parent) if only_closed else NOTHING_WITHHELD
+    for path in _bag_files(recording, reader):
         try:
-            if only_closed and reader.closing(path) is not Closing.CLOSED:
+            if only_closed and (
+                withheld.holds(recording.name, path.name)
+                or reader.closing(path) is not Closing.CLOSED
+            ):
                 continue
             summary = reader.summarize(path)
         except BagUnreachableError:
@@ -508,7 +624,8 @@ def _summaries(
         except BagError:
             continue
         if not summary.empty:
-            yield path, summary
+            summaries[path.name] = summary
+    return summaries
 
 
 def _bag_files(recording: Path, reader: BagReader) -> list[Path]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -113,6 +114,12 @@ class Splits:
     def seen(self) -> Collection[str]:
         """The names of all splits that were ever observed."""
         return self._files.keys()
+
+    def names(self) -> frozenset[str]:
+        """Returns the names of all splits, seen before or present now."""
+        with suppress(OSError):
+            return frozenset(self._files) | frozenset(self._sizes())
+        return frozenset(self._files)
 
     def _sizes(self) -> dict[str, int]:
         sizes: dict[str, int] = {}

@@ -11,17 +11,16 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush_bags
-from ros2_memory.bag_dir.handover_file import write_handover
 from ros2_memory.bag_dir.layout import METADATA_FILE, recording_name
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
+    SUBSCRIBE_TIMEOUT_S,
     HandoverTransfer,
     Step,
     give_up,
     settle_handover,
-    taking_over,
     unsettled_handovers,
 )
 from ros2_memory.recorder.policies import ClockReading, describe_death
@@ -70,6 +69,7 @@ class Orders:
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
+        subscribe_timeout_s: how long a handover waits for topics (see `handover`).
     """
 
     bag_dir: Path
@@ -86,6 +86,7 @@ class Orders:
     required: Sequence[Required] = ()
     simulated: bool = False
     advice: Callable[[], str] = str
+    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
 
 
 SETTLE_S: Final = 5.0
@@ -129,6 +130,8 @@ class RecordingSessions:
         self.current: RecordingSession | None = None
         self.handover: HandoverTransfer | None = None
         self.running: tuple[RecordingSession, ...] = ()
+        # By the old recording's name, until that has ended.
+        self._completed: dict[str, HandoverTransfer] = {}
         # Old and new recordings whose sidecars may have to change.
         self._unsettled: list[tuple[Path, Path]] = []
         self._is_recovered = False
@@ -169,7 +172,7 @@ class RecordingSessions:
             self._unsettled.append((old.splits.directory, self._bag_dir / name))
             self.settle_handovers()
             raise
-        self.handover = HandoverTransfer(old, new, now, self._orders.topics)
+        self.handover = HandoverTransfer(old, new, now, self._orders)
         self._events.info("rotation_begun", recording=old.name, next=name)
 
     def observe(self, now: ClockReading) -> bool:
@@ -247,17 +250,22 @@ class RecordingSessions:
             self.settle_handovers()
         return deaths
 
-    def end_all(self) -> None:
+    def end_all(self, now: ClockReading) -> None:
         """Asks all sessions to end; `collect_ended` finalizes them later."""
-        if self.handover is not None:
-            self._unsettled.append(self.handover.directories)
+        handover = self.handover
+        if handover is not None:
+            with self._reporting_failures(handover.old):
+                # Else the old one counts up to its end, and the new one from there.
+                if handover.complete(now):
+                    self._completed[handover.old.name] = handover
+            self._unsettled.append(handover.directories)
         for session in self.running:
             session.end()
         self.current, self.handover = None, None
 
     def stop(self, now: ClockReading) -> None:
         """Ends all sessions, and waits for that within the patience of the children."""
-        self.end_all()
+        self.end_all(now)
         for child in end_all([session.child for session in self.running]):
             self._events.fail("recorder_not_ended", f"process {child.pid} cannot be ended")
         self.collect_ended(now)
@@ -344,8 +352,8 @@ class RecordingSessions:
                 "gone, or were not discovered in time",
                 recording=handover.new.name,
             )
-        splits = handover.new.splits
-        write_handover(splits.directory, taking_over(handover.old.name, now.wall, splits.seen))
+        handover.complete(now)
+        self._completed[handover.old.name] = handover
         self._unsettled.append(handover.directories)
         handover.old.end()
         self.current, self.handover = handover.new, None
@@ -408,6 +416,10 @@ class RecordingSessions:
         session.state = SessionState.ENDED
         self.running = tuple(other for other in self.running if other is not session)
         self._observe_session(session, now)
+        handover = self._completed.pop(session.name, None)
+        if handover is not None:
+            with self._reporting_failures(session):
+                handover.add_late_splits()
         self._update_list(session)
         self._events.ended(session.name)
         splits = session.splits

@@ -277,7 +277,7 @@ class Supervisor:
             self._write_heartbeat()
 
     def _end_for_now(self, now: ClockReading) -> None:
-        self._sessions.end_all()
+        self._sessions.end_all(now)
         self._paused_at = now.wall if self._paused_at is None else self._paused_at
 
     def _check_handover(self, now: ClockReading) -> None:

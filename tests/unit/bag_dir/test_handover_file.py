@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from ros2_memory.bag_dir.handover_file import (
     Counting,
+    CutClock,
     Handover,
     Overlap,
     read_handover,
@@ -32,6 +33,7 @@ NAMES = st.none() | st.from_regex(r"rec_[0-9]{1,3}", fullmatch=True)
 HANDOVERS = st.builds(
     Handover,
     state=st.sampled_from(Counting),
+    clock=st.sampled_from(CutClock),
     previous=NAMES,
     counts_from=st.none() | MOMENTS,
     begin=st.none() | OVERLAPS,

@@ -20,19 +20,21 @@ from structlog.testing import capture_logs
 from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import (
     LOG_CLOCK_NOTE,
+    CutClock,
     Handover,
     Overlap,
     read_handover,
     write_handover,
+    write_handovers,
 )
 from ros2_memory.core.errors import BagUnreachableError, RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.recorder import handover
 from ros2_memory.recorder.handover import (
+    complete_sidecars,
     intended,
     pending,
     settle_handover,
-    taking_over,
     void,
 )
 from ros2_memory.storage.mcap_reader import McapReader
@@ -144,18 +146,46 @@ def assert_union(bag_dir: Path) -> None:
             assert newest == (of_topic[-1] if of_topic else None)
 
 
-def interrupted(old: Path, new: Path) -> None:
-    """What there is until the old recording has ended."""
-    write_handover(old, intended(read_handover(old).handover, new.name))
-    write_handover(new, pending(old.name))
+def hand_over(
+    bag_dir: Path,
+    both_s: float,
+    *,
+    names: tuple[str, str] = ("a", "b"),
+    clock: CutClock = CutClock.PUBLISH,
+) -> None:
+    """Writes the sidecars of a handover that was complete two seconds after both recorded."""
+    began, both, ended = (T0 + round(seconds * S) for seconds in (both_s - 1, both_s, both_s + 2))
+    before, after = (bag_dir / name for name in names)
+
+    def files(folder: Path) -> list[str]:
+        spans = {p.name: READER.summarize(p) for p in folder.glob("*.mcap")}
+        return [
+            file
+            for file, each in spans.items()
+            if each.empty or (each.end >= both if folder == before else each.start <= ended)
+        ]
+
+    old, new = complete_sidecars(
+        read_handover(before).handover,
+        before.name,
+        after.name,
+        began=began,
+        both=both,
+        ended=ended,
+        old_files=files(before),
+        new_files=files(after),
+        simulated=False,
+        clock=clock,
+    )
+    write_handovers({after: new, before: old})
 
 
-def handed_over(bag_dir: Path) -> tuple[Path, Path]:
-    """The two recordings of a handover without a stall."""
+def handed_over(bag_dir: Path, *stalls: Stall) -> tuple[Path, Path]:
+    """The two recordings of a complete handover, of which the new recorder stalled."""
     published = publications(13)
     Recorder(0, 7.5).writes(bag_dir / "a", published)
-    Recorder(4, 13).writes(bag_dir / "b", published)
-    interrupted(bag_dir / "a", bag_dir / "b")
+    Recorder(4, 13, stalls).writes(bag_dir / "b", published)
+    hand_over(bag_dir, 5)
     return bag_dir / "a", bag_dir / "b"
 
 
@@ -171,7 +201,7 @@ DOUBLED = st.frozensets(st.integers(60, 180), max_size=6)
     depth=st.integers(1, 30),
     ends_after=st.floats(0, 1),
     doubled=DOUBLED,
-    kind=st.sampled_from(["complete", "stopped", "void", "new one died"]),
+    kind=st.sampled_from(["complete", "stopped", "void"]),
 )
 def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
     tmp_path_factory: pytest.TempPathFactory,
@@ -187,19 +217,15 @@ def test_nothing_is_lost_that_a_file_holds_and_nothing_counts_twice(
         "complete": (7 + ends_after, 13.0),
         "stopped": (6 + ends_after, 6.5),
         "void": (13.0, 6 + ends_after),
-        "new one died": (8.0, 6 + ends_after),
     }[kind]
     published = publications(13, doubled)
     Recorder(0, old_stop, stalls[0], depth, splits[0]).writes(bag_dir / "a", published)
     Recorder(4, new_stop, stalls[1], depth, splits[1], 31_000).writes(bag_dir / "b", published)
-    if kind == "void":
-        write_handover(bag_dir / "b", void("a"))
+    if kind == "complete":
+        hand_over(bag_dir, 5)
     else:
-        interrupted(bag_dir / "a", bag_dir / "b")
-    if kind == "new one died":
-        files = [path.name for path in bag_dir.glob("b/*")]
-        write_handover(bag_dir / "b", taking_over("a", T0 + 6 * S, files))
-        settle_handover(bag_dir / "a", bag_dir / "b", READER, running=["a"])
+        write_handover(bag_dir / "a", Handover() if kind == "void" else intended(Handover(), "b"))
+        write_handover(bag_dir / "b", void("a") if kind == "void" else pending("a"))
     assert settle_handover(bag_dir / "a", bag_dir / "b", READER)
     assert_union(bag_dir)
 
@@ -210,18 +236,19 @@ def test_short_recordings_that_follow_each_other_are_compared_in_pairs(tmp_path:
     Recorder(0, 7.2, (Stall(5.2, 0.5),)).writes(tmp_path / "a", published)
     Recorder(4, 10.2, (Stall(6.2, 0.5), Stall(8.9, 0.3))).writes(tmp_path / "b", published)
     Recorder(7, 16, (Stall(9.2, 0.7),)).writes(tmp_path / "c", published)
-    interrupted(tmp_path / "a", tmp_path / "b")
-    recover_handovers(tmp_path, READER, ["b"])
-    interrupted(tmp_path / "b", tmp_path / "c")
+    hand_over(tmp_path, 5)
+    hand_over(tmp_path, 8, names=("b", "c"))
     recover_handovers(tmp_path, READER)
     held_by = [numbers(tmp_path / name, READER) for name in "abc"]
     counted = [numbers(tmp_path / name, BagDirReader(READER)) for name in "abc"]
     assert sum(counted, Counter[int]()) == held_by[0] | held_by[1] | held_by[2]
 
 
-def test_without_stalls_nothing_is_listed(tmp_path: Path) -> None:
+def test_without_stalls_nothing_is_listed_and_the_old_sidecar_stays(tmp_path: Path) -> None:
     old, new = handed_over(tmp_path)
+    before = (old / "handover.json").stat().st_mtime_ns
     assert settle_handover(old, new, READER)
+    assert (old / "handover.json").stat().st_mtime_ns == before
     after = read_handover(new).handover
     assert (after.compared, after.also_counts, after.counts_elsewhere) == (True, {}, {})
     assert_union(tmp_path)
@@ -232,8 +259,8 @@ class TestWhenItIsDue:
         published = publications(30)
         Recorder(0, 7.5, splits=(6.0,)).writes(tmp_path / "a", published)
         Recorder(4, 9, (Stall(6, 1),), splits=(8.0,)).writes(tmp_path / "b", published)
+        hand_over(tmp_path, 5)
         old, new = tmp_path / "a", tmp_path / "b"
-        interrupted(old, new)
         assert not settle_handover(old, new, READER, running={"a", "b"})
         assert not settle_handover(old, new, READER, running={"b"})
         more = Recorder(9, 14).receives(published)
@@ -250,7 +277,7 @@ class TestWhenItIsDue:
             patch.setattr(McapReader, "records", fails)
             with pytest.raises(RecorderError, match="input/output"):
                 settle_handover(old, new, READER)
-        assert read_handover(new).handover == pending("a")
+        assert read_handover(new).handover.compared is False
 
 
 @pytest.mark.parametrize("published_at", ["log", "zero"])
@@ -265,7 +292,7 @@ def test_without_publish_times_the_cut_stays_and_a_note_says_so(
             for each, at in zip(messages, publish, strict=True)
         ]
         write_mcap(tmp_path / name / f"{name}_0.mcap", written, LAYOUT)
-    interrupted(tmp_path / "a", tmp_path / "b")
+    hand_over(tmp_path, 5, clock=CutClock.LOG)
     assert settle_handover(tmp_path / "a", tmp_path / "b", READER)
     after = read_handover(tmp_path / "b").handover
     assert (after.notes, after.also_counts) == ((LOG_CLOCK_NOTE,), {})
@@ -276,14 +303,71 @@ def test_where_too_many_would_be_listed_all_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(handover, "MOST_LISTED", 5)
-    published = publications(13)
-    Recorder(0, 7.5, (Stall(6.5, 0.8),)).writes(tmp_path / "a", published)
-    Recorder(4, 13).writes(tmp_path / "b", published)
-    both = tmp_path / "a", tmp_path / "b"
-    interrupted(*both)
+    both = handed_over(tmp_path, Stall(5.8, 1))
     assert settle_handover(*both, READER)
     for recording in both:
         assert numbers(recording, BagDirReader(READER)) == numbers(recording, READER)
+
+
+class Receiver(NamedTuple):
+    """When a recorder received, in seconds of the wall clock, and by how much later it did."""
+
+    start: float
+    stop: float
+    delay_s: float
+
+
+class Publisher(NamedTuple):
+    """Publishes at multiples of its period, by a clock that is off by `skew_s`."""
+
+    period_s: float
+    phase_s: float
+    skew_s: float
+
+
+@given(
+    publisher=st.builds(Publisher, st.floats(0.003, 0.3), st.floats(0, 0.3), st.floats(-0.9, 0.9)),
+    subscribed_s=st.floats(0.2, 5),
+    delays=st.tuples(st.floats(0, 0.002), st.floats(0, 0.002)),
+    ends_after_s=st.floats(0.0, 5.0),
+)
+def test_every_message_counts_exactly_once_whatever_the_publisher_and_the_delays(
+    publisher: Publisher,
+    subscribed_s: float,
+    delays: tuple[float, float],
+    ends_after_s: float,
+) -> None:
+    old, new = complete_sidecars(
+        Handover(),
+        "a",
+        "b",
+        began=T0,
+        both=T0 + round(subscribed_s * S),
+        ended=T0 + round((subscribed_s + 2) * S),
+        old_files=["a.mcap"],
+        new_files=["b.mcap"],
+        simulated=False,
+        clock=CutClock.PUBLISH,
+    )
+    recorders = {
+        "a.mcap": (old, Receiver(-10.0, subscribed_s + 2 + ends_after_s, delays[0])),
+        # A second later at most: it said that it had subscribed after it had.
+        "b.mcap": (new, Receiver(subscribed_s - 0.1, 20.0, delays[1])),
+    }
+    moment = -5 + publisher.phase_s
+    while moment < 15:
+        counted = 0
+        for file, (sidecar, receiver) in recorders.items():
+            received = moment + receiver.delay_s
+            if not receiver.start <= received < receiver.stop:
+                continue
+            published = T0 + round((moment + publisher.skew_s) * S)
+            logged = T0 + round(received * S)
+            counted += not any(
+                each.excludes(published, logged) for each in sidecar.exclusions(file)
+            )
+        assert counted == 1, moment
+        moment += publisher.period_s
 
 
 def bump(published: int, delay: int) -> Msg:
@@ -298,6 +382,12 @@ def cut_recording(bag_dir: Path, name: str, start: float, stop: float, *, delay:
     directory = bag_dir / name
     write_mcap(directory / f"{name}_0.mcap", messages, TRUNCATED)
     return directory
+
+
+def interrupted(old: Path, new: Path) -> None:
+    """What a crash before the cut leaves."""
+    write_handover(old, intended(Handover(), new.name))
+    write_handover(new, pending(old.name))
 
 
 def counted(bag_dir: Path) -> Counter[int]:
@@ -337,12 +427,15 @@ def test_whatever_either_holds_counts_exactly_once(
     assert read_handover(old).handover.counts_until is not None
 
 
-def test_a_crash_while_the_old_one_ends_is_brought_to_its_end(tmp_path: Path) -> None:
+def test_a_crash_between_the_two_sidecars_is_brought_to_its_end(tmp_path: Path) -> None:
     old = cut_recording(tmp_path, "a", 0, 10, delay=5)
     new = cut_recording(tmp_path, "b", 7, 15, delay=9)
+    cut = T0 + 9 * S
     write_handover(old, intended(Handover(), "b"))
-    write_handover(new, taking_over("a", T0 + 9 * S, ["b_0.mcap"]))
+    begin = Overlap(T0 + 6 * S, T0 + 10 * S, ("b_0.mcap",))
+    write_handover(new, Handover(previous="a", counts_from=cut, begin=begin))
     assert counted(tmp_path) == once(range(150))
+    assert read_handover(old).handover.counts_until == cut
 
 
 def test_latched_messages_do_not_say_how_far_a_recording_reaches(tmp_path: Path) -> None:

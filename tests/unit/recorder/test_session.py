@@ -40,6 +40,7 @@ def test_bytes_written_never_shrink_though_splits_are_deleted(splits: Splits) ->
     (splits.directory / "rec_1_0.mcap").unlink()
     splits.observe(1)
     assert splits.bytes_written == before > 0
+    assert splits.names() == {"rec_1_0.mcap"}
 
 
 def test_a_closed_split_that_cannot_be_read_is_reported_and_counts_as_closed(

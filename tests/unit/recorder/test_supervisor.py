@@ -104,24 +104,25 @@ class TestRotation:
         assert_each_counts_once(world)
 
     def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=40).started(39)
+        world = World(tmp_path, session_duration_s=20, subscribe_timeout_s=6).started(19)
         world.defaults = {"topics": ("/bumper",)}
-        [said] = world.logged(26.25, "rotated_without")
+        [said] = world.logged(12.25, "rotated_without")
         assert world.recorders[0].status == 0
         assert "does not subscribe to /door yet" in str(said["reason"])
         assert world.heartbeat()["last_error"] is None
         world.supervisor.stop()
         assert_each_counts_once(world)
 
-    def test_the_new_one_counts_while_the_old_one_ends(self, tmp_path: Path) -> None:
+    def test_a_split_that_the_old_one_opens_while_it_ends_is_in_its_sidecar(
+        self, tmp_path: Path
+    ) -> None:
         world = World(tmp_path, session_duration_s=20).started()
         world.recorders[0].obeys_after = 40
-        world.run(30)
-        old, new = world.recorders
-        assert old.asked_to_end
-        assert old.status is None
-        assert not read_handover(new.directory).handover.hides_all
-        world.run(15)
+        world.run(40)
+        old = read_handover(world.recorders[0].directory).handover
+        assert old.end is not None
+        last = f"{world.recorders[0].directory.name}_{world.recorders[0].splits}.mcap"
+        assert last in old.end.files
         world.supervisor.stop()
         assert_each_counts_once(world)
 
@@ -185,6 +186,14 @@ class TestMessagesOfOneRecordingAlone:
         world = World(tmp_path, session_duration_s=20).started(20 - deaf_s)
         world.recorders[0].deaf = True
         world.run(deaf_s + 15)
+        world.supervisor.stop()
+        assert_what_stands_counts_once(world)
+
+    @pytest.mark.parametrize("after_s", [20.5, 21.0, 21.75, 22.0, 24.5, 26.0, 26.5])
+    def test_a_stop_amid_a_rotation_hides_nothing(self, tmp_path: Path, after_s: float) -> None:
+        world = World(tmp_path, session_duration_s=20).started(after_s - 0.5)
+        world.recorders[0].deaf = True
+        world.run(0.5)
         world.supervisor.stop()
         assert_what_stands_counts_once(world)
 
@@ -344,7 +353,7 @@ class TestOffers:
         assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/lidar"]]
 
     def test_nodes_that_have_gone_are_reported_until_they_come_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path).started(12)
+        world = World(tmp_path, subscribe_timeout_s=6).started(12)
         world.silent, world.defaults = True, {"topics": ()}
         [said] = world.logged(90, "topic_silent")
         assert said["topics"] == ["/bumper", "/door"]
