@@ -286,10 +286,12 @@ def unsettled_handovers(bag_dir: Path) -> list[tuple[Path, Path]]:
         handover = read_handover(directory).handover
         if handover.next is not None and handover.counts_until is None:
             pairs.append((directory, bag_dir / handover.next))
-        # Retention may have deleted the one before, and then there is nothing to compare.
-        if handover.previous is not None and handover.compared is False:
+        if handover.previous is not None:
             previous = bag_dir / handover.previous
-            pairs += [(previous, directory)] * is_folder(previous)
+            # Retention may have deleted the one before: then there is nothing to compare, and what
+            # waits for it would never count.
+            if handover.compared is False if is_folder(previous) else handover.hides_all:
+                pairs.append((previous, directory))
     return pairs
 
 

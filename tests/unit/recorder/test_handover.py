@@ -488,3 +488,9 @@ def test_one_whose_predecessor_was_deleted_is_settled(tmp_path: Path) -> None:
         recover_handovers(tmp_path, READER)
     assert not logs
     assert read_handover(new).handover == after
+
+
+def test_one_that_waits_for_a_recording_that_is_gone_counts(tmp_path: Path) -> None:
+    write_handover(cut_recording(tmp_path, "b", 7, 15, delay=9), pending("a"))
+    recover_handovers(tmp_path, READER)
+    assert counted(tmp_path) == once(range(70, 150))

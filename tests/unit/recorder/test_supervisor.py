@@ -152,6 +152,28 @@ class TestStop:
         assert world.running == []
         (assert_what_stands_counts_once if is_deaf else assert_each_counts_once)(world)
 
+    @pytest.mark.parametrize("killed", ["old", "new", "all"])
+    @pytest.mark.parametrize("obeys_after", [1, 8])
+    @pytest.mark.parametrize("after_s", [21.25, 22.5, 25.0, 26.25, 27.5])
+    def test_kills_at_any_moment_of_a_handover_lose_and_double_nothing(
+        self, tmp_path: Path, after_s: float, obeys_after: int, killed: str
+    ) -> None:
+        """`all`: the daemon, too; what it left is settled by the next one."""
+        world = World(tmp_path, session_duration_s=20).started()
+        world.recorders[0].obeys_after = obeys_after
+        world.run(after_s)
+        doomed = world.recorders[:1] if killed == "old" else world.recorders[1:]
+        for recorder in world.recorders if killed == "all" else doomed:
+            if recorder.status is None:
+                recorder.die()
+        if killed == "all":
+            before, world = world, World(tmp_path)
+            world.wall = before.wall
+            world.supervisor.start()
+        world.run(12)
+        world.supervisor.stop()
+        assert_what_stands_counts_once(world)
+
     def test_a_process_that_nothing_ends_is_named(self, tmp_path: Path) -> None:
         world = World(tmp_path, defaults={"obeys_after": 10**9, "patience_s": 0.05}).started(2)
         with capture_logs() as logs:
