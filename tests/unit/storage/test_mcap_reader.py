@@ -8,7 +8,7 @@ import zstandard
 from mcap import records as mcap_records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from ros2_memory.core.errors import (
     BagContradictionError,
@@ -17,6 +17,7 @@ from ros2_memory.core.errors import (
 )
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.mcap import bag_file
+from ros2_memory.storage.mcap.records import MESSAGE
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import VOLATILE, McapLayout, Msg, boolean, definition, text, write_mcap
@@ -155,6 +156,31 @@ class TestIndexesThatAreWrong:
         assert found == [*range(count)]
         assert len(notes) == 1
         assert any("without its indexes" in note for note in reader.summarize(path).notes)
+
+    @pytest.mark.parametrize("longer", [100, 1 << 40, -20])
+    def test_a_message_that_does_not_end_in_its_chunk_is_left_out_and_named(
+        self, tmp_path: Path, longer: int
+    ) -> None:
+        """Where no checksum tells that its length is wrong."""
+
+        def fill(writer: Writer) -> None:
+            schema = writer.register_schema(STRING, "ros2msg", b"string data")
+            channel = writer.register_channel("/chatter", "cdr", schema)
+            for time in range(4):
+                writer.add_message(channel, time, b"\0\1\0\0\2\0\0\0%d\0" % time, time)
+
+        path = raw_mcap(
+            tmp_path / "a.mcap", fill, compression=CompressionType.NONE, enable_crcs=False
+        )
+        data = bytearray(path.read_bytes())
+        at = data.index(b"\2\0\0\0003\0") - 4 - MESSAGE.size + 1
+        (length,) = struct.unpack_from("<Q", data, at)
+        struct.pack_into("<Q", data, at, length + longer)
+        path.write_bytes(data)
+        for newest_first in (False, True):
+            found, notes = read_on(McapReader(), path, newest_first=newest_first)
+            assert found == sorted(range(3), reverse=newest_first)
+            assert any("not where its index says" in note for note in notes)
 
     @pytest.mark.parametrize(
         ("kind", "old", "new"),

@@ -8,6 +8,7 @@ messages themselves where the indexes of a file are missing or wrong (see `mcap.
 
 from __future__ import annotations
 
+import struct
 from bisect import bisect_left
 from contextlib import suppress
 from functools import lru_cache, partial
@@ -53,9 +54,9 @@ from ros2_memory.storage.mcap.chunk import (
     Chunk,
     Column,
     Pairs,
+    believed_pairs,
     declarations_of,
     in_file_order,
-    index_groups,
     pairs_in,
     require_indexed,
     walk_chunk,
@@ -392,7 +393,9 @@ class _Reading:
         pairs = self._pairs(chunk, data)
         pairs = pairs.taken(np.isin(pairs.channels, [*self._wanted]))
         if before is not None:
-            pairs = pairs.taken(~np.isin(pairs.offsets, self._stated_pairs(before).offsets))
+            pairs = pairs.taken(
+                ~np.isin(pairs.offsets, believed_pairs(self._file, before, before.channels).offsets)
+            )
         try:
             batches = self._batches_of(ReadChunks([chunk], data, [len(data)]), pairs)
         except (UnreadableError, ValueError, IndexError) as error:
@@ -427,7 +430,7 @@ class _Reading:
                     return None
                 at = lost.last if newest_first else lost.first
                 return RunRows([at], [0], lambda _place, _time: lost)
-            column = self._inside(self._pairs(chunk, data), wanted)
+            column = self._inside(self._pairs(chunk, data, wanted), wanted)
             if not column.times.size:
                 return None
             if len(data) <= _LARGE_BYTES:
@@ -461,7 +464,8 @@ class _Reading:
         window = self._window
         try:
             with as_unreadable():
-                times = self._inside(self._stated_pairs(chunk), self._wanted).times
+                believed = believed_pairs(self._file, chunk, self._wanted)
+                times = self._inside(believed, self._wanted).times
         except UnreadableError:
             window = self._window
             return LostError(
@@ -486,38 +490,35 @@ class _Reading:
                 except UnreadableError:
                     continue
 
-    def _pairs(self, chunk: Chunk, data: bytes | None = None) -> Pairs:
+    def _pairs(
+        self, chunk: Chunk, data: bytes | None = None, wanted: Collection[int] | None = None
+    ) -> Pairs:
         """Returns the messages of a chunk, compared with its decompressed records.
+
+        Those of all channels, or at least of the `wanted` ones.
 
         Raises:
             _ContradictedError: the indexes do not agree with the records.
             UnreadableError: the records cannot be read.
         """
-        key = (self._file.key, chunk.offset, chunk.index_places is None)
+        file, is_indexed = self._file, chunk.index_places is not None
+        channels = chunk.channels if wanted is None else chunk.channels.intersection(wanted)
+        key = (file.key, chunk.offset, channels if is_indexed else None)
         pairs = self._bags.indexes.get(key)
         if isinstance(pairs, Pairs):
             return pairs
         data = self._chunk_data(chunk) if data is None else data
-        if chunk.index_places is None:
+        if not is_indexed:
             pairs = walk_chunk(data).pairs
         else:
             try:
-                pairs = self._stated_pairs(chunk)
-                require_indexed(pairs, data, pairs.offsets)
+                pairs = believed_pairs(file, chunk, channels)
+                require_indexed(pairs, data, pairs.offsets, len(data))
                 in_file_order(pairs.offsets)
-            except (UnreadableError, ValueError, IndexError) as error:
+            except (UnreadableError, ValueError, IndexError, struct.error) as error:
                 raise _ContradictedError(reason_of(error), chunk) from error
         self._bags.indexes.put(key, pairs, 4 * pairs.times.nbytes + 600)
         return pairs
-
-    def _stated_pairs(self, chunk: Chunk) -> Pairs:
-        """Returns the messages of a chunk by its indexes.
-
-        Raises:
-            UnreadableError: it has none, or others than it should.
-        """
-        [(chunks, indexes)] = index_groups(self._file, [chunk])
-        return pairs_in(chunks, indexes)
 
     def _chunk_data(self, chunk: Chunk) -> bytes:
         """Returns the decompressed records of a chunk.

@@ -169,10 +169,10 @@ def batches_of(
     begins = ends - sizes
     begin, end = begins[pairs.chunks], ends[pairs.chunks]
     at = pairs.offsets + begin
-    heads = require_indexed(pairs, buffer, at)
-    stops = at + RECORD.size + heads["length"]
-    if (pairs.offsets < 0).any() or (stops > end).any() or (stops < at + MESSAGE.size).any():
+    if (pairs.offsets < 0).any():
         raise UnreadableError(NOT_THERE)
+    heads = require_indexed(pairs, buffer, at, end)
+    stops = at + RECORD.size + heads["length"]
     in_file_order(at)
     order = _in_window(pairs, window)
     at, numbers = at[order], pairs.channels[order]

@@ -50,6 +50,7 @@ if TYPE_CHECKING:
 
 
 _INDEX_OPCODE: Final = int(Opcode.MESSAGE_INDEX)
+_MESSAGE_OPCODE: Final = int(Opcode.MESSAGE)
 _OTHER_INDEX: Final = "damaged: a message index is not what its chunk index says"
 OUTSIDE: Final = "damaged: a chunk states other times than its messages have"
 INDEX_OFFSET: Final = np.dtype([("channel", "<u2"), ("at", "<i8")])
@@ -58,6 +59,8 @@ _INDEX: Final = np.dtype(
     [("opcode", "u1"), ("length", "<i8"), ("channel", "<u2"), ("size", "<u4")], align=False
 )
 """A message index up to its pairs of log time and offset: opcode, length, channel, their size."""
+_INDEX_SIZE: Final = struct.Struct("<I")
+_INDEX_PLACE: Final = struct.Struct("<HQ")
 _PAIR: Final = np.dtype([("time", "<i8"), ("place", "<i8")])
 NOT_THERE: Final = "damaged: a message is not where its index says"
 _MANY_DECLARED: Final = f"a chunk declares more than {MAX_CHUNK_DECLARATIONS} things"
@@ -191,6 +194,32 @@ def pairs_in(
     )
 
 
+def believed_pairs(file: OpenFile, chunk: Chunk, wanted: Collection[int]) -> Pairs:
+    """Returns the messages of the `wanted` channels of a chunk, by its indexes.
+
+    These are believed: `pairs_in` found all indexes of the file right when the file was indexed. To
+    check them once more takes longer than all else that a chunk takes.
+
+    Raises:
+        UnreadableError, ValueError, struct.error: they have changed.
+    """
+    base = chunk.offset + chunk.length
+    region = file.read(base, chunk.index_length)
+    numbers: list[int] = []
+    columns = [np.zeros(0, _PAIR)]
+    for number, place in _INDEX_PLACE.iter_unpack(chunk.index_places or b""):
+        if number in wanted:
+            at = place - base + _INDEX.itemsize
+            (size,) = _INDEX_SIZE.unpack_from(region, at - _INDEX_SIZE.size)
+            numbers.append(number)
+            columns.append(np.frombuffer(region, _PAIR, size // _PAIR.itemsize, at))
+    pairs = columns[1] if len(numbers) == 1 else np.concatenate(columns)
+    times, offsets = (np.ascontiguousarray(pairs[name]) for name in ("time", "place"))
+    sizes = [column.size for column in columns[1:]]
+    channels = np.repeat(np.array(numbers, np.int64), sizes)
+    return Pairs(channels, times, offsets, np.zeros(channels.size, np.int64))
+
+
 def _fill(begins: IntArray, ends: IntArray, size: int) -> bool:
     """Returns whether records follow each other from the begin of a region to its end."""
     order = np.argsort(begins)
@@ -240,7 +269,7 @@ _HEAD: Final = np.dtype(
 
 
 def require_indexed(
-    pairs: Pairs, data: bytes, places: IntArray
+    pairs: Pairs, data: bytes, places: IntArray, ends: IntArray | int
 ) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     """Compares messages with their records, and returns the heads of these.
 
@@ -251,18 +280,19 @@ def require_indexed(
         pairs: the messages, by their indexes.
         data: the decompressed records, which checksums protect.
         places: where the record of each message begins.
+        ends: where the records of its chunk end.
 
     Raises:
-        UnreadableError: a message is not there, or has another channel or log time.
+        UnreadableError: a message is not there, has another channel or log time, or does not end in
+            its chunk.
     """
     if places.size and (places.min() < 0 or places.max() > len(data) - _HEAD.itemsize):
         raise UnreadableError(NOT_THERE)
-    heads = gathered(data, _HEAD, places)
-    if (
-        (heads["opcode"] != Opcode.MESSAGE).any()
-        or (heads["channel"] != pairs.channels).any()
-        or (heads["log_time"] != pairs.times).any()
-    ):
+    heads, room = gathered(data, _HEAD, places), ends - places - RECORD.size
+    is_other = heads["opcode"] != _MESSAGE_OPCODE
+    is_other |= (heads["channel"] != pairs.channels) | (heads["log_time"] != pairs.times)
+    is_other |= (heads["length"] < MESSAGE_FIELDS) | (heads["length"] > room)
+    if is_other.any():
         raise UnreadableError(NOT_THERE)
     return heads
 
