@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.tables import TABLES
-from tests.support.bags import Msg, detections, write_mcap
+from tests.support.bags import Msg, battery, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
 from tests.support.lakes import lake_rows, robot_bags, ship
@@ -78,6 +78,14 @@ def test_messages_of_a_chosen_topic_are_whole(lake: tuple[Path, Memory]) -> None
     rows = sorted(lake_rows(lake[0], "messages"), key=lambda row: row["time_ns"])
     assert [row["flags"] for row in rows] == [[("value", on)] for on in (False, True, False)]
     assert {(row["value"], row["undecodable"]) for row in rows} == {('{"value":null}', None)}
+
+
+def test_numbers_of_messages_are_as_they_were_recorded(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [battery(NOW, math.nan)])
+    robot = robot_bags("hall", tmp_path / "bags", messages=["/battery_state"])
+    assert ship(tmp_path / "lake", [robot]).bags == 1
+    [row] = lake_rows(tmp_path / "lake", "messages")
+    assert math.isnan(dict(row["numbers"])["percentage"])
 
 
 def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(
