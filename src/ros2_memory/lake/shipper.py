@@ -36,7 +36,7 @@ from ros2_memory.columns.fill import is_settled
 from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import BagError, LakeError
+from ros2_memory.core.errors import BagError, BusyError, EpisodicError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
@@ -360,7 +360,7 @@ class RobotBags:
                     continue
                 ids.add(bag_id)
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
-            except (BagError, OSError, ValueError) as error:
+            except (EpisodicError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
                 continue
             # The rows of a copy are the same, which has another path and mtime.
@@ -388,10 +388,13 @@ class RobotBags:
         """
         if self.filling is not None:
             self._store(self.filling, [to_ship.file for to_ship in group], waiting)
-        maker = RowMaker(self.memory, self.config, self.messages)
         try:
-            rows = maker.rows({to_ship.file: to_ship.bag for to_ship in group})
-        except (BagError, OSError, ValueError) as error:
+            try:
+                rows = self._rows(group)
+            except BusyError:
+                # Another program deleted stored columns, or they are damaged: they are set aside.
+                rows = self._rows(group)
+        except (EpisodicError, OSError, ValueError) as error:
             if len(group) == 1:
                 done.problems.append(f"{self.name}: {error}")
                 return
@@ -399,6 +402,10 @@ class RobotBags:
                 yield from self._made([alone], waiting, done)
         else:
             yield _PreparedBags(self, group, rows)
+
+    def _rows(self, group: Sequence[_BagToShip]) -> dict[str, pa.Table]:
+        maker = RowMaker(self.memory, self.config, self.messages)
+        return maker.rows({to_ship.file: to_ship.bag for to_ship in group})
 
     def _store(self, filling: Filling, bags: Sequence[BagFile], waiting: dict[str, Batch]) -> None:
         """Stores the columns of bags, and of those in the same parts, if they are `waiting`.

@@ -17,8 +17,10 @@ from pyiceberg.catalog.sql import SqlCatalog
 from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.columns.fill import StoreLimits
 from ros2_memory.columns.store import FILE
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
+from ros2_memory.lake.rows import RowMaker
 from ros2_memory.lake.tables import TABLES
 from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S
@@ -127,6 +129,30 @@ def test_what_it_stores_of_bags_is_in_a_file_and_cut_to_their_share(tmp_path: Pa
         assert robot.filling is not None
         assert len(robot.filling.store.paths()) == (BAGS if cache else 0)
         assert bool(robot.filling.store.dropped()) == bool(cache)
+
+
+def test_columns_that_another_program_deletes_or_damages_keep_no_bag_from_being_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(BAGS):
+        write_bag(tmp_path / "hall", number)
+    robot = robot_bags("hall", tmp_path / "hall")
+    made, calls = RowMaker.rows, 0
+
+    def gone(maker: RowMaker, bags: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 1 or next(iter(bags.values())).file == spared:
+            raise GoneError
+        return made(maker, bags)
+
+    monkeypatch.setattr(RowMaker, "rows", gone)
+    spared = ""
+    done = ship(tmp_path / "once", [robot], most_bags=100)
+    assert (done.bags, done.problems) == (BAGS, [])
+    spared = "rec/rec_0.mcap"
+    done = ship(tmp_path / "always", [robot], most_bags=100)
+    assert (done.bags, len(done.problems)) == (BAGS - 1, 1)
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(
