@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -53,11 +54,21 @@ def robot_bags(
     bag_dir: Path,
     clock: Clock | None = None,
     messages: Sequence[str] = ("/chatter",),
+    *,
+    cache: Sequence[Path] | None = None,
+    limits: StoreLimits | None = None,
 ) -> RobotBags:
-    """A robot whose bags are shipped."""
+    """A robot whose bags are shipped; its store is full, or an empty one at a path of `cache`."""
     bag_dir.mkdir(parents=True, exist_ok=True)
-    memory = with_store(memory_of(bag_dir, clock=clock), bag_dir)
-    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, StoreLimits())
+    memory = memory_of(bag_dir, clock=clock)
+    if cache is None:
+        memory = with_store(memory, bag_dir)
+    else:
+        memory = replace(
+            memory, scanner=Scanner(ColumnStore(cache, memory.reader.definition), bag_dir)
+        )
+    limits = limits or StoreLimits()
+    filling = Filling(memory.scanner, memory.reader, bag_dir, memory.clock, limits)
     return RobotBags(name, memory, McapReader(), "test", messages, filling)
 
 

@@ -23,13 +23,17 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from ros2_memory.core.model import TimeWindow
+
 PATIENCE_S: Final = 10.0
 """How long other programs may use the file before it is given up to empty its log."""
 _PAUSE_S: Final = 0.05
 _CATALOGUE_TABLES: Final = frozenset({"bags", "configs", "held", "shapes"})
 
 
-def forget(file: Path, bag_dir: Path, bags: Sequence[str]) -> None:
+def forget(
+    file: Path, bag_dir: Path, bags: Sequence[str], times: Sequence[TimeWindow] = ()
+) -> None:
     """Deletes bags from a store, and deletes stores that were set aside.
 
     Also those whose files are gone. The bags that have rows in one part with them go, too: they are
@@ -39,6 +43,7 @@ def forget(file: Path, bag_dir: Path, bags: Sequence[str]) -> None:
         file: the store; nothing is done if it is absent.
         bag_dir: the bag directory.
         bags: their paths below it.
+        times: bags that have something of these go, too.
 
     Raises:
         BagError: it cannot be changed, is of another version, or another program uses it all the
@@ -52,7 +57,7 @@ def forget(file: Path, bag_dir: Path, bags: Sequence[str]) -> None:
             with closing(
                 sqlite3.connect(address, uri=True, timeout=PATIENCE_S, isolation_level=None)
             ) as base:
-                _delete_bags_and_unused(base, bag_dir, bags)
+                _delete_bags_and_unused(base, bag_dir, bags, times)
                 rewrite(base)
     except (OSError, sqlite3.Error, ValueError) as error:
         reason = f"the columns may still contain deleted data ({error}); delete the file"
@@ -113,15 +118,21 @@ def rewrite(base: sqlite3.Connection) -> None:
             time.sleep(_PAUSE_S)
 
 
-def _delete_bags_and_unused(base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str]) -> None:
+def _delete_bags_and_unused(
+    base: sqlite3.Connection, bag_dir: Path, bags: Sequence[str], times: Sequence[TimeWindow]
+) -> None:
     if base.execute("PRAGMA user_version").fetchone()[0] != FORMAT:
         raise ValueError("it is of another version")
     for pragma in PRAGMAS:
         base.execute(f"PRAGMA {pragma}")
     base.execute("BEGIN IMMEDIATE")
     try:
-        stored = [path for (path,) in base.execute("SELECT path FROM bag")]
-        gone = [path for path in stored if not (bag_dir / path).exists()]
+        stored = base.execute("SELECT path, first_ns, last_ns FROM bag").fetchall()
+        gone = [
+            path
+            for path, first, last in stored
+            if any(time.overlaps(first, last) for time in times) or not (bag_dir / path).exists()
+        ]
         delete_bags(base, [*bags, *gone])
         # Without those beside them another part of the same ten minutes may lack a bag.
         while beside := _beside_deleted(base):

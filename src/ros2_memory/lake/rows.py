@@ -293,9 +293,16 @@ class RowMaker:
         sightings, undecodable = list[Row](), 0
         for topic, of_topic in rows_of_topics.items():
             times = np.sort(np.concatenate([rows.times for rows in of_topic]))
-            for rows in of_topic:
+            left = [*of_topic]
+            for rows in left:
                 detected = self._detections.of(rows)
                 lost = len(rows) - len(detected.log_times)
+                if lost and len(rows) > 1 and rows.ranks.any():
+                    # Which of those of one log time are lost shows where they are read alone.
+                    tied = np.isin(rows.times, rows.times[rows.ranks > 0])
+                    alone = map(rows.some, np.flatnonzero(tied)[:, np.newaxis])
+                    left += [rows.some(np.flatnonzero(~tied)), *alone]
+                    continue
                 undecodable += lost
                 number = np.searchsorted(times, detected.log_times)
                 number += 0 if lost else rows.ranks

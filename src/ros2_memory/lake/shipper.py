@@ -33,9 +33,10 @@ from ros2_memory.bag_dir.state_files import (
     read_receipts,
 )
 from ros2_memory.columns.fill import is_settled
+from ros2_memory.columns.forget import forget as forget_columns
 from ros2_memory.columns.store import relative
 from ros2_memory.columns.writing import PART_NS
-from ros2_memory.core.errors import BagError, LakeError
+from ros2_memory.core.errors import BagError, BusyError, EpisodicError, LakeError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Clock, Ns
@@ -168,7 +169,8 @@ class Shipper:
             LakeError: the lake cannot be read or written.
         """
         for robot in self.robots:
-            robot.prune()
+            if robot.answers(self.patience_s):
+                robot.keep_up()
         now = self.clock.now()
         compact(self.lake, now, self.alive)
         expire(self.lake, now - grace if grace else MAX_NS)
@@ -191,6 +193,8 @@ class Shipper:
             done.problems.append(f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
+        # First: of what is written down only the lake's part is done again after a kill.
+        done.problems += robot.forget([tombstone.window for tombstone in new])
         for tombstone in new:
             append_tombstone(self.lake.location.state_dir, tombstone, done=False)
         for tombstone in new:
@@ -285,11 +289,30 @@ class RobotBags:
         self.known: dict[str, ShippedBag] = {}
         self._confirmed: set[ShippedBag] = set()
 
-    def prune(self) -> None:
-        """Deletes what is stored of bags that are gone."""
+    def keep_up(self) -> None:
+        """Deletes what is stored of bags that are gone; looks whether the disk works again."""
         snapshot = self.memory.index.snapshot()
         if self.filling is not None and snapshot.problem is None:
+            self.filling.store.look_after()
+            self.filling.store.write_again()
             self.filling.prune(snapshot.timeline)
+
+    def forget(self, times: Sequence[TimeWindow]) -> list[str]:
+        """Deletes what is stored of bags that have something of some times.
+
+        Returns why some of it may still be there.
+        """
+        if self.filling is None or not times:
+            return []
+        if not (self.answers(PATIENCE_S) and self.bag_dir.is_dir()):
+            do = "delete the cache folder of ros2-memory, which may have columns of it"
+            return [f"{self.name}: {self.bag_dir} is not there: {do}"]
+        try:
+            if (path := self.filling.store.path) is not None:
+                forget_columns(path, self.bag_dir, (), times)
+        except BagError as error:
+            return [f"{self.name}: {error}"]
+        return []
 
     def ready(self, shipper: Shipper, done: Shipped) -> Iterator[_PreparedBags]:
         """Yields the bags that are to be shipped, the oldest first, with their rows."""
@@ -309,6 +332,8 @@ class RobotBags:
             group.append(to_ship)
         if group:
             yield from self._made(group, waiting, done)
+        if self.filling is not None:
+            self._cut_to_share(self.filling)
         self._drop_gone(bags)
 
     def _to_ship(
@@ -335,7 +360,7 @@ class RobotBags:
                     continue
                 ids.add(bag_id)
                 shipped = self._row_of(bag, bag_id, before, maker.made_of(bag))
-            except (BagError, OSError, ValueError) as error:
+            except (EpisodicError, OSError, ValueError) as error:
                 done.problems.append(f"{self.name}: {error}")
                 continue
             # The rows of a copy are the same, which has another path and mtime.
@@ -363,10 +388,13 @@ class RobotBags:
         """
         if self.filling is not None:
             self._store(self.filling, [to_ship.file for to_ship in group], waiting)
-        maker = RowMaker(self.memory, self.config, self.messages)
         try:
-            rows = maker.rows({to_ship.file: to_ship.bag for to_ship in group})
-        except (BagError, OSError, ValueError) as error:
+            try:
+                rows = self._rows(group)
+            except BusyError:
+                # Another program deleted stored columns, or they are damaged: they are set aside.
+                rows = self._rows(group)
+        except (EpisodicError, OSError, ValueError) as error:
             if len(group) == 1:
                 done.problems.append(f"{self.name}: {error}")
                 return
@@ -375,14 +403,18 @@ class RobotBags:
         else:
             yield _PreparedBags(self, group, rows)
 
+    def _rows(self, group: Sequence[_BagToShip]) -> dict[str, pa.Table]:
+        maker = RowMaker(self.memory, self.config, self.messages)
+        return maker.rows({to_ship.file: to_ship.bag for to_ship in group})
+
     def _store(self, filling: Filling, bags: Sequence[BagFile], waiting: dict[str, Batch]) -> None:
         """Stores the columns of bags, and of those in the same parts, if they are `waiting`.
 
-        Those of the bags before are cut to their share first, since their rows are made.
+        Not in memory, which the stores of many robots would fill, nor on a disk that fails.
         """
-        filling.whole_since()
-        filling.thin()
-        filling.trim()
+        if filling.store.path is None or filling.store.is_failing:
+            return
+        self._cut_to_share(filling)
         timeline = self.memory.index.snapshot().timeline
         for bag in bags:
             batch = waiting.get(bag.file)
@@ -390,6 +422,12 @@ class RobotBags:
                 filling.fill(batch, timeline)
                 for stored in batch.bags:
                     waiting.pop(stored.file, None)
+
+    def _cut_to_share(self, filling: Filling) -> None:
+        """Drops stored columns beyond what they may take; of their bags the rows are made."""
+        filling.whole_since()
+        filling.thin()
+        filling.trim()
 
     def _settled(self, snapshot: Snapshot, done: Shipped) -> Sequence[BagFile]:
         """Returns the bags that change no more; reports the others."""

@@ -55,7 +55,7 @@ _PLAIN: Final = 1
 _PLACED: Final = 2
 _HEAD: Final = struct.Struct("<BBI")
 NAMESPACE: Final = "ros2_memory"
-ROWS_VERSION: Final = 34
+ROWS_VERSION: Final = 35
 """Of what rows are made of a bag; bags whose rows are of another one are shipped again."""
 
 _FIRST_TIMES: Final = ("time_ns", "first_ns", "start_ns")
@@ -123,7 +123,7 @@ class LakeTable:
         return rows.sort_by([(name, "ascending") for name in self.order])
 
     def filled(self, rows: Iterable[Row]) -> pa.Table:
-        """Returns rows as Arrow has them; NaN is null."""
+        """Returns rows as Arrow has them; NaN is null, but in maps, which are as recorded."""
         first = next((name for name in _FIRST_TIMES if name in self.columns), None)
         whole: list[Row] = []
         for row in rows:
@@ -139,7 +139,7 @@ class LakeTable:
 
 def _column(field: pa.Field, values: list[object]) -> pa.Array:
     try:
-        return pa.array(values, field.type, from_pandas=True)
+        return pa.array(values, field.type, from_pandas=not pa.types.is_map(field.type))
     except UnicodeEncodeError:
         # UTF-8 has no lone surrogates, which bytes of a hostile bag decode to.
         return pa.array([*map(_encodable, values)], field.type)

@@ -15,7 +15,9 @@ from pyiceberg.typedef import Record
 from ros2_memory import cli
 from ros2_memory.bag_dir.layout import FORGOTTEN_FILE
 from ros2_memory.bag_dir.state_files import Forgetting, read_forgettings
+from ros2_memory.columns.store import FILE
 from ros2_memory.core.errors import LakeError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.lake.shipper import Shipped
 from ros2_memory.lake.tables import TABLES, unpacked_messages
@@ -32,9 +34,18 @@ from ros2_memory.lake.upkeep import (
 from ros2_memory.lake.warehouse import WRITTEN
 from ros2_memory.storage.base import Channel, Schema
 from tests.support.bags import Msg, detections, odom, text, write_mcap
+from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S
 from tests.support.housekeepers import own_all
-from tests.support.lakes import lake_column, location, robot_bags, ship, ship_from, write_bag
+from tests.support.lakes import (
+    LATER,
+    lake_column,
+    location,
+    robot_bags,
+    ship,
+    ship_from,
+    write_bag,
+)
 from tests.support.log_lines import with_checks
 
 MARKER = "zyxwv-9876"
@@ -152,6 +163,36 @@ def test_what_is_forgotten_on_the_robot_the_next_pass_takes_out_of_the_lake(
     # A bag of the same time that stayed is another one.
     write_bag(bag_dir, 8, at_s=START_S + 70)
     assert ship_again(lake).bags == 1
+
+
+def test_what_is_forgotten_is_in_no_byte_of_the_columns_that_were_stored_to_ship_it(
+    shipped_robot: tuple[Path, Path, Path],
+) -> None:
+    """Also where the bag that had it was written again, and shares parts with others."""
+    bag_dir, lake, _ = shipped_robot
+    cache = lake.parent / "cache" / FILE
+
+    def ship_with_cache() -> Shipped:
+        robot = robot_bags("hall", bag_dir, FixedClock(LATER), cache=[cache])
+        return ship(lake.parent / "other", [robot], most_bags=100)
+
+    assert ship_with_cache().bags == 3
+    assert files_with(cache.parent, MARKER)
+    [topic] = {str(topic) for topic in lake_column(lake, "sightings", "topic")}
+    assert forget_on_robot("--topic", "/chatter", "--topic", topic) == 0
+    assert files_with(cache.parent, MARKER)
+    assert ship_with_cache().problems == []
+    assert files_with(cache.parent, MARKER) == []
+    assert len(lake_column(lake.parent / "other", "bags", "bag_id")) == 3
+
+
+def test_columns_that_cannot_be_forgotten_are_named(tmp_path: Path) -> None:
+    robot = robot_bags("hall", tmp_path / "hall", cache=[tmp_path / "cache" / FILE])
+    assert robot.forget([]) == []
+    assert robot.forget([TimeWindow(0, 1)]) == []
+    (tmp_path / "hall").rmdir()
+    [problem] = robot.forget([TimeWindow(0, 1)])
+    assert "is not there: delete the cache folder" in problem
 
 
 def test_topics_forgotten_on_the_robot_leave_the_lake_and_the_rest_of_their_bag_comes_again(

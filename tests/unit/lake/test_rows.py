@@ -10,7 +10,7 @@ import pytest
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
 from ros2_memory.lake.tables import TABLES
-from tests.support.bags import Msg, detections, write_mcap
+from tests.support.bags import Msg, battery, detections, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, seeded, write_robot
 from tests.support.lakes import lake_rows, robot_bags, ship
@@ -47,6 +47,27 @@ def test_each_detection_is_a_row(lake: tuple[Path, Memory], tmp_path: Path) -> N
     assert sorted((row["message"], row["label"]) for row in found) == [(0, "a"), (0, "b"), (2, "a")]
 
 
+def test_messages_of_one_time_have_their_own_numbers_beside_one_that_cannot_be_decoded(
+    tmp_path: Path,
+) -> None:
+    def seen(at: int, label: str) -> Msg:
+        return detections(at * NS_PER_S, [label])
+
+    spoiled = replace(seen(2, "-"), body=b"\x00\x01\x00\x00\xff")
+    messages = [seen(1, "a"), seen(1, "b"), spoiled, seen(2, "c"), seen(2, "d"), seen(3, "e")]
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", messages)
+    ship(tmp_path / "lake", [robot_bags("hall", tmp_path / "bags")])
+    found = lake_rows(tmp_path / "lake", "sightings")
+    assert sorted((row["message"], row["label"]) for row in found) == [
+        (0, "a"),
+        (1, "b"),
+        (3, "c"),
+        (4, "d"),
+        (5, "e"),
+    ]
+    assert [row["undecodable"] for row in lake_rows(tmp_path / "lake", "bags")] == [1]
+
+
 def test_poses_are_within_their_error_of_what_the_robot_drove(lake: tuple[Path, Memory]) -> None:
     rows = lake_rows(lake[0], "poses")
     assert {row["frame_id"] for row in rows} == {"map", "odom"}
@@ -78,6 +99,14 @@ def test_messages_of_a_chosen_topic_are_whole(lake: tuple[Path, Memory]) -> None
     rows = sorted(lake_rows(lake[0], "messages"), key=lambda row: row["time_ns"])
     assert [row["flags"] for row in rows] == [[("value", on)] for on in (False, True, False)]
     assert {(row["value"], row["undecodable"]) for row in rows} == {('{"value":null}', None)}
+
+
+def test_numbers_of_messages_are_as_they_were_recorded(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "bags" / "rec" / "rec_0.mcap", [battery(NOW, math.nan)])
+    robot = robot_bags("hall", tmp_path / "bags", messages=["/battery_state"])
+    assert ship(tmp_path / "lake", [robot]).bags == 1
+    [row] = lake_rows(tmp_path / "lake", "messages")
+    assert math.isnan(dict(row["numbers"])["percentage"])
 
 
 def test_of_large_messages_there_are_the_times_alone_unless_they_are_chosen(

@@ -15,11 +15,17 @@ import pytest
 from pyiceberg.catalog.sql import SqlCatalog
 
 from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
+from ros2_memory.columns.fill import StoreLimits
+from ros2_memory.columns.store import FILE
+from ros2_memory.columns.units import GoneError
 from ros2_memory.core.errors import LakeError
 from ros2_memory.lake import shipper as shipper_module
+from ros2_memory.lake.rows import RowMaker
 from ros2_memory.lake.tables import TABLES
+from tests.support.clocks import FixedClock
 from tests.support.fleets import START_S
 from tests.support.lakes import (
+    LATER,
     lake_column,
     lake_rows,
     location,
@@ -103,8 +109,50 @@ def test_a_bag_directory_that_hangs_is_named_and_the_others_are_shipped(
             [problem] = done.problems
             assert problem.startswith("hall: ")
             assert "does not answer" in problem
+        with monkeypatch.context() as hung:
+            hung.setattr(robots[0].memory.index, "snapshot", lambda: pytest.fail("it is looked at"))
+            shipper.keep_up(0)
         released.set()
         assert until(lambda: shipper.run().bags or None) == BAGS
+
+
+def test_what_it_stores_of_bags_is_in_a_file_and_cut_to_their_share(tmp_path: Path) -> None:
+    for number in range(BAGS):
+        write_bag(tmp_path / "hall", number)
+    limits = StoreLimits(max_share=0.0, least_bytes_per_s=0)
+    for name, cache in (("memory", []), ("file", [tmp_path / "cache" / FILE])):
+        robot = robot_bags("hall", tmp_path / "hall", FixedClock(LATER), cache=cache, limits=limits)
+        assert ship(tmp_path / name, [robot], most_bags=100).bags == BAGS
+        assert values(tmp_path / name) == sorted(
+            f"n{bag}0{nth}" if bag else f"n{nth}" for bag in range(BAGS) for nth in range(3)
+        )
+        assert robot.filling is not None
+        assert len(robot.filling.store.paths()) == (BAGS if cache else 0)
+        assert bool(robot.filling.store.dropped()) == bool(cache)
+
+
+def test_columns_that_another_program_deletes_or_damages_keep_no_bag_from_being_shipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(BAGS):
+        write_bag(tmp_path / "hall", number)
+    robot = robot_bags("hall", tmp_path / "hall")
+    made, calls = RowMaker.rows, 0
+
+    def gone(maker: RowMaker, bags: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == 1 or next(iter(bags.values())).file == spared:
+            raise GoneError
+        return made(maker, bags)
+
+    monkeypatch.setattr(RowMaker, "rows", gone)
+    spared = ""
+    done = ship(tmp_path / "once", [robot], most_bags=100)
+    assert (done.bags, done.problems) == (BAGS, [])
+    spared = "rec/rec_0.mcap"
+    done = ship(tmp_path / "always", [robot], most_bags=100)
+    assert (done.bags, len(done.problems)) == (BAGS - 1, 1)
 
 
 def test_a_late_robot_and_a_copy_of_a_robot_change_nothing_else(

@@ -130,6 +130,8 @@ def _forget(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
                 f"{listed(sorted(names))}"
             )
+        of_robot = (configured for configured in robots if configured.name == robot)
+        stored = [why for configured in of_robot for why in configured.forget([window])]
         append_tombstone(location.state_dir, tombstone, done=False)
         gone = forget_in_lake(lake, tombstone)
     kept_by = [*gone.kept_by]
@@ -139,8 +141,9 @@ def _forget(
         bags = counted(gone.bags, "bag")
         print_line(f"{bags} of {robot} forgotten; {counted(gone.files, 'file')} deleted")
         print_notes([f"a branch or tag keeps an older version: {name}" for name in kept_by])
+    print_notes(stored)
     _note_versions(location)
-    return bool(kept_by)
+    return bool(kept_by or stored)
 
 
 def _note_versions(location: "LakeLocation") -> None:
