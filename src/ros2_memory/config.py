@@ -44,6 +44,7 @@ from pydantic_core import to_jsonable_python
 from ros2_memory.config_errors import (
     OpenSecretError,
     foreign_errors_as_config_error,
+    line_of,
     validated,
 )
 from ros2_memory.config_sources import (
@@ -850,8 +851,9 @@ def load_exclusions(settings: Settings) -> Mapping[str, ExcludeRule]:
 def _load_file(model: type[_T], key: str, path: Path) -> _T:
     """Returns the content of a YAML file that a key names, as an instance of a model."""
 
-    def source(_fault: str) -> str:
-        return f"in {path}, which {key} names"
+    def source(fault: str) -> str:
+        line = line_of(path, fault)
+        return f"in {path}{f', line {line}' if line else ''}, which {key} names"
 
     with foreign_errors_as_config_error(f"{key}: {path}", source):
         data = OmegaConf.to_container(OmegaConf.load(path), resolve=True)

@@ -7,10 +7,11 @@ and the file system raise is translated in one place.
 from __future__ import annotations
 
 import re
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from typing import TYPE_CHECKING, Final, TypeVar, get_args, get_origin, get_type_hints
 
+import yaml
 from hydra.errors import HydraException
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import TypeAdapter, ValidationError
@@ -98,6 +99,23 @@ def foreign_errors_as_config_error(where: str, source: Callable[[str], str]) -> 
         reason = reason_of(error)
         sentence = f"{key}: {reason} (set {source(key)})" if key else f"{where}: {reason}"
         raise ConfigError(sentence) from error
+
+
+def line_of(path: Path, key: str) -> int | None:
+    """Returns the line (from 1) of a dot-path's key in a YAML file, or of the nearest one above it.
+
+    None where the file has none of its keys, or cannot be read.
+    """
+    line, rest = None, key
+    with suppress(OSError, ValueError, YAMLError):
+        node = yaml.compose(path.read_text(), yaml.SafeLoader)
+        while isinstance(node, yaml.MappingNode):
+            leading = [entry for entry in node.value if f"{rest}.".startswith(f"{entry[0].value}.")]
+            if not leading:
+                break
+            name, node = leading[0]
+            line, rest = name.start_mark.line + 1, rest[len(name.value) + 1 :]
+    return line
 
 
 def reason_of(error: Exception) -> str:

@@ -132,6 +132,7 @@ class TestMessageSchemas:
             ("schemas: {a/msg/B: {position: pose..position}}", "schemas.a/msg/B.position"),
             ("schemas: {a/msg/B: {position: 3}}", "schemas.a/msg/B.position: 3"),
             ("schemas: {a/msg/B: position}", "schemas.a/msg/B: 'position'"),
+            ("schemas:\n  a/msg/C: {x: y}\n  a/msg/B:\n    x.y: 3", "schemas.yaml, line 4,"),
             ("schemas: {a/msg/B: {'': position}}", "must not be empty"),
             ("schemas: {a/msg/B: {x: y}, a/msg/B: {x: z}}", "duplicate key a/msg/B"),
             ("schema: {}", "schema: unknown key"),

@@ -17,7 +17,14 @@ from typing import Final, NamedTuple, TypeVar
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, read_heartbeat
-from ros2_memory.bag_dir.layout import ERASING_FILE, MOMENTS_FOLDER, SHIPPED_FILE, is_carried
+from ros2_memory.bag_dir.layout import (
+    ERASING_FILE,
+    MOMENTS_FOLDER,
+    OWN_FOLDER,
+    SHIPPED_FILE,
+    has_recorded,
+    is_carried,
+)
 from ros2_memory.bag_dir.state_files import describe_leaving, is_shipped, read_receipts
 from ros2_memory.bootstrap import build_recorder
 from ros2_memory.bootstrap_fleet import ROBOTS_SETTING, lake_location
@@ -56,6 +63,9 @@ T = TypeVar("T")
 
 _MSG_FOLDERS: Final = "reader.custom_msg_paths"
 _READ: Final = "give this user the right to read it, or run as the user of the services"
+_WAIT: Final = (
+    "it counts as being written; if no program writes it, as a copy, it is read once it is older"
+)
 _START_RECORDER: Final = "start it: ros2-memory-recorder, or systemctl start ros2-memory-recorder"
 _LATE_NS: Final[Ns] = 3600 * NS_PER_S
 """A hub that is reached has confirmed closed bags after this time."""
@@ -269,7 +279,7 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
         do = "recording.bag_dir=DIR names another directory; a recorder fills this one"
         yield warning(nothing_here(snapshot), do)
     names_by_fault: dict[tuple[str, str, str], list[str]] = {}
-    for kind, wrong, do, name in _faults(memory, snapshot, covered):
+    for kind, wrong, do, name in _faults(memory, snapshot, covered, is_recording=bool(robot.live)):
         names_by_fault.setdefault((kind, wrong, do), []).append(name)
     for (kind, wrong, do), names in names_by_fault.items():
         yield warning(f"{counted(len(names), kind)} {wrong}: {listed(names)}", do)
@@ -284,7 +294,7 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
 
 
 def _faults(
-    memory: Memory, snapshot: Snapshot, covered: DataTimeRange
+    memory: Memory, snapshot: Snapshot, covered: DataTimeRange, *, is_recording: bool
 ) -> Iterator[tuple[str, str, str, str]]:
     """Yields of each fault a noun, what is wrong, what to do, and the name of what has it."""
     for bag in covered.unread:
@@ -292,6 +302,8 @@ def _faults(
     for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):
         for bag in files:
             yield "file", state, _remedy(bag, memory), f"{bag.path.name} ({bag.reason})"
+    for active in () if is_recording else snapshot.active:
+        yield "file", "without an end, and changed lately, so not read", _WAIT, active.path.name
     for odd in bags_with_remarks(snapshot):
         name = f"{odd.path.name} ({'; '.join(odd.summary.notes)})"
         do = "nothing is missing: what it states of itself is wrong, not its messages"
@@ -474,6 +486,16 @@ def check_lake(settings: Settings) -> Iterator[Finding]:
         yield warning(f"{location.warehouse} has no bag yet", do)
     else:
         yield ok(f"{location.warehouse}; its newest commit is from {iso_local(committed)}")
+    for name, bag_dir in settings.fleet.robots.items() if settings.lake.engine is None else ():
+        where = bag_dir / SHIPPED_FILE, bag_dir / OWN_FOLDER, bag_dir
+        path = next((path for path in where if path.exists()), bag_dir)
+        if has_recorded(bag_dir) and not os.access(path, os.W_OK):
+            seen = (
+                f"{name}: {path} is read-only here: no receipts can be written, so "
+                "retention.require_shipped can never work on that robot"
+            )
+            do = "mount it writable for the user of ros2-memory ship, or do not require it"
+            yield warning(seen, do)._replace(about="robot")
 
 
 def check_ros(robot: Examined) -> Iterator[Finding]:

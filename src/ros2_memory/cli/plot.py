@@ -173,7 +173,7 @@ def plot_path(
     given = [f"{key}={quoted(value)}" for key, value in chosen.items() if value is not None]
     asked = _checked_request(out, bags, times, *given)
     with spinner("looking for the path"):
-        path, happened = path_in(asked), asked.recap()
+        path, happened = path_in(asked, topic), asked.recap()
     if frame not in (None, path.frame):
         raise InvalidArgumentsError(f"--frame {frame}: no transform leads there from {path.frame}")
     with _picture(out, f"Path, {asked.title}", _totals(happened), (8.5, 7.0)) as figure:
@@ -408,16 +408,22 @@ def asked_in(memory: Memory, window: TimeWindow) -> Asked:
     return Asked(view, within)
 
 
-def path_in(asked: Asked) -> DrawnPath:
-    """Returns the path; in the map where transforms lead there.
+def path_in(asked: Asked, topic: str | None = None) -> DrawnPath:
+    """Returns the path by a topic or `data.pose_topic`; in the map where transforms lead there.
 
     Without a topic of poses and transforms, that of a satellite receiver.
 
     Raises:
-        NoDataError: there is none in this time.
+        NoDataError: there is none in this time, or no such topic.
     """
-    memory, receivers = asked.view.memory, topics_with(asked.view, "geodetic")
-    if receivers and robot_places(asked.view, asked.window) is None:
+    view, memory = asked.view, asked.view.memory
+    if topic is not None:
+        resolve_topic(view, topic)  # another one that has poses is not what was asked for
+    elif (
+        (receivers := topics_with(view, "geodetic"))
+        and not topics_with(view, "position")
+        and robot_places(view, asked.window) is None
+    ):
         receiver, _, _ = receivers[0].partition(" ")
         memory = replace(memory, limits=replace(memory.limits, pose_topic=receiver))
     everywhere = Box(-math.inf, -math.inf, math.inf, math.inf, _PIXEL_M)
@@ -427,7 +433,10 @@ def path_in(asked: Asked) -> DrawnPath:
         raise NoDataError(error.reason, f"{error.detail}, or give --topic") from error
     if not len(line.times):
         view = View(memory, Call())
-        raise no_data_between(view, (resolve_path_topic(view, degrees=True),), asked.window)
+        of = resolve_path_topic(view, degrees=True)
+        if any(view.timeline.extents(of, asked.window)):
+            raise NoDataError(NoDataReason.OUTSIDE_RANGE, f"no pose of {of} has a place")
+        raise no_data_between(view, (of,), asked.window)
     return DrawnPath(path.frame, line.times / NS_PER_S, line.x, line.y, line.begins)
 
 

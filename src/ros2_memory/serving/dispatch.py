@@ -13,7 +13,6 @@ import uuid
 from collections import deque
 from contextlib import contextmanager
 from difflib import get_close_matches
-from functools import partial
 from threading import Lock
 from typing import TYPE_CHECKING, Final
 
@@ -97,6 +96,7 @@ _QUERY_MARGIN_S: Final = 0.5
 _IDLE_S: Final = 1.0
 """How long nobody must have asked until work in advance begins."""
 _LONGEST_IN_ADVANCE_S: Final = 120.0
+_REPORTED_WAIT_S: Final = 0.5
 _LONG_S: Final = 0.1
 """An answer that took longer used so much memory that what is free of it goes back."""
 _LOGGED_CHARS: Final = 300
@@ -332,26 +332,28 @@ class Dispatcher:
             BusyError: its turn does not come in time, or too many wait.
             QueryTimeoutError: the time of a call is up.
         """
-        begun = threading.Event()
+        asked_s, waits_s = time.monotonic(), list[float]()
+
+        def begin() -> tuple[str, Reply]:
+            waits_s.append(time.monotonic() - asked_s)
+            return self._asked(answer, call, waits_s[0])
+
         with anyio.move_on_after(self._call_timeout_s):
-            return await queue.run(client, partial(self._asked, answer, call, begun))
+            return await queue.run(client, begin)
         if self._stopping.is_set():
             raise BusyError(STOPPING)
-        if not begun.is_set():
+        if not waits_s:
             raise BusyError(
                 f"{name} waited {self._call_timeout_s:g} s behind other calls and was not "
                 "started; ask again, with fewer at once"
             )
         raise QueryTimeoutError(
-            f"{name} needs more than {self._call_timeout_s:g} s; "
+            f"{name} needs more than {self._call_timeout_s:g} s{_with_wait(waits_s[0])}; "
             "ask about a shorter window or a single topic"
         )
 
-    def _asked(
-        self, answer: Callable[[], Reply], call: Call, has_begun: threading.Event
-    ) -> tuple[str, Reply]:
+    def _asked(self, answer: Callable[[], Reply], call: Call, waited_s: float) -> tuple[str, Reply]:
         """Returns the outcome and the reply, in a worker thread; errors as replies."""
-        has_begun.set()
         begun = time.monotonic()
         try:
             # Around all of it: an error keeps what was read alive until it has become a reply.
@@ -359,7 +361,10 @@ class Dispatcher:
                 try:
                     return "ok", answer()
                 except QueryTimeoutError as error:
-                    failure = BusyError(STOPPING) if self._stopping.is_set() else error
+                    late = QueryTimeoutError(
+                        f"{error}{_with_wait(waited_s)}", error.searched_back_to
+                    )
+                    failure = BusyError(STOPPING) if self._stopping.is_set() else late
                     return failure.code, self._replies.error(failure)
                 except EpisodicError as error:
                     reason = f": {error.reason}" if isinstance(error, NoDataError) else ""
@@ -376,6 +381,13 @@ class Dispatcher:
         """Returns the reply to a call that failed through a fault of this program."""
         context = structlog.contextvars.get_contextvars()
         return "internal", self._replies.internal(str(context.get("correlation_id")))
+
+
+def _with_wait(waited_s: float) -> str:
+    """Returns what the error of a timeout says of a wait for its turn; nothing if it was short."""
+    if waited_s < _REPORTED_WAIT_S:
+        return ""
+    return f" (it waited {waited_s:.1f} s of its time behind other calls)"
 
 
 def _named(name: str, tools: Mapping[str, Tool]) -> Tool:

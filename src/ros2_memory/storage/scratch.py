@@ -54,7 +54,8 @@ class Scratch:
         self._root: Path | None = None
         self._copies: OrderedDict[Hashable, _Copy] = OrderedDict()
         self._bytes = 0
-        self._lock = threading.Lock()
+        # A reader that is collected as garbage may end while this thread makes a file.
+        self._lock = threading.RLock()
 
     @contextmanager
     def use(

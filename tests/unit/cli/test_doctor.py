@@ -359,6 +359,21 @@ def test_runs_that_are_answered_together_are_reported(robot: Path, examined: Exa
     assert "other, rec overlap in time (from 20" in finding["seen"]
 
 
+@pytest.mark.parametrize(("recorder", "is_active"), [("none", False), ("ros2bag", True)])
+def test_a_copy_without_an_end_is_named_while_it_counts_as_being_written(
+    robot: Path, examined: Examined, recorder: str, is_active: bool
+) -> None:
+    (robot / "recorder.json").unlink()
+    path = write_mcap(
+        robot / "copy" / "copy_0.mcap", [odom(10**18 + n, 0.0, 0.0) for n in range(9)]
+    )
+    path.write_bytes(path.read_bytes()[:-20])
+    code = 1 if recorder == "none" else 2
+    seen = " ".join(each["seen"] for each in examined(code, f"recorder={recorder}")["bags"])
+    assert ("so not read: copy_0.mcap" in seen) is is_active
+    assert ("1 file unfinished: copy_0.mcap" in seen) is not is_active
+
+
 def test_what_the_recorder_receives_by_now_is_not_missed_in_closed_bags(
     robot: Path, examined: Examined
 ) -> None:

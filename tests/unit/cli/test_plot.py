@@ -124,6 +124,23 @@ def test_without_poses_and_transforms_it_is_that_of_the_satellite_receiver(tmp_p
     assert (path.xs[-1], path.ys[-1]) == pytest.approx((east, 2 * 1852 * 0.006), rel=0.01)
 
 
+def test_a_path_of_another_topic_than_the_one_asked_for_is_not_drawn(
+    tmp_path: Path, exits: Program
+) -> None:
+    fixes = [fix(T0 + n * S, n * 1e-4, 0.0) for n in range(3)]
+    write_mcap(tmp_path / "a" / "a_0.mcap", fixes)
+    drawn = f"--out {tmp_path}/drawn.svg"
+    refused = exits(2, f"plot path {tmp_path}/a --topic /fixed {drawn}").err
+    assert "no topic /fixed is recorded; similar: /fix" in refused
+    poses = [odom(T0, 0.0, 0.0, topic=topic) for topic in ("/a/odom", "/b/odom")]
+    write_mcap(tmp_path / "b" / "b_0.mcap", [*fixes, *poses])
+    refused = exits(2, f"plot path {tmp_path}/b {drawn}").err
+    assert "poses are on /a/odom (nav_msgs/msg/Odometry), /b/odom" in refused
+    nowhere = [odom(T0 + n * S, math.nan, math.nan) for n in range(3)]
+    write_mcap(tmp_path / "c" / "c_0.mcap", nowhere)
+    assert "no pose of /odom has a place" in exits(2, f"plot path {tmp_path}/c {drawn}").err
+
+
 @given(
     latitude=st.floats(-80, 80),
     longitude=st.floats(-180, 180),

@@ -172,6 +172,14 @@ def test_doctor_tells_of_a_lake_what_keeps_it_from_working(
     told = found()
     assert [*told] == ["lake ok"]
     assert "its newest commit is from" in told["lake ok"][0]
+    can = os.access
+    own = tmp_path / "hall" / ".episodic"
+    monkeypatch.setattr(
+        os, "access", lambda path, mode: own not in Path(path).parents and can(path, mode)
+    )
+    [told_of] = found()["robot warning"]
+    assert "hall: " in told_of
+    assert "can never work" in told_of
     shutil.rmtree(lake / "ros2_memory")
     assert "looking into the lake failed" in found()["lake error"][0]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import itertools
 import json
+import re
 import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
@@ -191,6 +192,19 @@ async def test_a_query_that_does_not_look_at_its_deadline_is_left_behind() -> No
     assert result.is_error
     assert sent(result)["error"] == "timeout"
     assert sent(result)["detail"].startswith("stuck needs more than 0.05 s")
+
+
+@pytest.mark.parametrize("looks_at_its_deadline", [True, False])
+async def test_a_query_that_waited_and_then_ran_out_of_time_says_so(
+    monkeypatch: pytest.MonkeyPatch, looks_at_its_deadline: bool
+) -> None:
+    monkeypatch.setattr("ros2_memory.serving.dispatch._REPORTED_WAIT_S", 0.0)
+    held = Held()
+    ask = until_given_up if looks_at_its_deadline else held.ask
+    async with Client(served(tool("late", ask), timeout_s=1.0)) as client:
+        detail = sent(await client.call_tool("late", {}))["detail"]
+        held.released.set()
+    assert re.search(r" s \(it waited \d\.\d s of its time behind other calls\)", detail)
 
 
 async def test_tools_are_listed_while_queries_run_and_wait() -> None:

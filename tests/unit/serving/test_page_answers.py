@@ -362,6 +362,15 @@ def test_robots_that_overlap_have_a_path_each_and_a_folder_of_recordings_is_one(
     assert paths(-1000, -800) == {}
 
 
+def test_robots_within_one_folder_have_a_path_each_beside_another_folder(tmp_path: Path) -> None:
+    for name, x in (("hall/robin", 0), ("hall/wren", 100), ("yard/jay", 200)):
+        messages = [odom(BEGIN + n * S // 10, x + n / 10, 0.0) for n in range(101)]
+        write_mcap(tmp_path / name / "0.mcap", messages)
+    found = paths_in(memory_of(tmp_path), 0, 30)
+    ends = {path["name"]: (path["x"][0], path["x"][-1]) for path in found}
+    assert ends == {"hall/robin": (0, 10), "hall/wren": (100, 110), "yard": (200, 210)}
+
+
 def test_robots_without_a_common_time_have_a_path_each_where_their_frames_are_unlike(
     tmp_path: Path,
 ) -> None:

@@ -8,8 +8,9 @@ import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from ros2_memory.core.errors import (
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.storage.base import Closing, Record
 from ros2_memory.storage.rosbag2_reader import Rosbag2Reader
+from ros2_memory.storage.scratch import Scratch
 from tests.support.bags import (
     McapLayout,
     Msg,
@@ -36,7 +38,7 @@ from tests.support.bags import (
 from tests.support.memories import asked, memory_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
 
 EVERYTHING = TimeWindow.everything()
@@ -387,6 +389,25 @@ class TestCompressedFiles:
             reader.summarize(other)
         assert list(held) == []
         assert reader.summarize(other).count == 1
+
+    def test_a_reading_may_end_while_its_thread_unpacks_another_file(self) -> None:
+        """As where garbage is collected meanwhile: a lock that no thread takes twice would hang."""
+        scratch = Scratch(1 << 20)
+
+        def fill(folder: Path, _reserve: Callable[[int], None]) -> tuple[Path, str]:
+            held.close()
+            return folder, ""
+
+        def two_files() -> None:
+            with held, scratch.use("other", fill) as (folder, _):
+                assert folder.is_dir()
+
+        held = ExitStack()
+        held.enter_context(scratch.use("one", lambda folder, _reserve: (folder, "")))
+        thread = threading.Thread(target=two_files, daemon=True)
+        thread.start()
+        thread.join(20)
+        assert not thread.is_alive()
 
     def test_temporary_files_go_with_the_reader(self, tmp_path: Path, scratch_root: Path) -> None:
         path = compressed(write_db3(tmp_path / "a.db3", chatter(3)))

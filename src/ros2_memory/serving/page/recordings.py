@@ -120,27 +120,29 @@ def _rows(snapshot: Snapshot, root: str) -> list[JsonObject]:
 def _robots(memory: Memory, call: Call, window: TimeWindow) -> list[str]:
     """Returns the names under which the robots of a window are found, if there are several.
 
-    Some of their recordings overlap in time, or have frames of other robots. Each folder is one; of
-    one folder each recording. The newest come first.
+    Some of their recordings overlap in time, or have frames of other robots. A folder is one, but
+    for one whose own recordings overlap: there each recording is. The newest come first.
     """
     root, ends = str(memory.index.bag_dir), dict[str, Ns]()
     for path, bags in recordings_of(memory.index.snapshot()).items():
         if any(bag.reaches_into(window) for bag in bags):
             ends[name_of(path, bags, root)] = max(bag.end for bag in bags)
-    folders = {*map(_folder, ends)}
+    present = {*map(_folder, ends)}
     unlike = (
         {_folder(path.removeprefix(f"{root}/")) for path in contradiction.recordings}
         for contradiction in contradicting_frames(memory, call)
     )
-    are_mixed = any(
-        mixed.topic is not None and window.overlaps(mixed.pair.start, mixed.pair.end)
-        for mixed in mixed_recordings(memory, call)
-    )
-    if not are_mixed and not any(len(pair) > 1 and pair <= folders for pair in unlike):
+    overlaps = [
+        {_folder(str(path).removeprefix(f"{root}/")) for path in (pair.first, pair.second)}
+        for pair, topic in mixed_recordings(memory, call)
+        if topic is not None and window.overlaps(pair.start, pair.end)
+    ]
+    if not overlaps and not any(len(pair) > 1 and pair <= present for pair in unlike):
         return []
+    split = {folder for pair in overlaps if len(pair) == 1 for folder in pair}
     robots: dict[str, Ns] = {}
     for name, end in ends.items():
-        robot = _folder(name) if len(folders) > 1 else name
+        robot = name if _folder(name) in split else _folder(name)
         robots[robot] = max(end, robots.get(robot, end))
     return sorted(robots, key=lambda robot: (robots[robot], robot), reverse=True)
 
