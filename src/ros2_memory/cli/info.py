@@ -240,7 +240,9 @@ def recordings(as_json: AsJson = False, *, bags: Bags) -> bool:
     elif is_empty:
         _print_nothing(memory)
     else:
-        lists: JsonObject = {"recordings": [*rows], "not_read": [*not_read]}
+        # For people there is the length.
+        short = [{key: row[key] for key in row if key != "end"} for row in rows]
+        lists: JsonObject = {"recordings": [*short], "not_read": [*not_read]}
         print_reply({title: rows for title, rows in lists.items() if rows})
     return is_empty
 
@@ -256,6 +258,7 @@ def _rows(snapshot: Snapshot, root: Path) -> Iterator[JsonObject]:
         yield {
             "recording": name_of(path, bags, str(root)),
             "start": unix_from_ns(start),
+            "end": unix_from_ns(end),
             "length_s": round(unix_from_ns(end - start), 3),
             "size_mb": round(sum(bag.size for bag in bags) / MB, 3),
             "bags": len(bags),

@@ -204,8 +204,9 @@ class TestRecordings:
         rows = self.rows(exits)
         bags = {name: row["bags"] for name, row in rows.items()}
         assert bags == {"a": 2, "b": 1, "loose/red": 1, "loose/blue": 1}
-        keys = ("start", "length_s", "messages", "topics", "storage")
-        assert [rows["a"][key] for key in keys] == [1_700_000_000.0, 9.0, 11, 2, "mcap"]
+        keys = ("start", "end", "length_s", "messages", "topics", "storage")
+        start_s = 1_700_000_000.0
+        assert [rows["a"][key] for key in keys] == [start_s, start_s + 9.0, 9.0, 11, 2, "mcap"]
 
     def test_it_says_whose_they_are_and_names_what_is_not_read(
         self, folder: Path, exits: Program
