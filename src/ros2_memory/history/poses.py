@@ -15,7 +15,6 @@ from ros2_memory.analysis.poses import FrameCodes, Poses, joined_poses
 from ros2_memory.columns.poses import NoPoseError, PoseColumns, rounded
 from ros2_memory.columns.steps import METRES
 from ros2_memory.columns.table import Texts
-from ros2_memory.columns.units import Rows
 from ros2_memory.core.errors import InvalidArgumentsError, UndecodableError
 from ros2_memory.history.no_data import describe_lack
 from ros2_memory.history.scan import (
