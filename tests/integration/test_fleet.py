@@ -10,7 +10,6 @@ import httpx2
 from mcp import Client
 from mcp.client.sse import sse_client
 from mcp.client.streamable_http import streamable_http_client
-from mcp.types import ResourceTemplateReference
 
 from tests.integration.test_server_process import serving
 from tests.support.fleets import START_S, seeded, write_robot
@@ -68,10 +67,6 @@ async def test_a_token_decides_about_whom_is_answered(tmp_path: Path) -> None:
                     await client.list_resource_templates(),
                     await client.list_prompts(),
                     await client.get_prompt("use_memory"),
-                    await client.complete(
-                        ResourceTemplateReference(uri="episodic://schema/{type}"),
-                        {"name": "type", "value": ""},
-                    ),
                 ]
                 assert "r2" not in str(listed)
             async with Client(sse_client(served.url("/sse"), headers=headers)) as client:
