@@ -506,8 +506,11 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
         build_recorder(settings, reader=robot.memory.reader).check()
     except EpisodicError as problem:
         reason, _, do = str(problem).partition("; ")
-        given = "correct recorder.setup_files, or give this command the settings of the recorder"
-        yield error(reason, do or given)
+        given = "give this command the settings of the recorder (its environment and arguments)"
+        if setup_files or robot.live is None or robot.live.state is RecorderState.STOPPED:
+            yield error(reason, do or f"correct recorder.setup_files, or {given}")
+        else:
+            yield warning(f"{reason} with these settings; the running recorder has others", given)
         return
     files = ", ".join(map(str, setup_files))
     yield ok(f"ros2 bag record can be run{f' after {files}' if files else ''}")

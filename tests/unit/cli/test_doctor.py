@@ -333,6 +333,18 @@ def test_where_bags_must_be_shipped_it_counts_those_that_are_not_and_dates_the_n
     assert examined(0, required) == {}
 
 
+def test_a_running_recorder_has_a_ros_that_these_settings_do_not_name(
+    robot: Path, examined: Examined, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (robot.parent / "bin" / "ros2").unlink()
+    monkeypatch.setenv("PATH", str(robot.parent / "bin"))
+    [finding] = examined(1)["ros"]
+    assert finding["level"] == "warning"
+    assert "the running recorder has others" in finding["seen"]
+    beat(robot, RecorderState.STOPPED)
+    assert examined(2)["ros"][0]["level"] == "error"
+
+
 class TestTheServer:
     def test_another_program_is_recognised(self, robot: Path, examined: Examined) -> None:
         Answering.reply = b"<html>a printer</html>"

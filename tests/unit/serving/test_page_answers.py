@@ -278,6 +278,17 @@ def test_points_of_a_long_path_are_bounded_and_reach_from_its_first_to_its_last(
     assert {0, count - 1} <= {*kept}
 
 
+def test_a_path_of_many_corners_is_drawn_by_a_bounded_number_of_points(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zigzag = [odom(BEGIN + n * S, n / 10, n % 2) for n in range(60)]
+    write_mcap(tmp_path / "rec" / "0.mcap", zigzag)
+    monkeypatch.setattr(span, "MOST_POINTS", 10)
+    path = shown(memory_of(tmp_path))["path"]
+    assert len(path["t"]) == 10
+    assert (path["x"][0], path["x"][-1]) == (0.0, 5.9)
+
+
 def answered(tool: str) -> Answered:
     return Answered(tool, "ok", 0.25, 2, "id")
 

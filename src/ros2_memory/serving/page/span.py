@@ -79,6 +79,9 @@ _QUICK_S: Final = 0.8
 _PART_S: Final = 8.0
 """How long each part of an answer may take; of a patient one the latter, of a first one all of them
 the former. The page shows what there is, and asks again for the rest."""
+_FINE_M: Final = 0.01
+_COARSE_M: Final = 1.0
+"""How near a path of many points is drawn, until few are left: from the one to the other."""
 _OF_WHOLE: Final = ("events", "things")
 """Parts that are of the whole span; `whole_ms` is their processor time, so that a live page knows
 how often it may ask for them."""
@@ -346,9 +349,14 @@ def path_in(memory: Memory, call: Call, window: TimeWindow) -> JsonObject | None
 def _drawn(path: RobotPath) -> JsonObject:
     """Returns a path by `MOST_POINTS` points at most."""
     track = path.track
-    kept = np.arange(len(track.times))
-    if len(kept) > MOST_POINTS:
-        kept = path.line.simplified(0.0, MOST_POINTS)
+    kept, tolerance_m = np.arange(len(track.times)), _FINE_M
+    while len(kept) > MOST_POINTS:
+        line = path.line.some(kept)
+        few = line.simplified(tolerance_m, len(kept))
+        is_too_coarse = len(few) < MOST_POINTS // 2 and tolerance_m > _FINE_M
+        if is_too_coarse or tolerance_m > _COARSE_M:
+            few = line.simplified(0.0, MOST_POINTS)  # as near as these allow: ten times slower
+        kept, tolerance_m = kept[few], 2 * tolerance_m
     return {
         "frame": path.frame,
         "t": np.round(track.times[kept] / NS_PER_S, 3).tolist(),
