@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.store import ColumnStore, State
-    from ros2_memory.index.segment import Segment
+    from ros2_memory.index.segment import Segment, TopicExtent
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
 
@@ -64,13 +64,15 @@ class Coverage:
         self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
         self._numbers: IntArray = all_numbers[self._order]
 
-    def missing_in(self, window: TimeWindow) -> Iterator[BagFile]:
-        """Yields the bags that are not stored and have messages in a window or near it."""
+    def missing_extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
+        """Yields the bags that are not stored as `Timeline.extents` yields all."""
         for covered in self.segments:
-            if covered.missing and window.overlaps(
-                covered.segment.first[0], covered.segment.latest
-            ):
-                yield from covered.missing
+            span = covered.segment.spans.get(topic) if covered.missing else None
+            if span is not None and window.overlaps(*span):
+                files = {bag.file for bag in covered.missing}
+                for extent in covered.segment.extents(topic, window):
+                    if extent.bag.file in files:
+                        yield extent
 
     def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
         """Returns which of some numbers are of bags of the timeline."""

@@ -363,9 +363,10 @@ class Group:
         batch, bags, is_hashed = _as_one(waiting, buffer, begins)
         hashes = None
         if is_hashed.any():
-            spans = zip(batch.starts.tolist(), (batch.starts + batch.sizes).tolist(), strict=True)
-            crcs = np.array([zlib.crc32(buffer[begin:end]) for begin, end in spans], np.int64)
-            hashes = np.where(is_hashed, crcs, UNHASHED)
+            starts, sizes = batch.starts[is_hashed], batch.sizes[is_hashed]
+            spans = zip(starts.tolist(), (starts + sizes).tolist(), strict=True)
+            hashes = np.full(len(bags), UNHASHED)
+            hashes[is_hashed] = [zlib.crc32(buffer[begin:end]) for begin, end in spans]
         table = Table(
             kind.first,
             batch.log_times,

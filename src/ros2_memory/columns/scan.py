@@ -375,16 +375,16 @@ class Scan:
         """Yields the sources that may have rows in a window."""
         topic, timeline, coverage = self._request.topic, self._request.timeline, self._coverage
         if coverage is None or self._scanner.store is None:
-            plain = {extent.bag.file: extent.bag for extent in timeline.extents(topic, reach)}
-            yield from (_Source(*bag.summary.span_of([topic]), None, bag) for bag in plain.values())
-            return
-        for head in self._scanner.parts(topic, reach, coverage):
-            yield _Source(head.first, head.last, head)
-        for bag in coverage.missing_in(reach):
-            if topic in bag.summary.schema.positions:
-                first, last = bag.summary.span_of([topic])
-                if reach.overlaps(first, last):
-                    yield _Source(first, last, None, bag)
+            extents = timeline.extents(topic, reach)
+        else:
+            for head in self._scanner.parts(topic, reach, coverage):
+                yield _Source(head.first, head.last, head)
+            extents = coverage.missing_extents(topic, reach)
+        of_bags: dict[str, _Source] = {}
+        for bag, *span in extents:
+            first, last = bag.summary.span_of([topic]) if bag.file in of_bags else span
+            of_bags[bag.file] = _Source(first, last, None, bag)
+        yield from of_bags.values()
 
     def _ordered(self, sources: Iterable[_Source]) -> list[_Source]:
         """Returns sources in order of time; of those of the same times as their bags are."""
