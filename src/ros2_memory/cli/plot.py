@@ -430,7 +430,9 @@ def path_in(asked: Asked, topic: str | None = None) -> DrawnPath:
     try:
         path, line, _ = line_in_box(memory, Call(), asked.window, everywhere)
     except NoDataError as error:
-        raise NoDataError(error.reason, f"{error.detail}, or give --topic") from error
+        has_others = "data.pose_topic" in error.detail
+        hint = ", or give --topic" if has_others else "; list_recorded_topics lists all"
+        raise NoDataError(error.reason, f"{error.detail}{hint}") from error
     if not len(line.times):
         view = View(memory, Call())
         of = resolve_path_topic(view, degrees=True)

@@ -75,6 +75,14 @@ def test_where_the_poses_are_on_several_other_topics_it_names_the_option(
     )
 
 
+def test_where_nothing_has_poses_it_names_the_command_that_lists_topics(
+    tmp_path: Path, exits: Program
+) -> None:
+    write_mcap(tmp_path / "bag.mcap", [text(T0, "hello")])
+    said = exits(2, f"plot path {tmp_path} --out {tmp_path}/x.svg").err
+    assert "no topic /odom is recorded; `ros2-memory topics` lists all" in said
+
+
 def test_where_no_cache_can_be_written_a_plot_leaves_nothing_in_the_temporary_folder(
     bags: Path, tmp_path: Path
 ) -> None:
