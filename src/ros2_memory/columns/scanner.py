@@ -174,8 +174,9 @@ class Scanner:
         self.caches = Caches.of() if caches is None else caches.namespace()
         self._reading = reading
         self._damaged: dict[tuple[str | Ns, ...], str] = {}
+        self._fresh: set[int] = set()
         # They follow from columns alone, and are of use where these were dropped.
-        self._outlines = Fragments(store, OUTLINE, "", self.caches.read)
+        self._outlines = Fragments(store, OUTLINE, "", self.caches.read, self._fresh)
         self._fragments: dict[str, object] = {OUTLINE.name: self._outlines}
 
     def met_damage(self, bag: BagFile, error: BagError) -> None:
@@ -196,7 +197,7 @@ class Scanner:
     def fragments(self, kind: FragmentKind[T]) -> Fragments[T]:
         """Returns the fragments of a kind."""
         if kind.name not in self._fragments:
-            fragments = Fragments(self.store, kind, self._reading, self.caches.read)
+            fragments = Fragments(self.store, kind, self._reading, self.caches.read, self._fresh)
             self._fragments.setdefault(kind.name, fragments)
         # By name: each kind has one type.
         return cast("Fragments[T]", self._fragments[kind.name])
@@ -220,6 +221,7 @@ class Scanner:
 
     def write_fragments(self) -> None:
         """Stores the fragments that were made since."""
+        self._fresh.clear()
         for fragments in [*self._fragments.values()]:
             cast("Fragments[Sized]", fragments).write()
 
@@ -377,6 +379,7 @@ class Scanner:
 
     def remember(self, parts: Mapping[int, PackedPart]) -> None:
         """Remembers parts that were written, by their numbers: what follows is made of these."""
+        self._fresh.update(parts)
         for number, part in parts.items():
             for path, packed in part.columns.items():
                 known = replace(packed, data=b"")

@@ -16,6 +16,7 @@ from ros2_memory.core.errors import (
     UndecodableError,
 )
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.storage.cache import ByteLru
 from ros2_memory.storage.mcap import bag_file
 from ros2_memory.storage.mcap.records import MESSAGE
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -85,6 +86,17 @@ class TestReadingOnlyWhatIsWanted:
         assert read(reader, path) == whole
         with pytest.raises(BagError):
             McapReader().summarize(path)
+
+    def test_a_bag_that_left_the_cache_has_the_same_messages_and_summary(
+        self, tmp_path: Path
+    ) -> None:
+        path = write_mcap(tmp_path / "a.mcap", chatter(20), SMALL)
+        bags = bag_file.McapBags()
+        summary = bags.summarize(path)
+        bags.indexes = ByteLru(1 << 20)
+        found = bags.records(path, ["/chatter"], EVERYTHING, newest_first=False)
+        assert [*found] == read(McapReader(), path)
+        assert bags.summarize(path) == summary
 
 
 def read_on(

@@ -89,6 +89,7 @@ _LARGE_BYTES: Final = 8 << 20
 _REASONS_BYTES: Final = 1 << 20
 _VERIFIED_BYTES: Final = 32 << 20
 """Chunks that take more, together, are not read only to verify their message indexes."""
+_MOST_SOUND: Final = 100_000
 _NEXT_BUT_ONE: Final = 2
 _EVERYTHING: Final = TimeWindow.everything()
 
@@ -126,6 +127,8 @@ class McapBags:
         self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 2)
         self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
         self.contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
+        # By the hashes of their keys: to fill a store each file of a history is read twice.
+        self.sound: set[int] = set()
 
     def closing(self, path: Path) -> Closing:
         """Returns whether the writer has finished the file."""
@@ -135,7 +138,7 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
-            index = _Reading(self, file).verified()
+            index = _Reading(self, file, has_totals=True).verified()
         return summarize_channels(
             index.channels,
             index.totals,
@@ -192,18 +195,20 @@ class _Reading:
         file: OpenFile,
         topics: Collection[str] = (),
         window: TimeWindow = _EVERYTHING,
+        *,
+        has_totals: bool = False,
     ) -> None:
         self._bags = bags
         self._file = file
         self._topics = topics
         self._window = window
         self._uncompressed = partial(uncompressed_payload, limit=bags.limit)
-        self.index = self._known_index()
+        self.index = self._known_index(has_totals=has_totals)
 
-    def _known_index(self) -> McapIndex:
-        file, limit = self._file, self._bags.limit
+    def _known_index(self, *, has_totals: bool) -> McapIndex:
+        file, limit, sound = self._file, self._bags.limit, self._bags.sound
         index = self._bags.indexes.get(file.key)
-        if isinstance(index, McapIndex):
+        if isinstance(index, McapIndex) and (index.totals or not has_totals):
             return index
         reason = self._bags.contradictions.get(file.key)
         if reason is not None:
@@ -211,7 +216,10 @@ class _Reading:
         if not is_finished(file):
             return self._remembered(index_by_scan(file, limit))
         try:
-            index = index_from_summary(file)
+            index = index_from_summary(file, is_sound=not has_totals and hash(file.key) in sound)
+            if len(sound) >= _MOST_SOUND:
+                sound.clear()
+            sound.add(hash(file.key))
         except DoubtError as doubt:
             index = index_by_scan(file, limit, str(doubt))
         except UnreadableError as error:
@@ -323,10 +331,11 @@ class _Reading:
     @property
     def _wanted(self) -> dict[int, Channel]:
         """The channels of the topics that have messages."""
+        used = self.index.used
         return {
             number: channel
             for number, channel in self.index.channels.items()
-            if channel.topic in self._topics and number in self.index.totals
+            if channel.topic in self._topics and number in used
         }
 
     def _batches(

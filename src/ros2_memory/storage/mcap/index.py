@@ -211,7 +211,7 @@ class McapIndex(NamedTuple):
         channels: the channels by their number in the file.
         channel_bytes: memory that the channels take which no other file shares.
         chunks: the chunks with messages, in file order.
-        totals: the messages of each channel that has some.
+        totals: the messages of each channel that has some; none where they were not asked for.
         loose: the messages outside chunks; their offsets are in the file.
         complete: whether the writer finished the file.
         notes: sentences on what is missing or wrong.
@@ -238,6 +238,12 @@ class McapIndex(NamedTuple):
     seams: tuple[Seam, ...] = ()
     contradiction: str = ""
     declared: Declarations | None = None
+
+    @property
+    def used(self) -> frozenset[int]:
+        """The channels that have messages."""
+        of_chunks = {chunk.channels for chunk in self.chunks}
+        return frozenset(self.loose.channels.tolist()).union(*of_chunks)
 
     @property
     def memory_bytes(self) -> int:
@@ -381,8 +387,10 @@ def chunk_data(file: OpenFile, chunk: Chunk, limit: SizeLimit) -> bytes:
     return decompressed_chunk(head, compressed, limit)
 
 
-def index_from_summary(file: OpenFile) -> McapIndex:
+def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
     """Returns the index that the summary section and the message indexes give.
+
+    Of a file that was found sound before, without what its messages amount to.
 
     Raises:
         DoubtError: the summary section is missing or unreliable; the file must be scanned.
@@ -394,7 +402,7 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         raise
     except Exception as error:
         raise DoubtError(f"its summary section is not used ({reason_of(error)})") from error
-    if not index.chunks:
+    if is_sound or not index.chunks:
         return index
     contents = Contents()
     with as_unreadable():
@@ -411,7 +419,6 @@ def index_from_summary(file: OpenFile) -> McapIndex:
         set_back=contents.back,
         pauses=contents.pauses,
         absences=contents.absences,
-        seams=_seams(index.chunks),
     )
 
 
@@ -438,7 +445,9 @@ def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
     index_length = sum([chunk.index_length for chunk in filled])
     if index_bytes(indexes, stated.message_count) != index_length:
         raise DoubtError("its message indexes do not hold what its statistics state")
-    return McapIndex(channels, channel_bytes, tuple(filled), {}, declared=declared), stated
+    seams = _seams(filled)
+    index = McapIndex(channels, channel_bytes, tuple(filled), {}, seams=seams, declared=declared)
+    return index, stated
 
 
 def _require_chunks_as_indexed(file: OpenFile, end: int, chunks: Sequence[Chunk]) -> None:
