@@ -205,8 +205,14 @@ def test_what_is_no_number_is_on_no_side(value: JsonValue) -> None:
 def test_near_is_within_the_tolerance_in_the_plane(
     x: float, y: float, tolerance_m: float, px: float, py: float
 ) -> None:
+    distance_m = math.dist((x, y), (px, py))
+    assume(abs(distance_m - tolerance_m) > 1e-12 * max(distance_m, 1.0))
     near = Condition(NearPosition(x, y, None, tolerance_m)).matches({"x": px, "y": py, "z": 1e6})
-    assert near == (math.dist((x, y), (px, py)) <= tolerance_m)
+    assert near == (distance_m < tolerance_m)
+
+
+def test_a_position_at_the_tolerance_is_near() -> None:
+    assert Condition(NearPosition(1.0, 2.0, None, 5.0)).matches({"x": 4.0, "y": 6.0})
 
 
 ONE_TWO, OTHER = {"x": 1.0, "y": 2.0}, {"x": 9.0, "y": 9.0}
