@@ -13,6 +13,7 @@ are of one robot, so a reply that uses borrowed transforms has to note it.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from functools import cached_property
 from itertools import chain, combinations
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -32,13 +33,21 @@ from ros2_memory.core.model import FrameEdge, StampedTransform, TimeWindow
 from ros2_memory.core.text import Reason
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.history.context import READING_S, Note
-from ros2_memory.history.scan import messages_of, of_columns, remembered, scan
+from ros2_memory.history.scan import (
+    joined_back,
+    messages_of,
+    of_columns,
+    open_scan,
+    remembered,
+    scan,
+)
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.columns.scan import Scan, Stretch
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.history.view import View
@@ -49,6 +58,8 @@ Session: TypeAlias = frozenset[str]
 
 _AROUND_NS: Final[Ns] = 10 * NS_PER_S
 """A recording covers a moment if one of its bags is this near: the length of tf2's cache."""
+_FEW_SESSIONS: Final = 4
+"""Sessions of which static transforms are looked up one by one."""
 _UNDECODED: Final = Reason("could not be decoded", "topic", of="messages of ")
 
 
@@ -322,29 +333,55 @@ class Sessions:
         Raises:
             QueryTimeoutError: the call's time is over.
         """
-        view, cache = self._view, self._view.memory.scanner.caches.statics
-        if session in self._static:
-            return self._static[session]
-        key = (session, view.static_topics)
-        timeline, static = cache.get(key) or (None, ())
-        if timeline is not view.timeline:
+        view, caches = self._view, self._view.memory.scanner.caches
+        if session not in self._static:
+            key = (session, view.static_topics)
+            timeline, static = caches.statics.get(key) or (None, ())
+            if timeline is view.timeline:
+                self._static[session] = static
+            elif len(self._static) == _FEW_SESSIONS:
+                # Who has asked for so many asks for more.
+                self._find_all_static()
+        if session not in self._static:
             before = view.notes.added
             static = _without_repeats(
                 transform
                 for topic in view.static_topics
                 for transform in self._static_received(topic, session)
             )
+            self._static[session] = static
             # What was noted must be noted in each answer.
             if view.notes.added == before and not view.call.used_active:
-                cache.put(key, (view.timeline, static), 1000 + 600 * len(static))
-        self._static[session] = static
-        return static
+                caches.statics.put(key, (view.timeline, static), 1000 + 600 * len(static))
+        return self._static[session]
+
+    def _find_all_static(self) -> None:
+        """Finds the static transforms of all sessions that are stored, unless some are carried."""
+        view = self._view
+        coverage = view.memory.scanner.coverage(view.timeline)
+        recordings = chain.from_iterable(map(view.timeline.recordings, view.static_topics))
+        if coverage is None or any(map(self.holds_carried, recordings)):
+            return
+        received: dict[Session, list[StampedTransform]] = defaultdict(list)
+        for statics in self.static_back(TimeWindow.everything()):
+            received[self.of(view.bag_dir / statics.recording)] += statics.transforms
+        for session in {self.of(bag.recording) for bag in coverage.missing}:
+            received.pop(session, None)
+        for session, transforms in received.items():
+            self._static[session] = _without_repeats(transforms)
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
         """Yields the static transforms of the parts in a window, of bags that are stored."""
         for topic in self._view.static_topics:
-            for rows in scan(self._view, topic, window, copies=True, stored=True):
-                yield self._static_changes(rows)
+            opened = open_scan(self._view, topic, window, copies=True, stored=True)
+
+            def make(stretch: Stretch, opened: Scan = opened) -> Iterator[tuple[Ns, Statics]]:
+                for rows in opened.rows(newest_first=True, among=stretch.window):
+                    if stretch.window.contains(max(rows.first, window.start)):
+                        yield rows.first, self._static_changes(rows)
+
+            for _, statics in joined_back(self._view, opened, STATICS, make):
+                yield statics
 
     def _static_received(self, topic: str, session: Session) -> Iterator[StampedTransform]:
         """Yields static transforms of a topic; of equal ones that follow in a part the first."""

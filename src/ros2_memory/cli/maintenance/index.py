@@ -115,8 +115,8 @@ def _fill_for_server(settings: Settings, server: int) -> None:
 
 
 def _cache_mb(settings: Settings) -> int:
-    """Returns what a cache may take (MiB): more than a server's, for ten minutes at a time."""
-    return min(_CACHE_MB, 3 * settings.reader.chunk_cache_mb)
+    """Returns what a cache may take, in MiB: of ten minutes at a time all is read together."""
+    return min(_CACHE_MB, settings.reader.chunk_cache_mb)
 
 
 def _filled(backfill: Backfill, show: Callable[[Progress], None] = lambda _: None) -> Progress:
