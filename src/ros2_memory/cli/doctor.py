@@ -296,7 +296,7 @@ def check_bags(robot: Examined) -> Iterator[Finding]:
 def _faults(
     memory: Memory, snapshot: Snapshot, covered: DataTimeRange, *, is_recording: bool
 ) -> Iterator[tuple[str, str, str, str]]:
-    """Yields of each fault a noun, what is wrong, what to do, and the name of what has it."""
+    """Yields what has a fault (a file, bag or topic), what it is, what to do, and a name."""
     for bag in covered.unread:
         yield "file", "not read", bag.reason, bag.path.name
     for state, files in (("damaged", covered.damaged), ("unfinished", covered.incomplete)):

@@ -57,7 +57,7 @@ class Scored(NamedTuple):
     scores: tuple[Leaf, ...]
 
     def read(self, values: Values) -> NamedScores:
-        """Returns the names and scores of all; raises `UnknownShapeError` where not held."""
+        """Returns the names and scores of all; raises `UnknownShapeError` without columns."""
         name, *fallbacks = (_names(values, leaf) for leaf in self.labels)
         for fallback in fallbacks:
             name = or_else(name, fallback, blank=True)
@@ -127,7 +127,7 @@ class Labels(NamedTuple):
         """Returns what names the objects, and its positions in the level of `scored`.
 
         Raises:
-            UnknownShapeError: it is not held, or rounded so that another hypothesis may be best.
+            UnknownShapeError: columns lack it, or rounding may make another hypothesis the best.
         """
         named = self.scored.read(values)
         if not self.is_best:
@@ -316,7 +316,7 @@ def _points(fields: dict[str, Node]) -> tuple[Point, ...] | None:
 
 
 def may_be_json(values: Values, texts: Iterable[Leaf]) -> bool:
-    """Returns whether one of these texts looks like JSON, or is not held."""
+    """Returns whether one of these texts looks like JSON, or is not in the columns."""
     try:
         return any(looks_like_json(word) for leaf in texts for word in values.texts(leaf).words)
     except UnknownShapeError:

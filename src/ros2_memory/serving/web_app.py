@@ -62,8 +62,8 @@ def _recording(report: JsonObject, *, all_of_it: bool) -> JSONResponse:
     `recording.exclude_when` cannot be evaluated: nothing is served then of what is recorded, or it
     is served against the rule. Other topics that are offered and not recorded are in `degraded`.
     """
-    told = report.get("recorder")
-    recorder = told if isinstance(told, dict) else {}
+    reported = report.get("recorder")
+    recorder = reported if isinstance(reported, dict) else {}
     faults = {key: recorder.get(key) or [] for key in ("failing_rules", "required_missing")}
     is_live, state = recorder.get("live", False), recorder.get("state")
     recording = is_live is True and state == "recording" and not any(faults.values())
