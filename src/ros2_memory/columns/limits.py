@@ -1,4 +1,4 @@
-"""For which rows of a table, and elements of its lists, something stands in the extracted value."""
+"""In which rows of a table, and elements of its lists, the extracted value has a field."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class TruthValues(NamedTuple):
-    """Of some rows or elements: where something surely stands, and where it may stand."""
+    """Of some rows or elements: which surely have a field, and which may have it."""
 
     surely: Mask
     perhaps: Mask
 
     @classmethod
     def known(cls, stands: Mask) -> TruthValues:
-        """Returns that it stands there and nowhere else."""
+        """Returns that these have it and no others."""
         return cls(stands, stands)
 
     @property
     def unsure(self) -> Mask:
-        """Where it may stand or not."""
+        """Which may have it or not."""
         return self.perhaps & ~self.surely
 
     @property
@@ -37,7 +37,7 @@ class TruthValues(NamedTuple):
 
     @property
     def is_none(self) -> bool:
-        """Whether it stands nowhere."""
+        """Whether none has it."""
         return not self.perhaps.any()
 
 
@@ -52,11 +52,11 @@ def unknown(size: int) -> TruthValues:
 
 
 class Limit(NamedTuple):
-    """For which rows or elements of a level something stands in the value.
+    """Which rows or elements of a level have a field in the extracted value.
 
     Attributes:
         level: the level that it is about.
-        find: returns where it stands, for some rows or elements of the level; may raise
+        find: returns which of some rows or elements of the level have it; may raise
             `UnknownShapeError`.
     """
 
@@ -64,7 +64,7 @@ class Limit(NamedTuple):
     find: Callable[[Values, Ints], TruthValues]
 
     def kept(self, values: Values, positions: Ints) -> TruthValues:
-        """Returns where it stands, for some rows or elements of the level."""
+        """Returns which of some rows or elements of the level have it."""
         try:
             return self.find(values, positions)
         except UnknownShapeError:
@@ -115,14 +115,14 @@ def where_longer(level: Level, sequence: str, count: int, *, is_longer: bool) ->
 def placed(
     values: Values, level: Level, positions: Ints, limits: Sequence[Limit], *, surely: bool
 ) -> tuple[Ints, Ints]:
-    """Returns which of some rows or elements stand in the value, and the row of each.
+    """Returns which of some rows or elements have a field, and the row of each.
 
     Args:
         values: of the table.
         level: of the rows or elements.
         positions: their positions.
-        limits: on what stands there.
-        surely: whether those that may or may not stand there are left out.
+        limits: on which have it.
+        surely: whether those that may have it or not are left out.
     """
     current, kept, owners = level, positions, positions
     while True:

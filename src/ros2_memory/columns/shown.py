@@ -395,7 +395,7 @@ def leaves_of(node: Node, *, in_objects: bool = True) -> list[Leaf]:
 
 
 def narrowed(node: Node, limit: Limit) -> Node:
-    """Returns a node that stands in the value of some rows or elements alone."""
+    """Returns a node that only some rows or elements have."""
     return _changed(node, lambda leaf: leaf._replace(limits=(*leaf.limits, limit)))
 
 

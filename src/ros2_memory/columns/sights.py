@@ -109,7 +109,7 @@ def joined(
     for at in _IN_SLICES:
         tables[at][0], number = np.split(number, [tables[at].shape[1]])
     spots, looks, hits, scores, beside, unplaced, fixes = tables
-    tables.clear()  # what is ordered takes the place of what is not
+    tables.clear()  # frees each when it is ordered
     spots, place = _ordered(spots, 3)
     for table in (hits, scores, beside):
         table[0] = place[table[0]]

@@ -111,7 +111,7 @@ class Leaf(NamedTuple):
         conversion: how its value comes out of the sources.
         json_depth: of a text that may be JSON, how deep detections of a low score are looked for in
             it; 0 for not at all.
-        limits: for which rows or elements it stands in the value.
+        limits: which rows or elements have it in the extracted value.
     """
 
     level: Level

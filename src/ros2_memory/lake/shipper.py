@@ -193,7 +193,7 @@ class Shipper:
             done.problems.append(f"{file}; nothing of this robot is shipped {why}")
             return False
         new = [tombstone for tombstone in wanted if tombstone not in self.tombstones]
-        # First: of what is written down only the lake's part is done again after a kill.
+        # Before the tombstone: after a kill it repeats the deletion in the lake, not this one.
         done.problems += robot.forget([tombstone.window for tombstone in new])
         for tombstone in new:
             append_tombstone(self.lake.location.state_dir, tombstone, done=False)

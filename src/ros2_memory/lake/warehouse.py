@@ -294,55 +294,28 @@ def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:
 
 @contextmanager
 def writing_alone(state_dir: Path) -> Iterator[None]:
-    """Holds the lock of a lake.
+    """Holds the lock of a lake, whose file names this process.
 
     Raises:
         LakeError: another process holds it, which the sentence names; or nothing can be locked.
     """
-    with _locked(state_dir, fcntl.LOCK_EX) as holder:
-        if holder is not None:
-            do = "a lake has one writer: stop that process first"
-            raise LakeError(f"{holder} writes into this lake; {do}")
-        yield
-
-
-def holder_of(state_dir: Path) -> str | None:
-    """Returns who holds the lock of a lake; None where nobody does. Writes nothing.
-
-    Raises:
-        LakeError: that cannot be found out.
-    """
-    if not (state_dir / _LOCK_FILE).exists():
-        return None
-    with _locked(state_dir, fcntl.LOCK_SH) as holder:
-        return holder
-
-
-@contextmanager
-def _locked(state_dir: Path, lock: int) -> Iterator[str | None]:
-    """Locks the file, if nobody else has; yields who has. Who writes is named in it.
-
-    Raises:
-        LakeError: it cannot be opened or locked.
-    """
-    path, holder, writes = state_dir / _LOCK_FILE, None, lock == fcntl.LOCK_EX
-    flags = os.O_RDWR | os.O_CREAT if writes else os.O_RDONLY
+    path, flags = state_dir / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
     with ExitStack() as opened:
         try:
-            if writes:
-                state_dir.mkdir(parents=True, exist_ok=True)
-            descriptor = os.open(path, flags | os.O_CLOEXEC | os.O_NOFOLLOW, 0o644)
+            state_dir.mkdir(parents=True, exist_ok=True)
+            descriptor = os.open(path, flags, 0o644)
             opened.callback(os.close, descriptor)
-            fcntl.flock(descriptor, lock | fcntl.LOCK_NB)
-            if writes:
-                write_holder(descriptor)
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            write_holder(descriptor)
         except BlockingIOError:
             pid, host = read_holder(descriptor)
             holder = "another process" if pid is None else f"process {pid} on {host}"
+            do = "a lake has one writer: stop that process first"
+            raise LakeError(f"{holder} writes into this lake; {do}") from None
         except OSError as error:
             do = "lake.state_dir must be on a file system that supports locks"
             raise LakeError(f"{path} cannot be opened or locked: {error.strerror}; {do}") from error
-        yield holder
+        yield
 
 
 def _owner_in(store: FileIO, path: str) -> dict[str, object]:

@@ -384,7 +384,7 @@ class Dispatcher:
 
 
 def _with_wait(waited_s: float) -> str:
-    """Returns what the error of a timeout says of a wait for its turn; nothing if it was short."""
+    """Returns how long a call waited for its turn, for the error of a timeout; "" if not long."""
     if waited_s < _REPORTED_WAIT_S:
         return ""
     return f" (it waited {waited_s:.1f} s of its time behind other calls)"
