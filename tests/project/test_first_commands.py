@@ -92,7 +92,7 @@ def test_readmes_first_line_works_where_the_distribution_manages_python(
     assert "externally-managed-environment" in refused.stderr
     done = ran(f"{FIRST[0]} --once --port 0", clone, programs)
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "15 of 15 answers are right" in done.stdout
+    assert re.search(r"^(\d+) of \1 answers are right", done.stdout, re.MULTILINE)
 
 
 def older_python(folder: Path) -> Path:
