@@ -216,7 +216,9 @@ RobotName: TypeAlias = Annotated[Text, AfterValidator(_robot_name)]
 @dataclass_transform(frozen_default=True, kw_only_default=True, field_specifiers=(Field,))
 def section(model: type[_T]) -> type[_T]:
     """Makes a class plain frozen data, whose values are checked; unknown keys are refused."""
-    checked = dataclass(frozen=True, slots=True, kw_only=True, config=ConfigDict(extra="forbid"))
+    checked = dataclass(
+        frozen=True, slots=True, kw_only=True, config=ConfigDict(extra="forbid", defer_build=True)
+    )
     return cast("type[_T]", checked(model))
 
 

@@ -156,18 +156,19 @@ def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     """
     topics = len(summaries[0].schema.topics)
     stored = [summary._numbers for summary in summaries]
-    size = _BASE.size + topics * (_COUNT_BYTES + 2 * _TIME_BYTES)
-    if any(len(numbers) != size for numbers in stored):
+    step = _COUNT_BYTES + 2 * _TIME_BYTES
+    size = _BASE.size + topics * step
+    if {*map(len, stored)} != {size}:
         whole = b"".join([summary.numbers for summary in summaries])
         return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
-    packed = np.frombuffer(b"".join(stored), np.uint8).reshape(-1, size)
-    base = np.ascontiguousarray(packed[:, : _BASE.size]).view("<i8")
-    fields = packed[:, _BASE.size :].reshape(len(stored), topics, -1)
-    wide = np.zeros((len(stored), topics, 3, 8), np.uint8)
-    wide[:, :, 0, :_COUNT_BYTES] = fields[:, :, :_COUNT_BYTES]
-    wide[:, :, 1:, :_TIME_BYTES] = fields[:, :, _COUNT_BYTES:].reshape(len(stored), topics, 2, -1)
-    numbers: IntArray = wide.view("<i8")[:, :, :, 0]
-    numbers[:, :, 1:] += base[:, :, None]
+    packed = b"".join(stored)
+    base = np.ndarray((len(stored), 1, 1), "<i8", packed, 0, (size, 0, 0))
+    # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
+    shape, strides = (len(stored), topics, 2), (size, step, _TIME_BYTES)
+    pairs = np.ndarray(shape, "<u8", packed, _BASE.size, strides)
+    numbers: IntArray = np.empty((len(stored), topics, 3), np.int64)
+    numbers[:, :, 0] = pairs[:, :, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
+    numbers[:, :, 1:] = base + (pairs >> 8 * _COUNT_BYTES).astype(np.int64)
     return numbers
 
 

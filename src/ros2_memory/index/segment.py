@@ -6,21 +6,26 @@ A query looks at few topics of many bags, so the numbers of their summaries are 
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from functools import cached_property, lru_cache, reduce
 from itertools import chain
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
-from ros2_memory.bag_dir.layout import is_carried, is_thinned
+from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import Pause, pauses_between
-from ros2_memory.index.split_order import Series, SplitRange, StepBack, split_ranges_of
+from ros2_memory.index.split_order import (
+    Series,
+    SplitNames,
+    SplitRange,
+    StepBack,
+    split_names_of,
+    split_ranges_of,
+)
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -37,8 +42,8 @@ _JITTER_NS: Final[Ns] = 50 * NS_PER_MS
 _FEW_MESSAGES: Final = 5
 """Fewer have no usual spacing: a map may be published twice when its node starts."""
 
-_CACHED_SEGMENTS: Final = 320
-"""A week of splits has some 260: 16 MB of eleven topics. Of one more than fit, none would stay."""
+_CACHED_SEGMENTS: Final = 80
+"""A week of splits has some 60: 16 MB of eleven topics. Of one more than fit, none would stay."""
 
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
@@ -48,6 +53,8 @@ _LOGS: Final = FOXGLOVE_LOGS | {"rcl_interfaces/msg/Log", "rcl_interfaces/Log"}
 _FEWEST: Final = 3
 """A bag with fewer messages of a topic shows no period."""
 _PER_OCTAVE: Final = 2
+_OCTAVES: Final = 64 * _PER_OCTAVE
+"""A period of 64 bits is in one of so many parts of octaves."""
 
 _Times: TypeAlias = "NDArray[np.int64]"
 
@@ -135,32 +142,39 @@ class Segment:
         self._known_recordings: dict[str, dict[Path, TopicTotals]] = {}
 
     @cached_property
-    def latest(self) -> Ns:
-        """Log time of the last message in any of the bags."""
-        return max([bag.end for bag in self.bags])
+    def starts(self) -> NDArray[np.int64]:
+        """Log time of the first message in each bag."""
+        return np.array([bag.start for bag in self.bags], np.int64)
 
     @cached_property
-    def _reaches(self) -> NDArray[np.int64]:
-        """Log time of the last message in each bag or in one before it."""
-        return np.maximum.accumulate([bag.end for bag in self.bags])
+    def ends(self) -> NDArray[np.int64]:
+        """Log time of the last message in each bag."""
+        return np.array([bag.end for bag in self.bags], np.int64)
+
+    @cached_property
+    def latest(self) -> Ns:
+        """Log time of the last message in any of the bags."""
+        return int(self.ends.max())
 
     def overlapping(self, window: TimeWindow) -> list[BagFile]:
         """Returns the bags whose span overlaps a window, in order."""
-        begin = int(self._reaches.searchsorted(window.start))
-        end = bisect_left(self.bags, window.stop, key=attrgetter("start"))
-        return [bag for bag in self.bags[begin:end] if bag.end >= window.start]
+        is_inside = (self.starts < window.stop) & (self.ends >= window.start)
+        return [self.bags[row] for row in np.flatnonzero(is_inside).tolist()]
 
     @cached_property
     def recorded(self) -> Segment | None:
         """The bags without that of carried messages: mostly itself; None where no other is left."""
-        return self._without(is_carried)
+        return self._without(is_carried, CARRY_FOLDER)
 
     @cached_property
     def unthinned(self) -> Segment | None:
         """The bags that have every message that was recorded; itself where all do."""
-        return self._without(is_thinned)
+        return self._without(is_thinned, MEMORY_FOLDER)
 
-    def _without(self, is_left_out: Callable[[str], bool]) -> Segment | None:
+    def _without(self, is_left_out: Callable[[str], bool], name: str) -> Segment | None:
+        """Returns the bags but for some that lie in a folder of a name, if they are there."""
+        if not any(f"/{folder}".endswith(f"/{name}") for folder in self.folders):
+            return self
         rest = [bag for bag in self.bags if not is_left_out(bag.file)]
         if len(rest) == len(self.bags):
             return self
@@ -175,9 +189,15 @@ class Segment:
     @cached_property
     def _numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
         """The folders of the bags, and for each bag the position of its folder among them."""
+        series, positions, _ = self.split_names
         number_of: dict[str, int] = {}
-        numbers = [number_of.setdefault(folder_of(bag), len(number_of)) for bag in self.bags]
-        return [*number_of], np.array(numbers, np.uint16)
+        numbers = [number_of.setdefault(_folder_of(path), len(number_of)) for path in series]
+        return [*number_of], np.array(numbers, np.uint16)[positions]
+
+    @cached_property
+    def split_names(self) -> SplitNames:
+        """What the names of the bags say."""
+        return split_names_of(self.bags)
 
     @cached_property
     def folders(self) -> frozenset[str]:
@@ -189,9 +209,8 @@ class Segment:
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
         folders, numbers = self._numbered_folders
-        firsts = [bag.start for bag in self.bags]
-        lasts = [bag.end for bag in self.bags]
-        return dict(zip(folders, _spans_of(len(folders), numbers, firsts, lasts), strict=True))
+        spans = _spans_of(len(folders), numbers, self.starts, self.ends)
+        return dict(zip(folders, spans, strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
@@ -205,7 +224,7 @@ class Segment:
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
         """Which splits of each recording are among the bags, by their number."""
-        return split_ranges_of(self.bags)
+        return split_ranges_of(self)
 
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
@@ -221,14 +240,20 @@ class Segment:
         """Where the clock was set back within a bag."""
         return tuple(
             StepBack(bag, bag, back[0])
-            for bag in self.bags
+            for bag in self._bags_with("set_back")
             if (back := bag.summary.schema.set_back) is not None
         )
 
     @cached_property
-    def _schemas(self) -> tuple[SummarySchema, ...]:
+    def schemas(self) -> tuple[SummarySchema, ...]:
         """The different schemas of the summaries; mostly one."""
-        return tuple({id(bag.summary.schema): bag.summary.schema for bag in self.bags}.values())
+        schemas = [bag.summary.schema for bag in self.bags]
+        return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
+
+    def _bags_with(self, name: str) -> list[BagFile]:
+        """Returns the bags of whose schemas an attribute is not empty: mostly none."""
+        odd = {id(schema) for schema in self.schemas if getattr(schema, name)}
+        return [bag for bag in self.bags if id(bag.summary.schema) in odd] if odd else []
 
     @cached_property
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
@@ -302,7 +327,7 @@ class Segment:
     def types(self) -> dict[str, frozenset[str]]:
         """By topic, the types of its messages."""
         types: dict[str, set[str]] = {}
-        for schema in self._schemas:
+        for schema in self.schemas:
             for header in schema.topics:
                 types.setdefault(header.topic, set()).add(header.type)
         return {topic: frozenset(names) for topic, names in types.items()}
@@ -311,7 +336,7 @@ class Segment:
     def transient_local(self) -> frozenset[str]:
         """The topics that some publisher offered as transient local."""
         return frozenset(
-            header.topic for schema in self._schemas for header in schema.topics if header.latched
+            header.topic for schema in self.schemas for header in schema.topics if header.latched
         )
 
     @cached_property
@@ -320,10 +345,11 @@ class Segment:
         columns = _topic_columns(self)
         topics = sorted(columns.topics)
         numbers = columns.of_all(topics)
-        lengths = (numbers[:, :, 0] > 0) @ np.array([bag.end - bag.start for bag in self.bags])
+        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)
         # Between absences a bag is as many: what follows each comes behind all bags.
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
-        for row, bag in enumerate(self.bags):
+        has_absences = bool(self._bags_with("absences"))
+        for row, bag in enumerate(self.bags if has_absences else ()):
             for topic, pauses in bag.summary.schema.absences:
                 nth = topics.index(topic)
                 count, _, last = numbers[nth, row].tolist()
@@ -341,7 +367,7 @@ class Segment:
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
         """Which topics the bags hold together, each combination once."""
-        return frozenset(frozenset(schema.positions) for schema in self._schemas)
+        return frozenset(frozenset(schema.positions) for schema in self.schemas)
 
     @cached_property
     def pauses(self) -> tuple[Pause, ...]:
@@ -353,14 +379,14 @@ class Segment:
         """The pauses of each bag; other bags may have messages in them."""
         return tuple(
             Pause(start, end, (bag,), ran_on=not is_thinned(bag.file))
-            for bag in self.bags
+            for bag in self._bags_with("pauses")
             for start, end in bag.summary.schema.pauses
         )
 
     @cached_property
     def silent(self) -> frozenset[str]:
         """The topics that some bag declares without a message."""
-        return frozenset(chain.from_iterable(schema.silent for schema in self._schemas))
+        return frozenset(chain.from_iterable(schema.silent for schema in self.schemas))
 
 
 def is_log(type_name: str) -> bool:
@@ -385,8 +411,8 @@ def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, N
 def _spans_of(
     folders: int,
     numbers: NDArray[np.uint16],
-    firsts: Sequence[Ns] | _Times,
-    lasts: Sequence[Ns] | _Times,
+    firsts: _Times,
+    lasts: _Times,
 ) -> list[Span]:
     """Returns the span of each folder; of each row there are its folder's number, and its span."""
     starts, ends = np.full(folders, MAX_NS), np.full(folders, MIN_NS)
@@ -397,7 +423,11 @@ def _spans_of(
 
 def folder_of(bag: BagFile) -> str:
     """Returns the folder of a bag: that of its recording, as a string."""
-    return bag.file[: bag.file.rfind("/")]
+    return _folder_of(bag.file)
+
+
+def _folder_of(path: str) -> str:
+    return path[: path.rfind("/")]
 
 
 class _TopicColumns:
@@ -408,18 +438,17 @@ class _TopicColumns:
         numbers: by header and bag the count, 0 where it has none, the first and the last time.
     """
 
-    def __init__(self, bags: Sequence[BagFile]) -> None:
-        by_schema: dict[int, list[int]] = {}
-        for row, bag in enumerate(bags):
-            by_schema.setdefault(id(bag.summary.schema), []).append(row)
-        schemas = [bags[rows[0]].summary.schema for rows in by_schema.values()]
+    def __init__(self, bags: Sequence[BagFile], schemas: Sequence[SummarySchema]) -> None:
         headers = dict.fromkeys(chain.from_iterable(schema.topics for schema in schemas))
         header_rows = {header: row for row, header in enumerate(headers)}
         self.headers = tuple(headers)
         self.numbers = np.zeros((len(headers), len(bags), 3), np.int64)
-        for schema, rows in zip(schemas, by_schema.values(), strict=True):
-            headers_of_schema = [header_rows[header] for header in schema.topics]
-            numbers = numbers_of([bags[row].summary for row in rows])
+        summaries = [bag.summary for bag in bags]
+        schema_of = np.array([id(summary.schema) for summary in summaries])
+        for schema in schemas:
+            rows = np.flatnonzero(schema_of == id(schema))
+            headers_of_schema = np.array([header_rows[header] for header in schema.topics])
+            numbers = numbers_of([summaries[row] for row in rows.tolist()])
             self.numbers[np.ix_(headers_of_schema, rows)] = numbers.swapaxes(0, 1)
         self._all_bags = np.arange(len(bags))
         self._columns: dict[str, TopicColumn] = {}
@@ -464,7 +493,7 @@ class _TopicColumns:
 @lru_cache(maxsize=_CACHED_SEGMENTS)
 def _topic_columns(segment: Segment) -> _TopicColumns:
     """Returns the columns of a segment: a copy of its summaries, so few of a week are kept."""
-    return _TopicColumns(segment.bags)
+    return _TopicColumns(segment.bags, segment.schemas)
 
 
 def _activities(numbers: NDArray[np.int64], lengths: _Times) -> Iterator[Activity]:
@@ -500,10 +529,13 @@ def _spacings(counts: NDArray[np.int64], spans: NDArray[np.int64]) -> list[dict[
     topics, bags = np.nonzero((counts >= _FEWEST) & (spans > 0))
     spans, intervals = spans[topics, bags], counts[topics, bags] - 1
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
-    keys, nth = np.unique(topics << 32 | octaves, return_inverse=True)
-    sums = np.zeros((keys.size, 3), np.int64)
-    np.add.at(sums, nth, np.stack((np.ones_like(spans), spans, intervals), axis=1))
+    keys = topics * _OCTAVES + octaves
+    sums = np.zeros((3, len(counts) * _OCTAVES), np.int64)
+    for added, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
+        np.add.at(added, keys, values)
     spacings: list[dict[int, Spacing]] = [{} for _ in counts]
-    for key, spacing in zip(keys.tolist(), sums.tolist(), strict=True):
-        spacings[key >> 32][key & (1 << 32) - 1] = Spacing(*spacing)
+    there = np.flatnonzero(sums[0])
+    for key, spacing in zip(there.tolist(), sums[:, there].T.tolist(), strict=True):
+        topic, octave = divmod(key, _OCTAVES)
+        spacings[topic][octave] = Spacing(*spacing)
     return spacings

@@ -11,11 +11,16 @@ from itertools import chain, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
+import numpy as np
+
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.model import COMPRESSED
+from ros2_memory.core.timebase import MAX_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
@@ -65,6 +70,20 @@ class SplitName(NamedTuple):
     number: int
 
 
+class SplitNames(NamedTuple):
+    """What the names of some bags say.
+
+    Attributes:
+        series: the different ones, in order of the bags; of a name without a number the path.
+        positions: for each bag, where its series is among these.
+        numbers: of the bags in their series; -1 where the name has none.
+    """
+
+    series: Sequence[Series]
+    positions: NDArray[np.int64]
+    numbers: NDArray[np.int64]
+
+
 _BY_NUMBER: Final = attrgetter("number")
 
 
@@ -75,10 +94,33 @@ def stem_of(file: str) -> str:
 
 
 def split_of(file: str) -> SplitName | None:
-    """Returns the series of a bag file and its number there; None where its name has no number."""
+    """Returns the series of a bag file and its number there; None where its name has no number.
+
+    One of more than 64 bits is none.
+    """
     stem = stem_of(file)
     series = stem.rstrip("0123456789")
-    return None if series == stem else SplitName(series, int(stem[len(series) :]))
+    number = int(stem[len(series) :] or -1)
+    return SplitName(series, number) if 0 <= number <= MAX_NS else None
+
+
+def split_names_of(bags: Iterable[BagFile]) -> SplitNames:
+    """Returns what the names of bags say."""
+    position_of: dict[Series, int] = {}
+    rows: list[tuple[int, int]] = []
+    following, position, series, number, suffix = "", 0, "", 0, ""
+    for bag in bags:
+        # Mostly the bag after one is the next split.
+        if bag.file == following and number < MAX_NS:
+            number += 1
+        else:
+            series, number = split_of(bag.file) or (bag.file, -1)
+            suffix = bag.file[len(stem_of(bag.file)) :]
+            position = position_of.setdefault(series, len(position_of))
+        rows.append((position, number))
+        following = f"{series}{number + 1}{suffix}"
+    positions, numbers = np.array(rows, np.int64).reshape(-1, 2).T
+    return SplitNames([*position_of], positions, numbers)
 
 
 def is_recording(series: Series) -> bool:
@@ -87,12 +129,27 @@ def is_recording(series: Series) -> bool:
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
-def split_ranges_of(bags: Iterable[BagFile]) -> dict[Series, SplitRange]:
-    """Returns the range of each series among these bags."""
+def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
+    """Returns the range of each series among the bags of a segment."""
+    bags, (all_series, positions, numbers) = segment.bags, segment.split_names
+    order = np.lexsort((numbers, positions))
+    order = order[numbers[order] >= 0]
+    # Few splits begin before the one before them has ended.
+    late = np.flatnonzero(segment.ends[order[:-1]] > segment.starts[order[1:]])
+    edges = np.searchsorted(positions[order], np.arange(len(all_series) + 1))
+    late_edges = np.searchsorted(late, edges).tolist()
+
+    def split(at: int) -> Split:
+        return Split(int(numbers[order[at]]), bags[order[at]])
+
     ranges: dict[Series, SplitRange] = {}
-    for series, splits in _by_series(bags).items():
-        steps = _steps_between(splits) if is_recording(series) else []
-        ranges[series] = SplitRange(splits[0], splits[-1], tuple(steps))
+    for series, (begin, end), among in zip(
+        all_series, pairwise(edges.tolist()), pairwise(late_edges), strict=True
+    ):
+        if begin < end:
+            lates = late[slice(*among)].tolist() if is_recording(series) else ()
+            pairs = ((split(at), split(at + 1)) for at in lates if at + 1 < end)
+            ranges[series] = SplitRange(split(begin), split(end - 1), tuple(_steps_of(pairs)))
     return ranges
 
 
@@ -111,11 +168,10 @@ def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
         pairs = [*pairwise(ranges)]
         if all(earlier.last.number < later.first.number for earlier, later in pairs):
             steps.extend(chain.from_iterable(split_range.steps for split_range in ranges))
-            for earlier, later in pairs:
-                steps.extend(_steps_between((earlier.last, later.first)))
+            steps.extend(_steps_of((earlier.last, later.first) for earlier, later in pairs))
         else:
             bags = chain.from_iterable(segment.bags for segment in holding)
-            steps.extend(_steps_between(_by_series(bags)[series]))
+            steps.extend(_steps_of(pairwise(_splits_of(series, bags))))
     return steps
 
 
@@ -131,7 +187,7 @@ def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
         if split_range is not None:
             first, last, _ = split_range
             is_inside = first.number < number < last.number
-            splits += _by_series(segment.bags)[series] if is_inside else (first, last)
+            splits += _splits_of(series, segment.bags) if is_inside else (first, last)
     lower = (split for split in splits if split.number < number)
     higher = (split for split in splits if split.number > number)
     before = max(lower, key=_BY_NUMBER, default=None)
@@ -139,21 +195,16 @@ def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
     return Neighbours(before and before.bag.end, after and after.bag.start)
 
 
-def _by_series(bags: Iterable[BagFile]) -> dict[Series, list[Split]]:
-    """Returns the splits of each series among these bags, by number."""
-    by_series: dict[Series, list[Split]] = {}
-    for bag in bags:
-        name = split_of(bag.file)
-        if name is not None:
-            by_series.setdefault(name.series, []).append(Split(name.number, bag))
-    for splits in by_series.values():
-        splits.sort(key=_BY_NUMBER)
-    return by_series
+def _splits_of(series: Series, bags: Iterable[BagFile]) -> list[Split]:
+    """Returns the splits of a series among these bags, by number."""
+    named = ((split_of(bag.file), bag) for bag in bags if bag.file.startswith(series))
+    splits = [Split(name.number, bag) for name, bag in named if name and name.series == series]
+    return sorted(splits, key=_BY_NUMBER)
 
 
-def _steps_between(splits: Iterable[Split]) -> list[StepBack]:
-    return [
-        StepBack(earlier.bag, later.bag, earlier.bag.end - later.bag.start)
-        for earlier, later in pairwise(splits)
-        if earlier.number < later.number and earlier.bag.end - later.bag.start > OUT_OF_ORDER_NS
-    ]
+def _steps_of(pairs: Iterable[tuple[Split, Split]]) -> Iterator[StepBack]:
+    """Yields where the clock was set back between two splits that follow each other."""
+    for earlier, later in pairs:
+        by = earlier.bag.end - later.bag.start
+        if earlier.number < later.number and by > OUT_OF_ORDER_NS:
+            yield StepBack(earlier.bag, later.bag, by)

@@ -7,12 +7,10 @@ that changes is computed again.
 
 from __future__ import annotations
 
-import os
 from bisect import bisect_left, bisect_right
 from functools import cached_property, reduce
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
-from zlib import crc32
 
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.memo import Memo
@@ -38,11 +36,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-SEGMENT_BAGS: Final = 256
-"""The most bags in a segment: few enough to compute in a millisecond; a week has 240 segments."""
-_STARTS: Final = 1024
-"""One of so many bags begins a segment wherever it is. So the oldest bags may go, and a later
-process still has the segments of those that are left, but for the first few."""
+SEGMENT_BAGS: Final = 1024
+"""The most bags in a segment: few enough to compute in some milliseconds; a week has 60."""
 
 
 class Timeline:
@@ -105,13 +100,6 @@ class Timeline:
         begin = bisect_left(self._reaches, window.start)
         end = bisect_left(self._firsts, window.stop, key=lambda first: first[0])
         return self.segments[begin:end]
-
-    def is_settled(self, segment: Segment) -> bool:
-        """Returns whether a segment stays as it is while bags are added and the oldest deleted."""
-        if segment is self.segments[-1]:
-            return False
-        shrinks = segment is self.segments[0] and not _starts_segment(segment.bags[0])
-        return not shrinks or len(segment.bags) == SEGMENT_BAGS
 
     def totals(self, topic: str) -> dict[str, TopicTotals]:
         """Returns by type what all bags hold of a topic."""
@@ -290,12 +278,7 @@ def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:
     """Returns segments of bags given in any order."""
     runs: list[list[BagFile]] = []
     for bag in sorted(bags, key=in_time):
-        if not runs or len(runs[-1]) == SEGMENT_BAGS or _starts_segment(bag):
+        if not runs or len(runs[-1]) == SEGMENT_BAGS:
             runs.append([])
         runs[-1].append(bag)
     return [Segment(run) for run in runs]
-
-
-def _starts_segment(bag: BagFile) -> bool:
-    """Whether a bag begins a segment whatever comes before it: chosen evenly, by its name."""
-    return crc32(os.fsencode(bag.file[bag.file.rfind("/") + 1 :])) % _STARTS == 0

@@ -10,9 +10,7 @@ from hypothesis import strategies as st
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
-from ros2_memory.index.split_order import (
-    steps_of,
-)
+from ros2_memory.index.split_order import split_names_of, split_of, steps_of
 
 S = 10**9
 
@@ -55,3 +53,20 @@ def test_steps_are_those_between_neighbours_however_the_history_is_parted(
         if a.end - b.start > S
     ]
     assert sorted(steps(bags, size)) == sorted(expected)
+
+
+@given(
+    st.lists(
+        st.builds(
+            "{}{}{}".format,
+            st.sampled_from(("rec_", "rec_00", "other_", "rec", "")),
+            st.sampled_from((0, 1, 2, 8, 9, 10, 2**63 - 1, 2**63, "")),
+            st.sampled_from((".mcap", ".db3", ".mcap.zstd")),
+        )
+    )
+)
+def test_the_names_of_bags_say_together_what_each_says_alone(names: list[str]) -> None:
+    bags = [bag(name, 0, 1) for name in names]
+    series, positions, numbers = split_names_of(bags)
+    said = [(series[at], number) for at, number in zip(positions, numbers, strict=True)]
+    assert said == [split_of(bag.file) or (bag.file, -1) for bag in bags]
