@@ -85,7 +85,8 @@ MessageList: TypeAlias = "dict[str, dict[str, tuple[_MessageId, ...]]]"
 _Time: TypeAlias = Int64 | None
 # The keys of the file: those of times end in `_ns`.
 _KEYS: Final = ConfigDict(
-    alias_generator=lambda name: f"{name}_ns" if name.endswith(("_from", "_until")) else name
+    alias_generator=lambda name: f"{name}_ns" if name.endswith(("_from", "_until")) else name,
+    defer_build=True,
 )
 
 

@@ -17,7 +17,7 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple, TypeAlias
 
-from pydantic import AfterValidator, Field, TypeAdapter
+from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter
 
 from ros2_memory.bag_dir.durable_write import read_small_file, write_durably
 from ros2_memory.bag_dir.json_files import Count, Int64, parsed
@@ -92,6 +92,8 @@ class Heartbeat:
         state_bytes: how much of that is no recording: `.episodic` and logs.
         process: what tells the process from another of the same id (see `process_of`).
     """
+
+    __pydantic_config__ = ConfigDict(defer_build=True)
 
     pid: _Pid
     updated: Int64

@@ -192,9 +192,11 @@ def node_name(recording: str) -> str:
 def bag_kind(name: str) -> str | None:
     """Returns the suffix of a bag's file name, one of `BAG_KINDS`; None for others and hidden."""
     lowered = name.lower()
-    if not lowered.endswith(BAG_KINDS) or lowered.startswith("."):
-        return None
-    return next(kind for kind in BAG_KINDS if lowered.endswith(kind))
+    if not lowered.startswith("."):
+        for kind in BAG_KINDS:
+            if lowered.endswith(kind):
+                return kind
+    return None
 
 
 def bags_in(folder: Path) -> list[Path]:

@@ -107,7 +107,9 @@ class SaveRequest:
     `number` is its random id, `asked` the wall clock time of the request.
     """
 
-    __pydantic_config__ = ConfigDict(alias_generator=lambda name: _KEYS.get(name, name))
+    __pydantic_config__ = ConfigDict(
+        alias_generator=lambda name: _KEYS.get(name, name), defer_build=True
+    )
 
     number: _Number
     label: _Label
@@ -138,6 +140,8 @@ class SavedMoment:
     were not saved. By default nothing is saved yet. `rule` is the rule that asked for it, and
     `matches` how often that fired in it; None for a moment that was requested.
     """
+
+    __pydantic_config__ = ConfigDict(defer_build=True)
 
     request: _Request
     pending: StrictBool = True
@@ -265,6 +269,8 @@ class Outcome:
 
     `pending`: bags of it are still being written.
     """
+
+    __pydantic_config__ = ConfigDict(defer_build=True)
 
     moment: str | None = None
     bags: Count = 0

@@ -225,12 +225,12 @@ class ColumnStore(Database):
             )
             bags: dict[str, BagFile] = {}
             numbers: list[int] = []
+            closed, summary_of = BagState.CLOSED, BagSummary.decoded
             for path, size, mtime, schema, counts, first, last, sidecar, row in rows:
                 file = files.get(root + path)
                 if file is not None:
-                    summary = BagSummary.decoded(schemas[schema], counts)
-                    times = first, last, sidecar
-                    bags[file] = BagFile(file, size, mtime, BagState.CLOSED, summary, *times)
+                    summary = summary_of(schemas[schema], counts)
+                    bags[file] = BagFile(file, size, mtime, closed, summary, first, last, sidecar)
                     numbers.append(row)
             stored = np.array(numbers, np.int64)
             self._known = _Known(self._deletion(connection), (*bags.values(),), stored)
@@ -254,7 +254,8 @@ class ColumnStore(Database):
         rows: dict[int, int] = {}
         if known is not None and known.deletion == deletion:
             rows = dict(zip(map(id, known.bags), known.rows.tolist(), strict=True))
-        others = [bag for bag in bags if id(bag) not in rows]
+        found = [rows.get(id(bag)) for bag in bags]
+        others = [bag for bag, row in zip(bags, found, strict=True) if row is None]
         if others:
             keys = [(relative(bag.file, bag_dir), *_stamps(bag)) for bag in others]
             query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
@@ -263,11 +264,11 @@ class ColumnStore(Database):
                 query += " AND path IN (SELECT value FROM json_each(?))"
                 given.append(json.dumps([path for path, *_ in keys]))
             stored = self._asked(
-                lambda found: {row[1:]: row[0] for row in found}, dict[Key, int](), query, *given
+                lambda read: {row[1:]: row[0] for row in read}, dict[Key, int](), query, *given
             )
-            for bag, key in zip(others, keys, strict=True):
-                rows[id(bag)] = stored.get(key, -1)
-        return np.array([rows[id(bag)] for bag in bags], np.int64)
+            asked = (stored.get(key, -1) for key in keys)
+            found = [next(asked) if row is None else row for row in found]
+        return np.array(found, np.int64)
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""

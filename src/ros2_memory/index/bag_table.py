@@ -173,7 +173,7 @@ class BagTable:
     def _copies(self) -> tuple[BagFile, ...]:
         """Returns the bags that are copies of others in their folder; compares each once."""
         compared, self._compared = self._compared, {}
-        for pair in alike_among(self._timeline.bags):
+        for pair in alike_among(self._timeline):
             with suppress(OSError):
                 self._compared[pair] = compared[pair] if pair in compared else is_copy(*pair)
         return tuple(bag for (_, bag), is_same in self._compared.items() if is_same)
@@ -299,10 +299,10 @@ class BagTable:
         kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
         bags = []
-        for path, stamp in [*stamps.items()]:
-            bag = known.get(path)
+        for path, bag in known.items():
+            stamp = stamps.get(path)
             if (
-                bag is not None
+                stamp is not None
                 and stamp.is_of(bag)
                 and stamp.mtime_ns < last
                 and path.endswith(kinds)

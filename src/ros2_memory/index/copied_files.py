@@ -6,24 +6,28 @@ One of them counts. Messages of one folder are no copies of each other, so all w
 from __future__ import annotations
 
 import os
-from collections import Counter
 from typing import TYPE_CHECKING, Final
+
+import numpy as np
 
 from ros2_memory.index.segment import folder_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterator
 
     from ros2_memory.core.model import BagFile
+    from ros2_memory.index.timeline import Timeline
 
 _BLOCK_BYTES: Final = 64 << 10
 _BLOCKS: Final = 16
 
 
-def alike_among(bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, BagFile]]:
+def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
     """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
-    starts = Counter(bag.start for bag in bags)
-    suspects = [bag for bag in bags if starts[bag.start] > 1]
+    starts = timeline.starts
+    is_same = starts[1:] == starts[:-1]
+    rows = np.flatnonzero(np.append(is_same, False) | np.append(False, is_same))
+    suspects = [timeline.bags[row] for row in rows.tolist()]
     originals: dict[tuple[str, int, int, int], BagFile] = {}
     for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
         original = originals.setdefault((folder_of(bag), bag.size, bag.start, bag.end), bag)

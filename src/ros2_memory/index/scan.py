@@ -73,7 +73,11 @@ class Stamp(NamedTuple):
 
     def is_of(self, bag: BagFile) -> bool:
         """Returns whether a bag is as it was when it was read."""
-        return self.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
+        return (
+            self.mtime_ns == bag.mtime_ns
+            and self.size == bag.size
+            and self.sidecar_ns == bag.sidecar_ns
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,7 +347,7 @@ class Tree:
         folder.find_sidecar(path)
         with os.scandir(path) as entries:
             for entry in entries:
-                if all(
+                if not self._named or all(
                     is_inside(entry.path) or path.startswith(f"{entry.path}/")
                     for path, is_inside in self._named
                 ):

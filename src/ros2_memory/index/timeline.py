@@ -12,6 +12,8 @@ from functools import cached_property, reduce
 from itertools import accumulate, chain
 from typing import TYPE_CHECKING, Final
 
+import numpy as np
+
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
@@ -34,6 +36,8 @@ from ros2_memory.index.unreadable_span import MAX_FILE_NS
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
+
+    from numpy.typing import NDArray
 
 
 SEGMENT_BAGS: Final = 1024
@@ -123,6 +127,11 @@ class Timeline:
     def bags(self) -> tuple[BagFile, ...]:
         """All bags, in order."""
         return tuple(chain.from_iterable(segment.bags for segment in self.segments))
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """Log time of the first message in each of all bags."""
+        return np.concatenate([np.empty(0, np.int64), *(part.starts for part in self.segments)])
 
     @cached_property
     def recorded_segments(self) -> tuple[Segment, ...]:
