@@ -187,11 +187,12 @@ class Segment:
         return sum([bag.size for bag in self.bags]), sum(left_open)
 
     @cached_property
-    def _numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
+    def numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
         """The folders of the bags, and for each bag the position of its folder among them."""
         series, positions, _ = self.split_names
         number_of: dict[str, int] = {}
-        numbers = [number_of.setdefault(_folder_of(path), len(number_of)) for path in series]
+        folders = [path[: path.rfind("/")] for path in series]
+        numbers = [number_of.setdefault(folder, len(number_of)) for folder in folders]
         return [*number_of], np.array(numbers, np.uint16)[positions]
 
     @cached_property
@@ -202,20 +203,20 @@ class Segment:
     @cached_property
     def folders(self) -> frozenset[str]:
         """The folders of the bags."""
-        folders, _ = self._numbered_folders
+        folders, _ = self.numbered_folders
         return frozenset(folders)
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, numbers = self._numbered_folders
+        folders, numbers = self.numbered_folders
         spans = _spans_of(len(folders), numbers, self.starts, self.ends)
         return dict(zip(folders, spans, strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        folders, numbers = self._numbered_folders
+        folders, numbers = self.numbered_folders
         messages = _topic_columns(self).numbers[:, :, 0].sum(axis=0)
         columns = (np.bincount(numbers), np.bincount(numbers, messages))
         rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
@@ -290,7 +291,7 @@ class Segment:
         column = self.column(topic)
         if column is None:
             return {}
-        _, folder_numbers = self._numbered_folders
+        _, folder_numbers = self.numbered_folders
         numbers, paths = folder_numbers[column.bags], self._recording_paths
         spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
         counts = np.zeros(len(paths), np.int64)
@@ -305,7 +306,7 @@ class Segment:
     def _recording_paths(self) -> list[Path]:
         """The recordings of the bags, in the order in which their folders are numbered."""
         # A path for each bag of a week would take longer than all else.
-        _, folder_numbers = self._numbered_folders
+        _, folder_numbers = self.numbered_folders
         _, rows = np.unique(folder_numbers, return_index=True)
         return [self.bags[row].recording for row in rows.tolist()]
 
@@ -423,11 +424,7 @@ def _spans_of(
 
 def folder_of(bag: BagFile) -> str:
     """Returns the folder of a bag: that of its recording, as a string."""
-    return _folder_of(bag.file)
-
-
-def _folder_of(path: str) -> str:
-    return path[: path.rfind("/")]
+    return bag.file[: bag.file.rfind("/")]
 
 
 class _TopicColumns:

@@ -17,8 +17,8 @@ import numpy as np
 from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.spans import Spans, overlap_spans, united, without
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
+from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
 from ros2_memory.index.segment import (
     Pace,
     Segment,
@@ -26,7 +26,6 @@ from ros2_memory.index.segment import (
     TopicExtent,
     TopicTotals,
     add_totals,
-    folder_of,
     in_time,
     is_log,
     wider,
@@ -230,17 +229,26 @@ class Timeline:
     @cached_property
     def shared_times(self) -> Spans:
         """The half-open spans in which bags of different recordings may hold copies, in order."""
-        folders: dict[str, Span] = {}
-        for segment in self.segments:
-            for folder, span in segment.folder_spans.items():
-                folders[folder] = wider(folders.get(folder), span)
-        # First by whole recordings, which are few; then by bags, where these overlap.
-        coarse = overlap_spans((*span, folder) for folder, span in folders.items())
-        near = [self.overlapping(TimeWindow(*span)) for span in coarse]
-        return united(
-            span
-            for bags in near
-            for span in overlap_spans((bag.start, bag.end, folder_of(bag)) for bag in bags)
+        if not self.segments:
+            return []
+        number_of: dict[str, int] = {}
+        folders = np.concatenate(
+            [
+                np.array([number_of.setdefault(name, len(number_of)) for name in names])[numbers]
+                for names, numbers in (segment.numbered_folders for segment in self.segments)
+            ]
+        )
+        starts, ends = self.starts, np.concatenate([segment.ends for segment in self.segments])
+        # Of bags of one recording that follow each other those count that begin while another one
+        # goes on, and the one that reaches farthest.
+        is_first = np.diff(folders, prepend=-1) != 0
+        begins, run = np.flatnonzero(is_first), np.cumsum(is_first) - 1
+        before = np.append(MIN_NS, np.maximum.accumulate(ends)[begins[1:] - 1])
+        is_near = np.maximum(starts, MIN_NS + COPY_HORIZON_NS) - COPY_HORIZON_NS <= before[run]
+        is_farthest = ends == np.maximum.reduceat(ends, begins)[run]
+        rows = np.flatnonzero(is_near | is_farthest)
+        return overlap_spans(
+            zip(*(of[rows].tolist() for of in (starts, ends, folders)), strict=True)
         )
 
     def faulty(self, window: TimeWindow) -> list[BagFile]:
