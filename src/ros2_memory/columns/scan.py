@@ -155,7 +155,6 @@ class Scan:
         self._compared: set[Ns] = set()
         self._latched_again: dict[object, IntArray] = {}
         self._latched_again_since = MAX_NS
-        self._together: list[PartHead] = []
         reach = request.window
         if request.repeats_latched:
             reach = TimeWindow.everything()
@@ -191,18 +190,12 @@ class Scan:
             QueryTimeoutError: by `check`; or what was stored was deleted meanwhile.
         """
         sources, ruled_out = self._asked_sources(newest_first=newest_first, among=among)
-        ahead = together = 1
         waiting: list[Rows] = []
-        for nth, source in enumerate(sources):
-            if nth == ahead:
-                # Who goes on reads many.
-                together = min(2 * together, _MOST_LOOKED_UP)
-                ahead += together
-                self._together = _heads(sources[nth:ahead])
+        for nth, (source, together) in enumerate(_with_next(sources)):
             self._request.check(source.last if newest_first else source.first)
             waiting += [
                 Rows(unit, partial(self._counting, unit), source.number not in ruled_out)
-                for unit in self._units(source)
+                for unit in self._units(source, together)
             ]
             # A bag has a table for each type: one may be later than the next bag, the other not.
             waiting.sort(key=lambda rows: -rows.last if newest_first else rows.first)
@@ -341,12 +334,15 @@ class Scan:
         """
         spans = [TimeWindow(*span) for span in self._shared]
         shared = {id(source) for span in spans for source in self._sources_in(span)}
-        for source in self._sources:
-            may_be_late = self._request.repeats_latched and self._may_be_late(source.number)
-            if not may_be_late and id(source) not in shared:
-                continue
+        asked = [
+            source
+            for source in self._sources
+            if id(source) in shared
+            or (self._request.repeats_latched and self._may_be_late(source.number))
+        ]
+        for source, together in _with_next(asked):
             self._request.check(source.first)
-            for unit in self._units(source):
+            for unit in self._units(source, together):
                 repeated = self._repeated(unit)
                 if repeated.size:
                     yield Rows.of(unit, np.unique(repeated))
@@ -404,11 +400,12 @@ class Scan:
         counting = self._coverage.of_part(part.number, part.bags)
         return self._coverage.bag(int(counting[0])) if counting.size else None
 
-    def _units(self, source: _Source) -> Iterable[Unit]:
+    def _units(self, source: _Source, together: Sequence[PartHead]) -> Iterable[Unit]:
+        """Returns what a source has; of parts `together` with it what is known is read at once."""
         if source.part is None and self._request.stored:
             return ()
         if source.part is not None and self._coverage is not None:
-            unit = self._scanner.part(source.part, self._coverage, self._together)
+            unit = self._scanner.part(source.part, self._coverage, together)
             return () if unit is None else (unit,)
         assert source.bag is not None  # noqa: S101 - a source is a part or a bag
         return self._units_of_bag(source.bag)
@@ -445,13 +442,15 @@ class Scan:
 
     def _holding_copies(self) -> list[tuple[Ns, Ns]]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
+        starts, stops = np.array(self._shared).T
+        begins = np.searchsorted(self._latest, starts).tolist()
+        ends = np.searchsorted(self._firsts, stops).tolist()
+        unknown, lasts = (-math.inf, math.inf), self._lasts.tolist()
+        published = [self._published.get(source.number, unknown) for source in self._sources]
         spans: list[tuple[Ns, Ns]] = []
-        for start, stop in self._shared:
-            published = sorted(
-                self._published.get(source.number, (-math.inf, math.inf))
-                for source in self._sources_in(TimeWindow(start, stop))
-            )
-            if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
+        for (start, stop), begin, end in zip(self._shared, begins, ends, strict=True):
+            near = sorted(published[nth] for nth in range(begin, end) if lasts[nth] >= start)
+            if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(near)):
                 spans.append((start, stop))
         return spans
 
@@ -541,8 +540,8 @@ class Scan:
         return [source for source in self._sources[begin:stop] if source.last >= window.start]
 
     def _units_in(self, window: TimeWindow) -> Iterator[Unit]:
-        for source in self._sources_in(window):
-            yield from self._units(source)
+        for source, together in _with_next(self._sources_in(window)):
+            yield from self._units(source, together)
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""
@@ -594,6 +593,18 @@ def _in_window(unit: Unit, window: TimeWindow) -> Mask:
 
 def _heads(sources: Iterable[_Source]) -> list[PartHead]:
     return [source.part for source in sources if source.part is not None]
+
+
+def _with_next(sources: Sequence[_Source]) -> Iterator[tuple[_Source, Sequence[PartHead]]]:
+    """Yields sources, each with parts to look up together: who goes on reads many."""
+    heads: Sequence[PartHead] = ()
+    ahead = together = 1
+    for nth, source in enumerate(sources):
+        if nth == ahead:
+            together = min(2 * together, _MOST_LOOKED_UP)
+            ahead += together
+            heads = _heads(sources[nth:ahead])
+        yield source, heads
 
 
 def _is_next(rows: Rows, after: _Source | None, *, newest_first: bool) -> bool:

@@ -364,8 +364,9 @@ def zone_of(
     least: float | str | None, greatest: float | str | None, nulls: int, words: str | None
 ) -> Zone:
     """Returns the zone that was stored so."""
-    low, high = (int(bound) if isinstance(bound, str) else bound for bound in (least, greatest))
-    return Zone(low, high, nulls, words)
+    least = int(least) if isinstance(least, str) else least
+    greatest = int(greatest) if isinstance(greatest, str) else greatest
+    return Zone(least, greatest, nulls, words)
 
 
 class Layouts:

@@ -32,13 +32,14 @@ from ros2_memory.history.clock_steps import without_steps
 from ros2_memory.history.coverage import unix_text
 from ros2_memory.history.merged_stream import MergedStream
 from ros2_memory.history.no_data import has_poses, only_pose_topic, require_bags
-from ros2_memory.history.scan import blocks, open_scan, scan
+from ros2_memory.history.scan import blocks, open_scan
 from ros2_memory.history.sessions import Sessions
 from ros2_memory.index.segment import TopicTotals
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ros2_memory.columns.scan import Scan
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
     from ros2_memory.storage.base import IntArray
@@ -153,17 +154,19 @@ class View:
 
     def _read_census(self, topic: str) -> dict[str, TopicTotals]:
         counted = self.timeline.totals(topic)
-        for rows in open_scan(self, topic, TimeWindow.everything(), columns=False).copies():
+        opened = open_scan(self, topic, TimeWindow.everything(), columns=False)
+        for rows in opened.copies():
             type_name = rows.table.channel.type
             first, last, messages = counted[type_name]
-            last = last if rows.span[1] < last else self._last_of(topic, type_name)
+            last = last if rows.span[1] < last else self._last_of(opened, type_name)
             counted[type_name] = TopicTotals(first, last, messages - len(rows))
         return {type_name: totals for type_name, totals in counted.items() if totals.messages}
 
-    def _last_of(self, topic: str, type_name: str) -> Ns:
+    def _last_of(self, opened: Scan, type_name: str) -> Ns:
         """Returns the log time of the newest message of a type that counts."""
-        rows = scan(self, topic, TimeWindow.everything(), newest_first=True, columns=False)
-        for together in blocks(rows, newest_first=True):
+        for together in blocks(opened.rows(newest_first=True), newest_first=True):
+            for rows in together:
+                self.note_thinned(TimeWindow(rows.first, rows.last + 1))
             lasts = [some.span[1] for some in together if some.table.channel.type == type_name]
             if lasts:
                 return max(lasts)
