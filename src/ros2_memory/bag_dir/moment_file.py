@@ -62,8 +62,10 @@ class HardLinks:
 
     def recorded_as(self, path: str) -> str:
         """Returns where the bag of a saved moment was recorded; any other path as it is."""
+        if not self.is_saved(path):
+            return path
         _, slash, name = path[len(self._moments) :].partition("/")
-        return f"{self._root}{name}" if slash and self.is_saved(path) else path
+        return f"{self._root}{name}" if slash else path
 
 
 _log = get_logger(__name__)

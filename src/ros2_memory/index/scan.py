@@ -138,15 +138,15 @@ class _Folder:
 
     def enter(self, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
         """Adds what the directory has under a name."""
-        hidden, kind = entry.name.startswith("."), bag_kind(entry.name)
+        kind = bag_kind(entry.name)
         # Nearly all entries are bags: they are checked first.
         if kind and entry.is_file(follow_symlinks=False):
             self._enter_bag(entry, stamps)
         elif entry.is_symlink():
-            if not hidden:
+            if not entry.name.startswith("."):
                 self.links.append(Path(entry.path))
         elif entry.is_dir(follow_symlinks=False):
-            if not hidden and entry.name != LOST_AND_FOUND:
+            if not entry.name.startswith(".") and entry.name != LOST_AND_FOUND:
                 self.folders.append(entry.path)
         elif entry.name == METADATA_FILE:
             self.has_metadata = True
