@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary, numbers_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 moments = st.integers(MIN_NS, MAX_NS)
@@ -54,8 +55,10 @@ def test_packing_changes_nothing_but_the_size(
     )
     for topics_of in (given_topics, alike):
         summary = BagSummary(topics_of)
+        numbers = numbers_of([summary, summary]) if topics_of else ()
         for _ in range(2):
             summary.pack()
+            assert not topics_of or np.array_equal(numbers_of([summary, summary]), numbers)
             assert summary == BagSummary(topics_of)
             assert summary.topics == topics_of
             assert [summary.at(number) for number in range(len(topics_of))] == list(topics_of)
