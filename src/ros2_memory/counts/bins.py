@@ -372,16 +372,16 @@ class BinnedWindow:
         counts = self.bins.membership(times).sum(axis=0)
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
-    def add_held(self, held: Sequence[tuple[Ns, Ns, bool]]) -> None:
+    def add_held(self, held: Ints) -> None:
         """Adds how often something began, its first and last time, and how long it held.
 
         That is without gaps, in which it may have held on, or begun and ended.
 
         Args:
-            held: from when to when, in order, and whether it is known to have begun then; else it
-                held before, or that is not known.
+            held: from when to when, and whether it is known to have begun then; else it held
+                before, or that is not known (N x 3).
         """
-        starts, stops, begun = np.array(held, np.int64).reshape(-1, 3).T
+        starts, stops, begun = held.T
         inside = (stops >= self.counted.start) & (starts < self.counted.stop)
         starts, stops = (times[inside].clip(*self._counted_bounds) for times in (starts, stops))
         begins = starts[begun[inside] > 0]
