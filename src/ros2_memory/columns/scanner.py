@@ -323,6 +323,8 @@ class Scanner:
         Raises:
             GoneError: it was deleted meanwhile.
         """
+        # Those that a scan from the newest on comes to next.
+        older = max(head.first - together[-1].first, 0) if together else 0
         offset = self._store_of_parts.offset
         topic = self._store_of_parts.topic(head.topic)
         if topic is None:
@@ -361,7 +363,7 @@ class Scanner:
             left_out,
             definition=topic.definition,
             packed=packed,
-            outline=partial(self._outlines.get, _outline_key(head)),
+            outline=partial(self._outlines.get, _outline_key(head), older),
             memory=self.caches.read,
             number=head.number,
         )

@@ -351,12 +351,16 @@ class BinnedWindow:
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
+        firsts, lasts = pieces_of(*self.bounds(topics), pause)
+        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
+        self.add_lengths(column, "duration", without(heard, self.gaps))
+
+    def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
+        """Returns the first and the last log time of topics in each bag of what is counted."""
         bounds = [self.view.bounds(topic, self.counted) for topic in topics]
         firsts, lasts = np.concatenate(bounds, axis=1)
         is_inside = (firsts < self.counted.stop) & (lasts >= self.counted.start)
-        firsts, lasts = pieces_of(firsts[is_inside], lasts[is_inside], pause)
-        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
-        self.add_lengths(column, "duration", without(heard, self.gaps))
+        return firsts[is_inside], lasts[is_inside]
 
     def add_unknown(self, spans: Spans) -> None:
         """Adds for how long the answer is not known, if there are such times."""

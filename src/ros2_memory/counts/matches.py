@@ -367,12 +367,14 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     view = binned.view
     if view.limits.latching.is_latched(view.snapshot, topic):
         return binned.gaps
-    bags = view.stream.overlapping_bags([topic], binned.counted)
     # Within a bag that has the topic before and after it, a gap ends where it does.
-    return [
-        (begin, min((max(bag.first, end) for bag in bags if bag.last >= end), default=end))
-        for begin, end in binned.gaps
-    ]
+    firsts, lasts = binned.bounds([topic])
+    order = np.argsort(lasts)
+    earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
+    begins, ends = np.array(binned.gaps, np.int64).reshape(-1, 2).T
+    following = np.searchsorted(lasts[order], ends)
+    heard = np.append(earliest, MIN_NS)[following].clip(ends)
+    return [*zip(begins.tolist(), heard.tolist(), strict=True)]
 
 
 def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]) -> _TrueSpans:
