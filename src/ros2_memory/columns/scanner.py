@@ -342,7 +342,10 @@ class Scanner:
             return None
 
         def integers(path: str) -> IntArray | None:
-            return None if packed(path) is None else np.asarray(load(path), np.int64)
+            column = packed(path)
+            if column is None:
+                return None
+            return np.asarray(self._column(head, path, column, together), np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)
