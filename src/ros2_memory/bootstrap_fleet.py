@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 
     from ros2_memory.fleet.robots import Fleet, Robot
     from ros2_memory.history.context import Memory, QuerySettings
-    from ros2_memory.lake.engine import DuckdbEngine
+    from ros2_memory.lake.engine import Lake
     from ros2_memory.lake.shipper import RobotBags
-    from ros2_memory.lake.warehouse import Lake, LakeLocation
+    from ros2_memory.lake.warehouse import LakeLocation
 
 
 # ruff: noqa: PLC0415 - the lake is an extra, and loads what nothing else needs
@@ -96,28 +96,17 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
         LakeError: it cannot be opened.
     """
     location = lake_location(settings)
-    engine = engine_of(node)
-    from ros2_memory.lake.warehouse import Lake
+    require_extra("lake: duckdb", "lake", "duckdb")
+    from ros2_memory.lake.engine import Lake
 
     opened = ExitStack()
     atexit.register(opened.close)
     # DuckDB complains at the end about objects that the garbage collector may not look at.
     opened.callback(gc.unfreeze)
-    opened.callback(engine.close)
     catalog = opened.enter_context(location.opened())
-    return Lake(catalog, engine, location.translated)
-
-
-def engine_of(node: DuckdbNode) -> DuckdbEngine:
-    """Returns the engine of the settings.
-
-    Raises:
-        ConfigError: its extra is missing, or it cannot be built.
-    """
-    require_extra("lake: duckdb", "lake", "duckdb")
-    from ros2_memory.lake.engine import DuckdbEngine
-
-    return instantiated("lake.engine", node, DuckdbEngine)
+    lake = instantiated("lake.engine", node, Lake, catalog=catalog, translated=location.translated)
+    opened.callback(lake.close)
+    return lake
 
 
 # ruff: noqa: PLC0415 - a server of one robot loads nothing of this

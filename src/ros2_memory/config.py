@@ -489,7 +489,7 @@ class NullRecorderNode(AdapterNode):
 class DuckdbNode(AdapterNode):
     """`lake=duckdb`: DuckDB inside of this process."""
 
-    target: Literal["ros2_memory.lake.engine.DuckdbEngine"] = Field(alias="_target_")
+    target: Literal["ros2_memory.lake.engine.Lake"] = Field(alias="_target_")
     memory_mb: Count
     threads: Count | None
 

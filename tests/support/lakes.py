@@ -9,7 +9,6 @@ from itertools import chain
 from pathlib import Path
 from typing import Any, Final
 
-from pyiceberg.catalog import Catalog
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.expressions import AlwaysTrue
 
@@ -21,11 +20,11 @@ from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Memory, QuerySettings
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.memory import MOST_BAGS, LakeIndex, LakeReader
 from ros2_memory.lake.shipper import RobotBags, Shipped, Shipper
 from ros2_memory.lake.upkeep import Tombstone
-from ros2_memory.lake.warehouse import CATALOGUE_FILE, Lake, LakeLocation, location_of
+from ros2_memory.lake.warehouse import CATALOGUE_FILE, LakeLocation, location_of
 from ros2_memory.serving.backfill import make_fragments
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support.bags import Msg, detections, text, write_mcap
@@ -132,13 +131,12 @@ def ship_and_ask(where: LakeLocation, folder: Path) -> None:
                 robots = [robot_bags("hall", folder)]
                 assert Shipper(tables, robots, FixedClock(LATER)).run().bags == shipped
     with where.opened() as catalog:
-        engine = DuckdbEngine()
-        lake = Lake(catalog, engine, where.translated)
+        lake = Lake(catalog, where.translated)
         assert [*lake.days("bags")] == ["hall"]
         sql = "SELECT bag_id, label FROM sightings ORDER BY bag_id"
         files = chain.from_iterable(lake.days("sightings")["hall"].values())
         found = lake.select(sql, "sightings", files).to_pylist()
-        engine.close()
+        lake.close()
     assert [row["label"] for row in found] == ["cup", "cup"]
     assert len({row["bag_id"] for row in found}) == 2
 
@@ -153,8 +151,7 @@ def lake_in(folder: Path) -> SqlCatalog:
 
 
 def lake_robots(
-    catalog: Catalog,
-    engine: DuckdbEngine,
+    lake: Lake,
     names: Sequence[str],
     stores: Path | None = None,
     *,
@@ -163,7 +160,7 @@ def lake_robots(
     now: int = NOW,
 ) -> dict[str, Memory]:
     """The robots of a lake; with a folder for `stores` each has one."""
-    lake, clock, decoder, large = Lake(catalog, engine), FixedClock(now), McapReader(), LargeReads()
+    clock, decoder, large = FixedClock(now), McapReader(), LargeReads()
 
     def memory(name: str) -> Memory:
         index = LakeIndex(lake, name, clock, refresh_s=0, days=days, most_bags=most_bags)
@@ -176,9 +173,10 @@ def lake_robots(
     return {name: memory(name) for name in names}
 
 
-def lake_robot(folder: Path, engine: DuckdbEngine, **how: Any) -> Memory:
+def lake_robot(folder: Path, **how: Any) -> Memory:
     """The robot `hall` of the lake in a folder; see `lake_robots`."""
-    return lake_robots(lake_in(folder), engine, ["hall"], **how)["hall"]
+    lake = Lake(lake_in(folder), memory_mb=256, threads=1)
+    return lake_robots(lake, ["hall"], **how)["hall"]
 
 
 def store_columns(memory: Memory) -> Filling:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ros2_memory.analysis.sights import TABLES, DetectorMessages, Ints, Sights, sights_of
-from ros2_memory.columns.sights import joined, packed
+from ros2_memory.analysis.sights import TABLES, DetectorMessages, Sights, sights_of
+from ros2_memory.columns.sights import JoinedSights, joined, packed
 from ros2_memory.columns.table import Texts
+from ros2_memory.core.arrays import Columns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -64,11 +66,12 @@ def seen_in(messages: Sequence[Message]) -> DetectorMessages:
     )
 
 
-def joined_of(parts: Sequence[Sights], epochs: Sequence[int] | None = None) -> tuple[Sights, Ints]:
-    """The sights of all parts, and the epoch of each slice."""
-    return joined([packed(part) for part in parts], epochs)
+def rows_of_tables(sights: JoinedSights) -> list[list[list[int]]]:
+    """The rows of each table of joined sights."""
+    tables = (getattr(sights, field.name) for field in fields(JoinedSights))
+    return [table[:].tolist() for table in tables if isinstance(table, Columns)]
 
 
-def whole(parts: Sequence[Sights]) -> Sights:
+def whole(parts: Sequence[Sights]) -> JoinedSights:
     """The sights of all parts, which are in one coordinate system."""
-    return joined_of(parts)[0]
+    return joined([packed(part) for part in parts])

@@ -13,7 +13,7 @@ a thing was missed before or after it was last seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations, groupby
 from operator import attrgetter
@@ -128,10 +128,7 @@ class DetectorMessages(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sights:
-    """What detectors saw in some slices: column 0 of most tables is the slice.
-
-    From `sights_of` it is the slice of the clock; `columns.sights.joined` numbers those of all from
-    0 to `slices`.
+    """What detectors saw in some slices of the clock: column 0 of most tables is the slice.
 
     Attributes:
         spots: where labels were seen (`Spot`).
@@ -152,7 +149,6 @@ class Sights:
     beside: Ints
     unplaced: Ints
     fixes: Ints
-    slices: int = field(default=0, kw_only=True)
 
     @property
     def tables(self) -> tuple[Ints, ...]:

@@ -373,11 +373,11 @@ def byte_planes(numbers: IntArray, width: int) -> bytes:
 
 def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
     """Returns the numbers as unsigned ones of the least width that numpy has."""
-    dtype = _CONTAINERS[width]
-    rows = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
-    numbers = rows[0].astype(dtype) if width else np.zeros(count, dtype)
-    for nth in range(1, width):
-        numbers |= rows[nth].astype(dtype) << (8 * nth)
+    planes = np.frombuffer(data, np.uint8, count * width, start).reshape(width, count)
+    numbers = np.zeros(count, _CONTAINERS[width])
+    rows = numbers.view(np.uint8).reshape(count, numbers.itemsize)
+    for nth, plane in enumerate(planes):
+        rows[:, nth] = plane
     return numbers
 
 

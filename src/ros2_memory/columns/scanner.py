@@ -323,6 +323,8 @@ class Scanner:
         Raises:
             GoneError: it was deleted meanwhile.
         """
+        # Those that a scan from the newest on comes to next.
+        older = max(head.first - together[-1].first, 0) if together else 0
         offset = self._store_of_parts.offset
         topic = self._store_of_parts.topic(head.topic)
         if topic is None:
@@ -340,7 +342,10 @@ class Scanner:
             return None
 
         def integers(path: str) -> IntArray | None:
-            return None if packed(path) is None else np.asarray(load(path), np.int64)
+            column = packed(path)
+            if column is None:
+                return None
+            return np.asarray(self._column(head, path, column, together), np.int64)
 
         def bag_of(number: int) -> BagFile:
             bag = coverage.bag(number + offset)
@@ -361,7 +366,7 @@ class Scanner:
             left_out,
             definition=topic.definition,
             packed=packed,
-            outline=partial(self._outlines.get, _outline_key(head)),
+            outline=partial(self._outlines.get, _outline_key(head), older),
             memory=self.caches.read,
             number=head.number,
         )

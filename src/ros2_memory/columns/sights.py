@@ -12,9 +12,10 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import dataclass
 from itertools import chain
 from struct import Struct
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from ros2_memory.analysis.sights import (
     Unplaced,
 )
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed
-from ros2_memory.core.arrays import distinct_rows
+from ros2_memory.core.arrays import Columns, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:
@@ -40,9 +41,15 @@ if TYPE_CHECKING:
 
     Bytes = NDArray[np.uint8]
 
+Names: TypeAlias = "tuple[dict[str, int], dict[str, int]]"
+"""The numbers of topics and of labels."""
+
 _HEAD: Final = Struct(f"<Bq{len(TABLES) + 1}I")
 _SLICE_US: Final = SLICE_NS // NS_PER_US
 _SIGN: Final = 63
+_AT_ONCE: Final = 256
+"""So many parts are unpacked together."""
+_COLUMNS: Final = tuple(map(len, TABLES))
 _SPOTS, _LOOKS, _HITS, _SCORES, _BESIDE, _UNPLACED, _FIXES = range(len(TABLES))
 _NAMED: Final = (
     ((_SPOTS, 1), (_LOOKS, 1), (_UNPLACED, 1)),
@@ -90,74 +97,158 @@ def packed(sights: Sights) -> bytes:
     return compressed(b"".join((head, names, *planes)))
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class JoinedSights:
+    """The sights of many parts of a history, with tables as those of `Sights`, in order.
+
+    Their slices are numbered in order of time. Those of one time and another epoch (the coordinate
+    system of a part) are different ones.
+
+    Attributes:
+        epochs: of each slice.
+    """
+
+    topics: tuple[str, ...]
+    labels: tuple[str, ...]
+    epochs: Ints
+    spots: Columns
+    looks: Columns
+    hits: Columns
+    scores: Columns
+    beside: Columns
+    unplaced: Columns
+    fixes: Columns
+
+
 def joined(
     parts: Sequence[bytes],
     epochs: Sequence[int] | None = None,
     sessions: Sequence[int] | None = None,
-) -> tuple[Sights, Ints]:
-    """Returns the sights of packed parts, and the epoch of each slice.
+) -> JoinedSights:
+    """Returns the sights of packed parts, which are of some epochs and sessions.
 
-    There is one table of names. Slices are numbered in order of time. Those of one time and another
-    epoch (the coordinate system of a part) are different ones. Fixes are in order of time for each
-    session: at one time there may be several robots.
+    Fixes are in order of time for each session: at one time there may be several robots.
     """
-    topics, labels, tables, part = _unpacked(parts)
     epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
     session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
-    slices = np.concatenate([tables[at][0] for at in _IN_SLICES])
-    rows, number = distinct_rows((slices, np.concatenate([epoch[part[at]] for at in _IN_SLICES])))
+    names: Names = {}, {}
+    # Of each table and column, those of the parts that are unpacked together, in few bytes.
+    pieces: list[list[list[Ints]]] = [[[] for _ in range(size + 1)] for size in _COLUMNS]
+    spots = looks = 0
+    for begin in range(0, max(len(parts), 1), _AT_ONCE):
+        tables, part_of = _unpacked(parts[begin : begin + _AT_ONCE], names)
+        for at in (_HITS, _SCORES, _BESIDE):
+            tables[at][0] += spots
+        tables[_HITS][Hit.LOOK] += (tables[_HITS][Hit.LOOK] >= 0) * looks
+        spots, looks = spots + tables[_SPOTS].shape[1], looks + tables[_LOOKS].shape[1]
+        for of_table, table, numbers in zip(pieces, tables, part_of, strict=True):
+            for of_column, column in zip(of_table, (*table, numbers + begin), strict=True):
+                of_column.append(narrowed(column))
+    columns = [[*map(_concatenated, of_table)] for of_table in pieces]
+    part = [table.pop() for table in columns]
+    for kind, places in enumerate(_NAMED):
+        rank = np.argsort([names[kind][name] for name in sorted(names[kind])]).astype(np.int64)
+        for at, column in places:
+            columns[at][column] = narrowed(rank[columns[at][column]])
+    epoch_of_slice = _number_slices(columns, part, epoch)
+    spot_order = _order(columns[_SPOTS][:3])
+    for at in (_HITS, _SCORES, _BESIDE):
+        columns[at] = _by_spot(columns[at], spot_order)
+    look_order = _order(columns[_LOOKS][:2])
+    place = np.full(len(look_order) + 1, -1, np.int64)
+    place[look_order] = np.arange(len(look_order))
+    columns[_HITS][Hit.LOOK] = narrowed(place[columns[_HITS][Hit.LOOK]])
+    orders = {
+        _SPOTS: spot_order,
+        _LOOKS: look_order,
+        _UNPLACED: _order(columns[_UNPLACED][:3]),
+        _FIXES: _distinct_fixes(columns[_FIXES], session[part[_FIXES]]),
+    }
+    for at, order in orders.items():
+        columns[at] = [column[order] for column in columns[at]]
+    topics, labels = (tuple(sorted(names_of_kind)) for names_of_kind in names)
+    return JoinedSights(topics, labels, epoch_of_slice, *map(Columns, columns))
+
+
+def _concatenated(pieces: list[Ints]) -> Ints:
+    """Returns some arrays one after the other, and frees them."""
+    column = np.concatenate(pieces)
+    pieces.clear()
+    return column
+
+
+def _number_slices(columns: list[list[Ints]], part: Sequence[Ints], epoch: Ints) -> Ints:
+    """Numbers the slices in tables, which are of some parts; returns the epoch of each."""
+    begins = []
     for at in _IN_SLICES:
-        tables[at][0], number = np.split(number, [tables[at].shape[1]])
-    spots, looks, hits, scores, beside, unplaced, fixes = tables
-    tables.clear()  # frees each when it is ordered
-    spots, place = _ordered(spots, 3)
-    for table in (hits, scores, beside):
-        table[0] = place[table[0]]
-    looks, place = _ordered(looks, 2)
-    hits[Hit.LOOK] = np.append(place, -1)[hits[Hit.LOOK]]
-    ordered = (spots, looks, *(_ordered(table, 2)[0] for table in (hits, scores, beside)))
-    ordered += _ordered(unplaced, 3)[0], _distinct_fixes(fixes, session[part[_FIXES]])
-    return Sights(topics, labels, *(table.T for table in ordered), slices=len(rows)), rows[:, 1]
+        is_other = np.ones(len(part[at]), np.bool_)
+        is_other[1:] = (np.diff(columns[at][0]) != 0) | (np.diff(part[at]) != 0)
+        begins.append(np.flatnonzero(is_other))
+    runs = zip(_IN_SLICES, begins, strict=True)
+    of_runs = [(columns[at][0][begin], epoch[part[at][begin]]) for at, begin in runs]
+    slices, epochs = map(np.concatenate, zip(*of_runs, strict=True))
+    rows, number = distinct_rows((slices, epochs))
+    numbers = np.split(narrowed(number), np.cumsum([len(begin) for begin in begins])[:-1])
+    for at, begin, of_table in zip(_IN_SLICES, begins, numbers, strict=True):
+        columns[at][0] = np.repeat(of_table, np.diff(begin, append=len(part[at])))
+    return rows[:, 1]
+
+
+def _order(keys: Sequence[Ints]) -> Ints:
+    """Returns the rows in the order of some columns; equal ones stay in their order."""
+    _, number = distinct_rows(keys)
+    begins = np.flatnonzero(np.diff(number, prepend=-1))
+    by_run = np.argsort(number[begins], kind="stable")  # many rows of one number follow each other
+    return in_ranges(begins[by_run], np.diff(begins, append=len(number))[by_run])
+
+
+def _by_spot(columns: Sequence[Ints], order: Ints) -> list[Ints]:
+    """Returns the rows of a table that is ordered by spots, where these come in another order."""
+    spot, *others = columns
+    sizes = np.bincount(spot, minlength=len(order)).astype(np.int64)
+    rows = in_ranges((np.cumsum(sizes) - sizes)[order], sizes[order])
+    spots = np.repeat(narrowed(np.arange(len(order))), sizes[order])
+    return [spots, *(column[rows] for column in others)]
 
 
 def united(parts: Sequence[bytes]) -> bytes:
     """Returns packed parts as one: their rows one after the other."""
-    topics, labels, tables, _ = _unpacked(parts)
-    return packed(Sights(topics, labels, *(table.T for table in tables)))
+    topics, labels = names = dict[str, int](), dict[str, int]()
+    tables, _ = _unpacked(parts, names)
+    return packed(Sights((*topics,), (*labels,), *(table.T for table in tables)))
 
 
-def _distinct_fixes(fixes: Ints, session: Ints) -> Ints:
+def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
     """Returns the fixes of each session in order of time, each once.
 
     Where a stretch of the clock ends, both that it parts have the fix.
     """
-    order = np.lexsort((*fixes[::-1], session))
-    fixes, session = fixes[:, order], session[order]
-    is_other = np.ones(len(session), np.bool_)
-    is_other[1:] = (np.diff(fixes) != 0).any(axis=0) | (np.diff(session) != 0)
-    return fixes[:, is_other]
+    order = np.lexsort((*columns[:0:-1], session))
+    is_other = np.ones(len(order), np.bool_)
+    changes = [np.diff(column[order]) != 0 for column in (*columns, session)]
+    is_other[1:] = np.any(changes, axis=0)
+    return order[is_other]
 
 
-def _unpacked(
-    parts: Sequence[bytes],
-) -> tuple[tuple[str, ...], tuple[str, ...], list[Ints], list[Ints]]:
-    """Returns the topics and labels of all parts, their tables, and the part of each row of these.
+def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], list[Ints]]:
+    """Returns the tables of all parts, and the part of each row of these.
 
-    Each table has its columns one after the other; numbers of spots and looks are of the whole.
+    Each table has its columns one after the other; numbers of spots and looks are of all these
+    parts. `names` has the numbers of topics and labels, and gets those of others.
     """
     planes: list[list[Bytes]] = [[] for _ in TABLES]
-    names, heads = [], []
+    own_names, heads = [], []
     for part in parts:
         data = decompressed(part)
         width, begin, *counts, size = _HEAD.unpack_from(data)
         at = _HEAD.size + size
-        names.append(json.loads(data[_HEAD.size : at]))
+        own_names.append(data[_HEAD.size : at])
         heads.append((begin, *counts))
-        for blocks, columns, count in zip(planes, TABLES, counts, strict=True):
-            shape = (len(columns), width, count)
+        for blocks, columns, count in zip(planes, _COLUMNS, counts, strict=True):
             if count:
+                shape = (columns, width, count)
                 blocks.append(np.frombuffer(data, np.uint8, math.prod(shape), at).reshape(shape))
-            at += math.prod(shape)
+                at += math.prod(shape)
     starts, *sizes = np.array(heads, np.int64).reshape(-1, 1 + len(TABLES)).T
     numbers = np.arange(len(parts))
     part_of = [np.repeat(numbers, rows) for rows in sizes]
@@ -173,17 +264,18 @@ def _unpacked(
         tables[at][0] += (np.cumsum(sizes[_SPOTS]) - sizes[_SPOTS])[part_of[at]]
     look = tables[_HITS][Hit.LOOK]
     look += (look >= 0) * (np.cumsum(sizes[_LOOKS]) - sizes[_LOOKS])[part_of[_HITS]]
-    united_names = []
-    for kind, places in enumerate(_NAMED):
-        of_parts = [part_names[kind] for part_names in names]
-        united_names.append(tuple(sorted({*chain.from_iterable(of_parts)})))
-        number = {name: nth for nth, name in enumerate(united_names[-1])}
-        codes = np.array([number[name] for name in chain.from_iterable(of_parts)], np.int64)
-        begins = np.cumsum([0, *map(len, of_parts)])
+    # Many parts have the same names.
+    distinct = {text: json.loads(text) for text in own_names}
+    for kind, (places, numbers_of) in enumerate(zip(_NAMED, names, strict=True)):
+        codes = {
+            text: [numbers_of.setdefault(name, len(numbers_of)) for name in both[kind]]
+            for text, both in distinct.items()
+        }
+        code = np.array([*chain.from_iterable(codes[text] for text in own_names)], np.int64)
+        begins = np.cumsum([0, *(len(codes[text]) for text in own_names)])
         for at, column in places:
-            tables[at][column] = codes[tables[at][column] + begins[part_of[at]]]
-    topics, labels = united_names
-    return topics, labels, tables, part_of
+            tables[at][column] = code[tables[at][column] + begins[part_of[at]]]
+    return tables, part_of
 
 
 def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
@@ -204,17 +296,3 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
         np.cumsum(steps, out=column)
         np.subtract(column, np.repeat(column[firsts] - steps[firsts], sizes), out=column)
     return columns
-
-
-def _ordered(table: Ints, keys: int) -> tuple[Ints, Ints]:
-    """Returns a table in the order of its first columns, so many, and the new place of each row."""
-    key = table[0]
-    for column in table[1:keys]:
-        low = column.min(initial=0)
-        key = key * (column.max(initial=0) - low + 1) + (column - low)
-    places = np.arange(len(key))
-    if (np.diff(key) >= 0).all():  # most are in it already
-        return table, places
-    order = np.argsort(key, kind="stable")
-    places[order] = np.arange(len(key))
-    return table[:, order], places

@@ -141,11 +141,9 @@ def lazy_columns(
         owners = cast("IntArray", column(f"{path}#"))
         return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
-    # Owners that are all equal take no bytes: they stay where the columns beside them are dropped.
-    return (
-        Lazily(
-            [name for name, path in columns.items() if path not in dropped],
-            lambda name: column(columns[name]),
-        ),
-        Lazily([name for name, path in sequences.items() if f"{path}#" not in dropped], elements),
-    )
+    kept, lists = columns.keys(), sequences.keys()
+    if dropped:
+        # Owners that are all equal take no bytes: they stay where the columns beside them go.
+        kept = {name: path for name, path in columns.items() if path not in dropped}.keys()
+        lists = {name: path for name, path in sequences.items() if f"{path}#" not in dropped}.keys()
+    return Lazily(kept, lambda name: column(columns[name])), Lazily(lists, elements)

@@ -19,6 +19,7 @@ Scalar = TypeVar("Scalar", bound="np.generic[object]")
 Word = TypeVar("Word", bound="Hashable")
 Ints: TypeAlias = NDArray[np.int64]
 Flags: TypeAlias = NDArray[np.bool_]
+Which: TypeAlias = "Ints | Flags | slice[None, None, None]"
 
 Codes: TypeAlias = "Ints | NDArray[np.uint32]"
 
@@ -127,7 +128,7 @@ def distinct_rows(columns: Sequence[Ints]) -> tuple[Ints, Ints]:
     # One number for each row, in the order of the rows: sorting rows takes ten times as long.
     keys = np.zeros(len(columns[0]), np.int64)
     for column, low, size in zip(columns, lows, sizes, strict=True):
-        keys = keys * size + (column - low)
+        keys = keys * size + (column.astype(np.int64) - low)
     if most <= _KEYS_OF_ROW * len(keys):
         is_there = np.zeros(most, np.bool_)
         is_there[keys] = True
@@ -142,7 +143,7 @@ def narrowed(column: Ints) -> Ints:
     low, high = int(column.min(initial=0)), int(column.max(initial=0))
     kinds = (np.uint8, np.int8, np.uint16, np.int16, np.int32, np.int64)
     kind = next(kind for kind in kinds if np.iinfo(kind).min <= low and high <= np.iinfo(kind).max)
-    narrow: Ints = column.astype(kind)
+    narrow: Ints = column.astype(kind, copy=False)
     return narrow
 
 
@@ -150,21 +151,21 @@ class Columns:
     """A table of integers, which is read like an array of rows, in as few bytes as they need.
 
     Args:
-        table: the rows.
+        columns: what it consists of.
     """
 
-    def __init__(self, table: Ints) -> None:
-        self._columns = [narrowed(column) for column in table.T]
-        self.nbytes = sum(column.nbytes for column in self._columns)
+    def __init__(self, columns: Iterable[Ints]) -> None:
+        self.columns = [*map(narrowed, columns)]
+        self.nbytes = sum(column.nbytes for column in self.columns)
 
     def __len__(self) -> int:
-        return len(self._columns[0])
+        return len(self.columns[0])
 
-    def __getitem__(self, at: Ints | tuple[Ints | slice[None, None, None], int]) -> Ints:
+    def __getitem__(self, at: Which | tuple[Which, int]) -> Ints:
         """Returns some rows, or these of one column."""
         if isinstance(at, tuple):
-            return self._columns[at[1]][at[0]].astype(np.int64)
-        return np.stack([column[at] for column in self._columns], axis=1, dtype=np.int64)
+            return self.columns[at[1]][at[0]].astype(np.int64)
+        return np.stack([column[at] for column in self.columns], axis=1, dtype=np.int64)
 
 
 class Groups(NamedTuple):

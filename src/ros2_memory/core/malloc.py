@@ -9,6 +9,7 @@ from typing import Final
 _ARENA_MAX, _MMAP_THRESHOLD, _TRIM_THRESHOLD = -8, -3, -1
 """Options of mallopt(3)."""
 _LARGE: Final = 1 << 16
+_KEPT: Final = 64 << 20
 
 
 def share_one_arena() -> None:
@@ -20,6 +21,12 @@ def return_large_at_once() -> None:
     """Has blocks of 64 KiB and more go back to the system when they are freed, which takes time."""
     _set(_MMAP_THRESHOLD, _LARGE)
     _set(_TRIM_THRESHOLD, _LARGE)
+
+
+def keep_freed() -> None:
+    """Has up to 64 MiB of what is freed stay: to take it from the system anew takes time."""
+    _set(_MMAP_THRESHOLD, _KEPT // 2)
+    _set(_TRIM_THRESHOLD, _KEPT)
 
 
 def return_free_memory() -> None:

@@ -23,7 +23,6 @@ from typing import (
     TYPE_CHECKING,
     ClassVar,
     Final,
-    Literal,
     Never,
     Protocol,
     TypeAlias,
@@ -54,7 +53,6 @@ T = TypeVar("T")
 JsonObject: TypeAlias = "dict[str, JsonValue]"
 Source: TypeAlias = "str | Callable[[Never], object]"
 """What a key is made of: the attribute of a dot-path, None where a part of it is; or a function."""
-Merging: TypeAlias = Literal["", "added", "counted", "earliest", "newest", "inherited", "who"]
 """How a key of several robots' replies becomes one: numbers are added up, or those of an object;
 the smallest or the largest counts; each row takes it over; the robots of which it is true are
 named. Else it is kept once where all agree."""
@@ -199,7 +197,7 @@ class Key:
         is_shown: whether there is one, of its value.
         most: of a list so many are shown: the first, or the last of them if that is negative. Of
             more, a key tells the number (`<name>_<counted>`), and of the last a note.
-        merging: how the key of several robots becomes one.
+        is_added: whether the sum of several robots' values says something.
         row_time: of a list of rows, which several robots' replies share: the key of their time.
         is_short: it stays where a reply has to be short.
     """
@@ -211,7 +209,7 @@ class Key:
     is_shown: Callable[[object], bool] = _always
     most: int = 0
     counted: str = "count"
-    merging: Merging = ""
+    is_added: bool = False
     row_time: str = ""
     is_short: bool = False
 
@@ -251,9 +249,10 @@ class Key:
         """Returns the key with the last `most` of its list; likewise, and with a note."""
         return replace(self, most=-most, counted=counted)
 
-    def merged(self, how: Merging) -> Key:
-        """Returns the key that becomes one of several robots' in this way."""
-        return replace(self, merging=how)
+    @property
+    def added(self) -> Key:
+        """The key, of which several robots' values, or counts by name, are added up."""
+        return replace(self, is_added=True)
 
     def along(self, row_time: str) -> Key:
         """Returns the key whose rows become one list of several robots', in order of a time."""

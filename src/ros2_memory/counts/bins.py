@@ -351,12 +351,16 @@ class BinnedWindow:
     def add_heard(self, column: str, topics: Sequence[str]) -> None:
         """Adds how long topics had messages, without pauses far longer than usual on them."""
         pause = round(2 * NS_PER_S * self.view.limits.split_duration_s)
+        firsts, lasts = pieces_of(*self.bounds(topics), pause)
+        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
+        self.add_lengths(column, "duration", without(heard, self.gaps))
+
+    def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
+        """Returns the first and the last log time of topics in each bag of what is counted."""
         bounds = [self.view.bounds(topic, self.counted) for topic in topics]
         firsts, lasts = np.concatenate(bounds, axis=1)
         is_inside = (firsts < self.counted.stop) & (lasts >= self.counted.start)
-        firsts, lasts = pieces_of(firsts[is_inside], lasts[is_inside], pause)
-        heard = zip(firsts.tolist(), lasts.tolist(), strict=True)
-        self.add_lengths(column, "duration", without(heard, self.gaps))
+        return firsts[is_inside], lasts[is_inside]
 
     def add_unknown(self, spans: Spans) -> None:
         """Adds for how long the answer is not known, if there are such times."""
@@ -372,16 +376,16 @@ class BinnedWindow:
         counts = self.bins.membership(times).sum(axis=0)
         self.add(column, "count", counts.tolist(), len(np.asarray(times)))
 
-    def add_held(self, held: Sequence[tuple[Ns, Ns, bool]]) -> None:
+    def add_held(self, held: Ints) -> None:
         """Adds how often something began, its first and last time, and how long it held.
 
         That is without gaps, in which it may have held on, or begun and ended.
 
         Args:
-            held: from when to when, in order, and whether it is known to have begun then; else it
-                held before, or that is not known.
+            held: from when to when, and whether it is known to have begun then; else it held
+                before, or that is not known (N x 3).
         """
-        starts, stops, begun = np.array(held, np.int64).reshape(-1, 3).T
+        starts, stops, begun = held.T
         inside = (stops >= self.counted.start) & (starts < self.counted.stop)
         starts, stops = (times[inside].clip(*self._counted_bounds) for times in (starts, stops))
         begins = starts[begun[inside] > 0]

@@ -62,7 +62,7 @@ from ros2_memory.history.reverse_search import condition_of
 from ros2_memory.history.robots import note_robots, note_robots_on
 from ros2_memory.history.scan import blocks, in_time, scan
 from ros2_memory.history.view import TimeRange, View, clamped, open_search
-from ros2_memory.insights.sightings import read_sightings
+from ros2_memory.insights.sightings import held_spans, read_sightings
 from ros2_memory.insights.topic_events import events_back
 from ros2_memory.places.where import Scope, Where, WhileCondition, parse_where
 from ros2_memory.results import BinColumn, Bins
@@ -72,12 +72,15 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.core.model import JsonValue
     from ros2_memory.core.spans import Spans
     from ros2_memory.core.timebase import Ns
 
     _TrueSpans: TypeAlias = list[tuple[Ns, Ns, bool]]
     """From when to when something was true, and whether it is known to have begun then."""
+    _Held: TypeAlias = tuple[Ints | None, Ns | None]
+    """Such times, N x 3, and since when they are known, if not all are; None: it is not clear."""
 
 BY_LABEL: Final = "label"
 ANY_LABEL: Final = ""
@@ -152,7 +155,7 @@ def count_matches(
     binned.add_heard("topic_s", topics)
     binned.add_unknown(scope.unknown)
     binned.add_held(held)
-    if not held:
+    if not held.size:
         is_bounded = where is not None or bool(during)
         view.notes.add(
             *notes_on_never(view, topic, condition, asked, min_score, is_bounded=is_bounded)
@@ -188,7 +191,7 @@ def _held_by_events(
     condition: Condition,
     value: JsonValue,
     scope: Scope,
-) -> tuple[_TrueSpans | None, Ns | None]:
+) -> _Held:
     """Returns when a boolean or a label held in a scope, and since when that is known.
 
     None where the condition is on neither.
@@ -210,7 +213,7 @@ def _held_by_events(
 
 def _boolean_held(
     binned: BinnedWindow, topic: str, condition: Condition, scope: Scope, *, wanted: bool
-) -> tuple[_TrueSpans | None, Ns | None]:
+) -> _Held:
     """Returns when a boolean of a topic held; None where it is not clear which one is meant."""
     view = binned.view
     if not condition.field and _has_lists(view, topic):  # booleans in them are no events
@@ -222,7 +225,7 @@ def _boolean_held(
         return None, None
     _note_uncounted(view, topic, parts)
     counted, end = _in_scope(spans, scope)
-    return counted, since if end is None else end
+    return held_spans(counted), since if end is None else end
 
 
 def _in_scope(spans: _TrueSpans, scope: Scope) -> tuple[_TrueSpans, Ns | None]:
@@ -275,7 +278,7 @@ def _note_uncounted(view: View, topic: str, parts: Sequence[TopicEvents]) -> Non
 
 def _label_held(
     binned: BinnedWindow, topics: Sequence[str], condition: Condition, scope: Scope
-) -> tuple[_TrueSpans | None, Ns | None]:
+) -> _Held:
     """Returns when a thing with a label was in view; None where no label meets a condition."""
     view, matches = binned.view, Condition(condition.test).matches
     if scope.is_bounded or condition.min_score or len(topics) > 1:
@@ -306,7 +309,8 @@ def _label_held(
         )
     # Each label's first: only of one label it is known whether a message lay between.
     of_any = ((interval.first, interval.last) for interval in visible.intervals())
-    return [(first, last, True) for first, last in united_spans(of_any, FLICKER_NS)], since
+    united_times = united_spans(of_any, FLICKER_NS)
+    return held_spans((first, last, True) for first, last in united_times), since
 
 
 def _flag_spans(
@@ -363,12 +367,14 @@ def _gaps_for_topic(binned: BinnedWindow, topic: str) -> list[tuple[Ns, Ns]]:
     view = binned.view
     if view.limits.latching.is_latched(view.snapshot, topic):
         return binned.gaps
-    bags = view.stream.overlapping_bags([topic], binned.counted)
     # Within a bag that has the topic before and after it, a gap ends where it does.
-    return [
-        (begin, min((max(bag.first, end) for bag in bags if bag.last >= end), default=end))
-        for begin, end in binned.gaps
-    ]
+    firsts, lasts = binned.bounds([topic])
+    order = np.argsort(lasts)
+    earliest = np.minimum.accumulate(firsts[order][::-1])[::-1]
+    begins, ends = np.array(binned.gaps, np.int64).reshape(-1, 2).T
+    following = np.searchsorted(lasts[order], ends)
+    heard = np.append(earliest, MIN_NS)[following].clip(ends)
+    return [*zip(begins.tolist(), heard.tolist(), strict=True)]
 
 
 def _without_gaps(start: Ns, stop: Ns, is_begun: bool, gaps: Sequence[tuple[Ns, Ns]]) -> _TrueSpans:

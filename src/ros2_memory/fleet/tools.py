@@ -4,9 +4,9 @@ The tools themselves are unchanged: each is asked of the memory of a robot. Wher
 several, their replies become one, and what keeps a robot from answering is a note.
 
 Two ways. Where a reply is a list of rows along time, the rows of all robots become one list, newest
-first, each with the name of its robot (`MERGED_ROWS`); what else the replies have is added up, kept
-once where all agree, or listed by robot. Where a reply is about one robot as a whole, it becomes a
-row itself (`SHORT_KEYS`).
+first, each with the name of its robot (`MERGED_ROWS`). What else the replies have is there once
+where all agree, else listed by robot, with a sum where that says something. Where a reply is about
+one robot as a whole, it becomes a row itself (`SHORT_KEYS`).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ros2_memory import results
 from ros2_memory.core import errors
 from ros2_memory.core.errors import EpisodicError, InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.core.reply import PLAIN, JsonObject, Key, Merging, with_notes
+from ros2_memory.core.reply import PLAIN, JsonObject, Key, with_notes
 from ros2_memory.core.text import listed, still_quoted
 from ros2_memory.core.timebase import (
     MAX_NS,
@@ -49,7 +49,7 @@ from ros2_memory.tools.replies import ROBOT_NAME, as_json
 from ros2_memory.tools.reply_size import to_json_text
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping, Sequence
+    from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.tools.declaration import Question, Tool
@@ -413,28 +413,25 @@ def _rows(declared: Sequence[Key], replies: Sequence[RobotReply], page: Page) ->
     times = {key.name: key.row_time for key in declared if key.row_time}
     present = {name for value in values.values() for name in value}
     key = next((name for name in times if name in present), next(iter(times)))
-    merging = {key.name: key.merging for key in declared if key.merging}
-    names = {name for name, how in merging.items() if how == "inherited"}
     order: list[tuple[bool, float, JsonObject]] = []
     for reply in replies:
-        value = values[reply.name]
-        same = _without(value, value.keys() - names)
-        for row in _list(value.get(key)):
+        for row in _list(values[reply.name].get(key)):
             time = row.get(times[key], 0)
             # A row whose time is null goes on.
             at = math.inf if time is None else _number(time)
-            named = {ROBOT_NAME: reply.name, **same, **row}
+            named = {ROBOT_NAME: reply.name, **row}
             order.append((reply.is_ahead, at if page.oldest_first else -at, named))
     order.sort(key=itemgetter(0, 1))
     rows: JsonObject = {key: [row for *_, row in order[: page.limit]]}
     if key == MATCHES:
         never = [reply.name for reply in replies if reply.value is None]
         return {**rows, "never": [*never]} if never else rows
-    rest = {name: _without(value, {key, *names}) for name, value in values.items()}
+    rest = {name: _without(value, {key}) for name, value in values.items()}
     is_cut = order[: page.limit] != order or any(value.get("more") for value in values.values())
     more: JsonObject = {"more": True}
     marks_more = is_cut and any(key.name == "more" for key in declared)
-    return {**rows, **_combined(merging, replies, rest), **(more if marks_more else {})}
+    added = {key.name for key in declared if key.is_added}
+    return {**rows, **_combined(rest, added), **(more if marks_more else {})}
 
 
 def _as_rows(reply: RobotReply) -> JsonObject:
@@ -447,49 +444,32 @@ def _as_rows(reply: RobotReply) -> JsonObject:
     return reply.body
 
 
-def _combined(
-    merging: Mapping[str, Merging], replies: Sequence[RobotReply], values: Mapping[str, JsonObject]
-) -> JsonObject:
-    """Returns what the replies have besides rows, and what of it is not the same for all.
+def _combined(values: Mapping[str, JsonObject], added: Collection[str] = frozenset()) -> JsonObject:
+    """Returns what replies have besides rows: once where all agree, else by robot.
 
-    What is added up is also listed by robot.
+    Numbers of the keys that are `added` up are listed by robot, too; counts by name are not.
     """
     combined: JsonObject = {}
     by_robot: dict[str, JsonObject] = {}
-    # Times of robots whose clock is ahead are compared only where there are no others.
-    dated = [reply.name for reply in replies if not reply.is_ahead] or [*values]
     # Where a robot has not counted all, there is no total, but at least so many.
     is_counted = not any(AT_LEAST in value for value in values.values())
     for key in dict.fromkeys(key for value in values.values() for key in value):
+        of_robots = {name: value[key] for name, value in values.items() if key in value}
+        counts = [value for value in of_robots.values() if isinstance(value, dict)]
+        agree = len({*map(to_json_text, of_robots.values())}) == 1 and len(of_robots) == len(values)
         if key in _LEFT_OUT:
             continue
-        of_robots = {name: value[key] for name, value in values.items() if key in value}
-        how = merging.get(key, "added" if key == AT_LEAST else "")
-        agree = len({*map(to_json_text, of_robots.values())}) == 1 and len(of_robots) == len(values)
-        if how in {"who", "counted", "earliest", "newest"}:
-            combined[key] = _as_one(how, of_robots, dated)
-        elif how == "" and agree:
+        if key in added and counts:
+            combined[key] = dict(sum(map(Counter[str], counts), Counter()).most_common())
+        elif agree and key not in {AT_LEAST, *added}:
             combined[key] = next(iter(of_robots.values()))
         else:
-            if how == "added" and (is_counted or key != _TOTAL):
+            if key == AT_LEAST or (key in added and (is_counted or key != _TOTAL)):
                 totals = [value.get(_TOTAL) for value in values.values() if key == AT_LEAST]
                 combined[key] = round(sum(map(_number, (*of_robots.values(), *totals))), 2)
             for name, value in of_robots.items():
                 by_robot.setdefault(name, {})[key] = value
     return {**combined, "by_robot": {**by_robot}} if by_robot else combined
-
-
-def _as_one(how: str, of_robots: Mapping[str, JsonValue], dated: Sequence[str]) -> JsonValue:
-    """Returns what a key becomes that is not listed by robot; times are those of `dated` robots."""
-    if how == "who":
-        return [name for name, is_so in of_robots.items() if is_so]
-    if how == "counted":
-        sums = Counter[str]()
-        for counts in of_robots.values():
-            sums.update(counts if isinstance(counts, dict) else {})
-        return dict(sums.most_common())
-    times = [_number(of_robots[name]) for name in dated if of_robots.get(name) is not None]
-    return (min if how == "earliest" else max)(times, default=None)
 
 
 def _by_topic(replies: Sequence[RobotReply]) -> list[JsonValue]:
@@ -525,7 +505,7 @@ def _one_table(replies: Sequence[RobotReply]) -> JsonObject:
             totals[name] = [*map(dict(zip(header[1:], total, strict=True)).get, columns[1:])]
     rest = {reply.name: _without(reply.body, {"columns", "rows", "all"}) for reply in replies}
     table: JsonObject = {"columns": [ROBOT_NAME, *columns], "rows": rows, "all": totals}
-    return table | _combined({}, replies, rest)
+    return table | _combined(rest)
 
 
 def by_reason(reasons: Iterable[tuple[str, str]]) -> dict[str, list[str]]:

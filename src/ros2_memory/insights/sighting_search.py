@@ -7,10 +7,9 @@ Where a scope does not hold, a match counts as no match.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import product
-from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -26,7 +25,7 @@ from ros2_memory.history.reverse_search import RowCondition
 from ros2_memory.history.scan import messages_at, scan
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator
+    from collections.abc import Callable, Collection, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -45,7 +44,6 @@ UNKNOWN: Final = 2
 
 _TOGETHER_NS: Final[Ns] = 2 * NS_PER_S
 """Messages that the bag decides and are no farther apart are read at once."""
-_LAST: Final = attrgetter("last")
 _MOST_WAITING: Final = 1 << 14
 """So many messages are looked at together."""
 
@@ -198,19 +196,35 @@ class Run(NamedTuple):
         first: log time of the first match.
         last: of the last one.
         messages: how many there are.
-        until: of the next message, which is no match or comes after a silence; None where that is
-            not known.
-        begun: whether what came before the first match is known.
+        until: of the next message, which is no match or comes after a silence; `MAX_NS` where that
+            is not known.
         later: how many matches have the log time of the last one, and come after it.
+        begun: 1 where what came before the first match is known, else 0.
     """
 
     topic: str
     first: Ns
     last: Ns
     messages: int
-    until: Ns | None
-    begun: bool = True
-    later: int = 0
+    until: Ns
+    later: int
+    begun: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Runs:
+    """Runs, the newest first; a column for each attribute of `Run`, topics by their number."""
+
+    topic: IntArray
+    first: IntArray
+    last: IntArray
+    messages: IntArray
+    until: IntArray
+    later: IntArray
+    begun: IntArray
+
+
+_NO_RUNS: Final = Runs(*[np.zeros(0, np.int64)] * 7)
 
 
 class BlockRuns(NamedTuple):
@@ -223,13 +237,13 @@ class BlockRuns(NamedTuple):
         is_blank: whether it has neither a match nor a message that surely is none.
     """
 
-    runs: list[Run]
-    goes_back: bool = False
-    goes_on: bool = False
-    is_blank: bool = False
+    runs: Runs
+    goes_back: bool
+    goes_on: bool
+    is_blank: bool
 
 
-def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
+def runs_of(topic: int, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     """Returns the runs of matches in some messages, of which there is at least one.
 
     A run ends with a message that does not match, and where none comes for longer than
@@ -237,27 +251,31 @@ def runs_of(topic: str, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
     """
     times, met = tested.times, tested.met
     begins = np.diff(times, prepend=times[0]) > SILENCE_NS
-    # Of two matches, this differs where a message that is none, or a silence, lies between them.
-    ends = np.cumsum((met == NOT_MET) | begins)
-    rows = np.flatnonzero(met == MET)
-    if not rows.size:
-        return BlockRuns([], is_blank=int(ends[-1]) == 0)
-    new = np.ones(rows.size, np.bool_) if apart else np.r_[True, np.diff(ends[rows]) > 0]
-    starts = np.flatnonzero(new)
-    stops = np.r_[starts[1:], rows.size]
     others = np.flatnonzero((met == NOT_MET) | begins)
-    until = np.append(times[others], MAX_NS)[np.searchsorted(others, rows[stops - 1], side="right")]
+    rows = np.flatnonzero(met == MET)
+    # Of two matches, this differs where a message that is none, or a silence, lies between them.
+    ends = np.searchsorted(others, rows, side="right")
+    starts = np.arange(rows.size)
+    if not apart:
+        starts = np.flatnonzero(np.diff(ends, prepend=-1) > 0)
+    stops = np.append(starts, rows.size)[1:]
+    until = np.append(times[others], MAX_NS)[ends[stops - 1]]
     firsts, lasts = times[rows[starts]], times[rows[stops - 1]]
     later = np.searchsorted(times[rows], lasts, side="right") - stops
-    columns = firsts, lasts, stops - starts, np.minimum(until, after), later
-    runs = [
-        Run(topic, first, last, messages, None if end == MAX_NS else end, later=later_matches)
-        for first, last, messages, end, later_matches in np.column_stack(columns).tolist()
-    ]
+    runs = Runs(
+        np.full(starts.size, topic),
+        firsts,
+        lasts,
+        stops - starts,
+        np.minimum(until, after),
+        later,
+        np.ones_like(starts),
+    )
     return BlockRuns(
-        runs[::-1],
-        goes_back=not apart and int(ends[rows[0]]) == 0,
-        goes_on=not apart and ends[rows[-1]] == ends[-1],
+        rows_of(runs, slice(None, None, -1)),
+        goes_back=not apart and ends[:1].tolist() == [0],
+        goes_on=not apart and ends[-1:].tolist() == [others.size],
+        is_blank=not rows.size and not others.size,
     )
 
 
@@ -266,39 +284,45 @@ class SearchedRuns:
     """What a search found.
 
     Attributes:
+        topics: their names, by number.
         runs: the newest first.
         searched_to: a log time; all that is newer was searched. None: all of the window was.
         is_over: whether the search ended since its time was over.
     """
 
-    runs: list[Run]
+    topics: Sequence[str]
+    runs: Runs
     searched_to: Ns | None = None
     is_over: bool = False
+
+    def listed(self, which: IntArray | slice[int | None, int | None]) -> list[Run]:
+        """Returns some of the runs."""
+        runs = rows_of(self.runs, which)
+        columns = (getattr(runs, column.name).tolist() for column in fields(runs))
+        return [Run(self.topics[topic], *run) for topic, *run in zip(*columns, strict=True)]
 
 
 class _TopicRuns:
     """The runs of one topic, from its newest block on."""
 
-    def __init__(self, topic: str, *, apart: bool) -> None:
+    def __init__(self, topic: int, *, apart: bool) -> None:
         self._topic = topic
         self._apart = apart
-        self._runs: list[Run] = []
+        self._runs: list[Runs] = []
         self._is_open = False
         self._begins: Ns = MAX_NS
         self._waiting: list[Tested] = []
         self._messages = 0
 
-    @property
-    def runs(self) -> list[Run]:
-        """The runs, the newest first."""
+    def runs(self, *, cut: bool) -> list[Runs]:
+        """Returns tables of runs. With `cut` the oldest may have begun earlier than is known."""
         self._join()
-        return self._runs
-
-    @property
-    def closed(self) -> list[Run]:
-        """The runs to which no older match can belong."""
-        runs = self.runs
-        return runs[:-1] if self._is_open else runs
+        if not (cut and self._is_open):
+            return self._runs
+        *newer, oldest = self._runs
+        begun = oldest.begun.copy()
+        begun[-1] = 0
+        return [*newer, replace(oldest, begun=begun)]
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
@@ -327,26 +351,23 @@ class _TopicRuns:
         if added.is_blank:
             self._is_open = self._is_open and is_near
             return
+        runs = added.runs
         if self._is_open and is_near and added.goes_on:
-            newer, older = self._runs.pop(), added.runs.pop(0)
-            messages = newer.messages + older.messages
-            self._runs.append(newer._replace(first=older.first, messages=messages))
-        self._runs += added.runs
+            self._runs[-1].first[-1] = runs.first[0]
+            self._runs[-1].messages[-1] += runs.messages[0]
+            runs = rows_of(runs, slice(1, None))
+        if runs.first.size:
+            self._runs.append(runs)
         self._is_open = added.goes_back
 
-    def end_in(self, view: View, gap: TimeWindow) -> None:
+    def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that was not searched.
 
         Then, and where no run goes on, what follows an older run is not known.
         """
         self._join()
-        if not self._is_open or _has_messages(view, self._topic, gap):
+        if not self._is_open or _has_messages(view, topic, gap):
             self._is_open, self._begins = False, MAX_NS
-
-    def cut(self) -> list[Run]:
-        """Returns the runs, of which the oldest may have begun earlier than is known."""
-        runs = self.runs
-        return [*runs[:-1], runs[-1]._replace(begun=False)] if self._is_open else runs
 
 
 def find_runs(
@@ -371,53 +392,58 @@ def find_runs(
     tester = MatchTester(view, search)
     # What lies outside of a scope is not read, and may well be decodable.
     tester.ruled_out = scope.is_bounded
-    is_log = view.timeline.is_log
-    latched = [topic for topic in search.topics if scope.is_bounded and is_latched(view, topic)]
+    topics, is_log = search.topics, view.timeline.is_log
+    latched = [topic for topic in topics if scope.is_bounded and is_latched(view, topic)]
     if latched:
         enough = None
-    runs_by_topic = {topic: _TopicRuns(topic, apart=is_log(topic)) for topic in search.topics}
+    by_topic = {topic: _TopicRuns(nth, apart=is_log(topic)) for nth, topic in enumerate(topics)}
     reached = searched = scope.window.stop
     try:
         for window in [scope.window] if latched else scope.narrowed():
-            for topic_runs in runs_by_topic.values():
-                topic_runs.end_in(view, TimeWindow(window.stop, searched))
+            for topic, topic_runs in by_topic.items():
+                topic_runs.end_in(view, topic, TimeWindow(window.stop, searched))
             searched = window.start
-            blocks = (tester.newest_first(topic, window) for topic in runs_by_topic)
+            blocks = (tester.newest_first(topic, window) for topic in topics)
             for block in heapq.merge(*blocks, key=lambda block: -block.last):
                 is_whole = not scope.is_bounded or block.topic in latched
                 counted = block if is_whole else _scoped(block, scope)
-                runs_by_topic[block.topic].add(counted)
-                reached = block.first if len(runs_by_topic) == 1 else block.last
-                if enough is not None and _has_enough(runs_by_topic, enough, reached):
+                by_topic[block.topic].add(counted)
+                reached = block.first if len(topics) == 1 else block.last
+                if enough is not None and _has_enough(by_topic.values(), enough, reached):
                     break
             else:
                 continue
             break
     except QueryTimeoutError:
-        runs = [run for topic_runs in runs_by_topic.values() for run in topic_runs.cut()]
-        if not runs:
+        found = SearchedRuns(
+            topics, _newest_first(by_topic.values(), cut=True), reached, is_over=True
+        )
+        if not found.runs.first.size:
             raise
-        parts = [*_parts_in(view, runs, scope, latched)]
-        return SearchedRuns(sorted(parts, key=_LAST, reverse=True), reached, is_over=True)
-    runs = sorted(
-        _parts_in(view, _newest_first(runs_by_topic), scope, latched), key=_LAST, reverse=True
-    )
-    if enough is not None and len(runs) > enough:
+        return _parts_in(view, found, scope, latched)
+    found = SearchedRuns(topics, _newest_first(by_topic.values()))
+    found = _parts_in(view, found, scope, latched)
+    if enough is not None and found.runs.first.size > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
-        search.note_untested(replace(scope.window, start=runs[enough - 1].first))
-        return SearchedRuns(runs, reached)
-    search.close(scope.window, is_found=bool(runs), ruled_out=tester.ruled_out)
-    return SearchedRuns(runs)
+        since = int(found.runs.first[enough - 1])
+        search.note_untested(replace(scope.window, start=since))
+        return replace(found, searched_to=reached)
+    search.close(scope.window, is_found=found.runs.first.size > 0, ruled_out=tester.ruled_out)
+    return found
 
 
 def _parts_in(
-    view: View, runs: Iterable[Run], scope: Scope, latched: Collection[str]
-) -> Iterator[Run]:
-    """Yields runs, and of those of latched topics the parts of a scope in which they held."""
+    view: View, found: SearchedRuns, scope: Scope, latched: Collection[str]
+) -> SearchedRuns:
+    """Returns runs, and of those of latched topics the parts of a scope in which they held."""
+    if not latched:
+        return found
     _, end = scope.window.asked()
-    for run in runs:
+    parts: list[tuple[int, ...]] = []
+    for run in found.listed(slice(None)):
+        topic = found.topics.index(run.topic)
         if run.topic not in latched:
-            yield run
+            parts.append((topic, *run[1:]))
             continue
         until = held_until(view, run.topic, run.last, end)
         for first, stop in scope.parts_of(run.first, until):
@@ -427,8 +453,10 @@ def _parts_in(
                 messages = sum(1 for _ in view.stream.messages([run.topic], said))
             if messages or first < stop:
                 last = max(first, min(run.last, stop))
-                begun = run.begun and first == run.first
-                yield Run(run.topic, first, last, messages, run.until, begun)
+                begun = run.begun if first == run.first else 0
+                parts.append((topic, first, last, messages, run.until, 0, begun))
+    columns = np.array(parts, np.int64).reshape(-1, 7).T
+    return replace(found, runs=_in_order([Runs(*columns)]))
 
 
 def _scoped(block: Block, scope: Scope) -> Block:
@@ -459,18 +487,18 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
     return bool(bags) and view.stream.first([topic], gap) is not None
 
 
-def _has_enough(runs_by_topic: dict[str, _TopicRuns], enough: int, reached: Ns) -> bool:
+def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:
     """Returns whether no match older than a moment can change the newest runs."""
-    if sum(len(topic_runs.runs) for topic_runs in runs_by_topic.values()) <= enough:
-        return False
-    newest = _newest_first(runs_by_topic)[:enough]
-    closed = {id(run) for topic_runs in runs_by_topic.values() for run in topic_runs.closed}
-    return newest[-1].last >= reached and all(id(run) in closed for run in newest)
+    runs = _newest_first(by_topic, cut=True)
+    newest = rows_of(runs, slice(enough))
+    return runs.first.size > enough and newest.last[-1] >= reached and bool(newest.begun.all())
 
 
-def _newest_first(runs_by_topic: dict[str, _TopicRuns]) -> list[Run]:
-    return sorted(
-        (run for topic_runs in runs_by_topic.values() for run in topic_runs.runs),
-        key=_LAST,
-        reverse=True,
-    )
+def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool = False) -> Runs:
+    tables = [table for topic_runs in by_topic for table in topic_runs.runs(cut=cut)]
+    return _in_order([_NO_RUNS, *tables])
+
+
+def _in_order(tables: Sequence[Runs]) -> Runs:
+    runs = stacked(tables)
+    return rows_of(runs, np.argsort(-runs.last, kind="stable"))

@@ -14,20 +14,16 @@ from dataclasses import replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
 
+import numpy as np
+
 from ros2_memory.analysis.conditions import Condition, NearPosition, matched_texts
 from ros2_memory.analysis.frames import TF_CACHE_NS
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.errors import (
-    InvalidArgumentsError,
-    QueryTimeoutError,
-)
+from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, Pose, TimeWindow
 from ros2_memory.core.regions import places_at
 from ros2_memory.core.text import Quoted, named, quote
-from ros2_memory.core.timebase import (
-    MIN_NS,
-    Ns,
-)
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.clock_steps import elapsed_in
 from ros2_memory.history.coverage import note_unread, recorded_reach, unix_text
 from ros2_memory.history.held_values import held_at, held_until, is_latched
@@ -57,9 +53,10 @@ from ros2_memory.results import Episode, LabelledPlace, Sighting, Sightings
 from ros2_memory.things.unseen import notes_on_never
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterable, Iterator
 
     from ros2_memory.analysis.clock_steps import Elapsed
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.context import Call, Memory
     from ros2_memory.history.stored_message import StoredMessage
 
@@ -230,8 +227,10 @@ def _runs_as_sightings(
             f"the search ran out of time at {unix_text(result.searched_to or MIN_NS)}: to "
             "continue, pass that time as end"
         )
-    runs = result.runs[-shown.limit :][::-1] if shown.oldest_first else result.runs[: shown.limit]
-    searched, total = scope.window, len(result.runs) if result.searched_to is None else None
+    runs = result.listed(
+        slice(None, -shown.limit - 1, -1) if shown.oldest_first else slice(shown.limit)
+    )
+    searched, total = scope.window, len(result.runs.first) if result.searched_to is None else None
     if total is None:
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
@@ -252,8 +251,8 @@ def _runs_as_sightings(
 
 def read_sightings(
     view: View, pattern: str, condition: Condition, scope: Scope
-) -> tuple[list[tuple[Ns, Ns, bool]], Ns | None]:
-    """Returns the times (inclusive) of all sightings in a scope, oldest first.
+) -> tuple[Ints, Ns | None]:
+    """Returns the times (inclusive) of all sightings in a scope, N x 3.
 
     And whether each is known to begin then: what a latched topic had said before may hold on. With
     them since when they are known, where the call's time is over before all is searched.
@@ -266,29 +265,38 @@ def read_sightings(
     topics = matching_topics(view, pattern)
     goals = goals_asked(view, topics, condition, scope)
     if goals is not None:
-        ends = [(goal.first, _goes_on_until(view, goal, scope), True) for goal in reversed(goals)]
-        return ends, None
+        return held_spans(
+            (goal.first, _goes_on_until(view, goal, scope), True) for goal in goals
+        ), None
     if says_episodes(view, topics):
         found, _, since = find_episodes(
             view, topics[0], condition, scope, limit=MOST_COUNTED, oldest_first=True
         )
-        return [(episode.first, episode.until, True) for episode in found], since
+        return held_spans((episode.first, episode.until, True) for episode in found), since
     result = find_runs(view, ReverseSearch(view, pattern, condition), scope, enough=None)
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
     start, end = scope.window.asked()
+    runs, is_log = result.runs, np.array([*map(view.timeline.is_log, topics)], np.bool_)
+    until, states = runs.last.copy(), np.flatnonzero(~is_log[runs.topic])
+    until[states] = [_lasted_until(view, run, scope) for run in result.listed(states)]
     # Without a scope the oldest may have begun before what there was time to search.
-    is_whole = not scope.is_bounded
-    spans = [
-        (run.first, _lasted_until(view, run, scope), run.begun or is_whole)
-        for run in reversed(result.runs)
+    begun = runs.begun if scope.is_bounded else np.ones_like(until)
+    spans: Ints = np.column_stack((runs.first, until, begun))
+    if result.is_over:
+        return spans, int(runs.first[-1])
+    earlier = [
+        (first, last, False)
+        for topic in topics
+        if met_before(view, topic, condition, start)
+        for first, last in scope.parts_of(start, held_until(view, topic, start, end))
     ]
-    since = spans[0][0] if result.is_over else None
-    for topic in topics if since is None else ():
-        if met_before(view, topic, condition, start):
-            parts = scope.parts_of(start, held_until(view, topic, start, end))
-            spans += [(first, last, False) for first, last in parts]
-    return sorted(spans), since
+    return np.concatenate((spans, held_spans(earlier))), None
+
+
+def held_spans(spans: Iterable[tuple[Ns, Ns, bool]]) -> Ints:
+    """Returns times (inclusive), and whether each is known to begin then, as an array, N x 3."""
+    return np.array([*spans], np.int64).reshape(-1, 3)
 
 
 def met_before(view: View, topic: str, condition: Condition, moment: Ns) -> StoredMessage | None:
@@ -329,7 +337,7 @@ def _lasted_until(view: View, run: Run, scope: Scope) -> Ns:
     if view.timeline.is_log(run.topic):
         return last
     _, end = scope.window.asked()
-    if run.until is None or is_latched(view, run.topic):
+    if run.until == MAX_NS or is_latched(view, run.topic):
         return scope.holds_until(last, held_until(view, run.topic, last, end))
     is_silent = run.until - last > SILENCE_NS
     return scope.holds_until(last, last if is_silent else max(last, min(run.until, end)))
@@ -352,7 +360,7 @@ def _sighting(
     value, detections = _counted(view, condition, newest.type, message)
     labels = {detection.label for detection in detections}
     thing = _sought_detection(detections, condition)
-    robot_at_first = thing is None and run.begun
+    robot_at_first = thing is None and run.begun > 0
     at = run.first if robot_at_first else run.last
     newest_recording = newest.bag.recording
     recording = recording_at(view, newest.topic, at, newest_recording) or newest_recording
@@ -363,7 +371,7 @@ def _sighting(
         last=run.last,
         until=_lasted_until(view, run, scope) if thing is None else run.last,
         messages=run.messages,
-        begun=run.begun,
+        begun=run.begun > 0,
         robot=robot,
         thing=_place_of_thing(
             view, condition, newest, run.first, robot, thing=thing, frame_id=frame_id

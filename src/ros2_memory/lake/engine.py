@@ -1,23 +1,38 @@
-"""DuckDB, inside of this process, runs SQL over data files of a lake. It loads no extension.
+"""Reads a lake: which files its tables have now, and DuckDB, inside of this process, over these.
 
-It is given the data files that hold what a question is about, and never looks at the lake's
-catalogue itself.
+DuckDB is given the data files that hold what a question is about, and never looks at the lake's
+catalogue itself. It loads no extension.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+import math
+import threading
+import time
+from collections import defaultdict
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from datetime import date, timedelta
+from itertools import chain
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
+from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
+from pyiceberg.manifest import ManifestContent, ManifestFile
+from pyiceberg.transforms import IdentityTransform
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.lake.tables import NAMESPACE, TABLES
+from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
-    from ros2_memory.lake.warehouse import DataFiles, Parameters
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
+    from pyiceberg.catalog import Catalog as IcebergCatalog
+    from pyiceberg.table import Table as IcebergTable
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
@@ -28,47 +43,174 @@ _LOCAL: Final = (
     " UNION ALL BY NAME"
     " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
 )
+_EPOCH: Final = date(1970, 1, 1)
+_LAST: Final = "\U0010ffff"
+"""After all ids of bags."""
+_MESSAGE_BYTES: Final = 64 << 20
 
 log = get_logger(__name__)
 
 
-class DuckdbEngine:
-    """Reads local files itself, within its limits, and those of a store through Arrow.
+class LakeFile(NamedTuple):
+    """A Parquet file by its URI, and how many rows it has.
 
-    Safe to use from several threads at once.
-
-    Args:
-        memory_mb: how much memory it may use.
-        threads: how many threads; None for one for each core.
+    No id of a bag in it is before `first`, nor after `last`.
     """
 
-    def __init__(self, memory_mb: int = 1024, threads: int | None = None) -> None:
+    location: str
+    rows: int = 0
+    first: str = ""
+    last: str = _LAST
+
+
+Parameters: TypeAlias = "Mapping[str, str | int | float | Sequence[str]]"
+Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
+"""The files of one robot in one table by day, in order of the days."""
+
+
+class Partitions:
+    """The files of the versions of one table that it was last shown. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._snapshot: int | None = None
+        self._read: dict[str, Sequence[tuple[str, date, LakeFile]]] = {}
+        self._robots: dict[str, dict[date, list[LakeFile]]] = {}
+
+    def look(self, table: IcebergTable) -> Mapping[str, Days]:
+        """Returns the files of a table's current version, by robot.
+
+        Raises:
+            RefusedError: another program wrote what cannot be read by robot and day.
+        """
+        snapshot = table.current_snapshot()
+        if snapshot is None or snapshot.snapshot_id == self._snapshot:
+            return self._robots
+        read = {}
+        for manifest in snapshot.manifests(table.io):
+            path = manifest.manifest_path
+            read[path] = self._read.get(path) or [*_files(table, manifest)]
+        robots: dict[str, dict[date, list[LakeFile]]] = {}
+        for robot, day, file in sorted(chain.from_iterable(read.values())):
+            robots.setdefault(robot, {}).setdefault(day, []).append(file)
+        self._read, self._robots, self._snapshot = read, robots, snapshot.snapshot_id
+        return robots
+
+
+def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
+    name = f"the lake's table {table.name()[-1]}"
+    entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
+    if entries and manifest.content is ManifestContent.DELETES:
+        do = "rewrite them into its data files first (copy-on-write)"
+        raise RefusedError(f"{name} has delete files, which another program wrote: {do}")
+    spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
+    positions = {
+        schema.find_column_name(part.source_id): position
+        for position, part in enumerate(spec.fields)
+        if isinstance(part.transform, IdentityTransform)
+    }
+    for column in ("robot", "day"):
+        if column not in positions:
+            why = f"has files that are not of one {column}, which another program wrote"
+            raise RefusedError(f"{name} {why}: partition it by robot and day again")
+    bag_id = schema.find_field("bag_id").field_id
+    for data in (entry.data_file for entry in entries):
+        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
+        first, last = (
+            bytes((bounds or {}).get(bag_id) or b"").decode()
+            for bounds in (data.lower_bounds, data.upper_bounds)
+        )
+        file = LakeFile(data.file_path, data.record_count, first, last or _LAST)
+        yield str(data.partition[positions["robot"]]), day, file
+
+
+class Lake:
+    """The tables of a lake as they are now, and DuckDB, which reads them. Thread-safe.
+
+    Args:
+        catalog: of the tables.
+        translated: turns the errors of catalogues and stores into those of this program.
+        memory_mb: how much memory DuckDB may use.
+        threads: how many threads; None for one for each core.
+
+    Attributes:
+        messages: packed ones that were read last, of all robots.
+    """
+
+    def __init__(
+        self,
+        catalog: IcebergCatalog,
+        translated: Callable[[str], AbstractContextManager[None]] = lambda _: nullcontext(),
+        memory_mb: int = 1024,
+        threads: int | None = None,
+    ) -> None:
         settings = {**_SETTINGS, "memory_limit": f"{memory_mb}MiB"}
         if threads:
             settings["threads"] = str(threads)
-        self._connection = duckdb.connect(config={**settings})
+        self._database = duckdb.connect(config={**settings})
+        self._catalog, self._translated = catalog, translated
+        self.messages = ByteLru[bytes](_MESSAGE_BYTES)
+        self._lock = threading.Lock()
+        self._looked_at = -math.inf
+        self._tables: dict[str, IcebergTable] = {}
+        self._partitions: defaultdict[str, Partitions] = defaultdict(Partitions)
 
-    def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
-        """Returns the rows of one select `FROM` the table, in no order without `ORDER BY`.
+    def close(self) -> None:
+        """Closes DuckDB's database, which is in memory."""
+        self._database.close()
 
-        A column that a file lacks is null there, and the table may have no file at all. `$name` is
-        the parameter of that name, whose text is never SQL; a list is for `IN $name`.
+    def refresh(self, within_s: float = 0.0) -> None:
+        """Looks for what was committed since, unless that was done within so many seconds.
+
+        `bags` is committed last, so nothing else changes for those who ask about its rows.
+
+        Raises:
+            RefusedError: the lake cannot be read; so do all others.
+        """
+        with self._looking():
+            if time.monotonic() - self._looked_at >= within_s:
+                # Other tables are looked up later, and have the rows of these bags by then.
+                self._tables = {}
+                self._loaded_table("bags")
+                self._looked_at = time.monotonic()
+
+    def days(self, name: str) -> Mapping[str, Days]:
+        """Returns the files of a table by robot, in order; no file of rows is read.
+
+        In those of a robot no row of another one is.
+        """
+        with self._looking():
+            table = self._loaded_table(name)
+            return {} if table is None else self._partitions[name].look(table)
+
+    def select(
+        self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
+    ) -> pa.Table:
+        """Returns the rows of one select `FROM` a table, in no order without `ORDER BY`.
+
+        It is over some files of the table, if any; a column that a file lacks is null there.
+        `$name` is the parameter of that name, whose text is never SQL; a list is for `IN $name`.
 
         Raises:
             RefusedError: a file cannot be read; the log has why.
         """
-        bound: dict[str, object] = {**parameters}
+        with self._looking():
+            table = self._loaded_table(name)
+        properties = {} if table is None else dict(table.io.properties)
+        places = [PyArrowFileIO.parse_location(file.location) for file in files]
+        paths = [path for *_, path in places]
+        rows: pa.Table | ds.Dataset = TABLES[name].arrow_schema.empty_table()
+        source, bound = "SELECT * FROM in_store", dict[str, object](parameters or {})
         try:
             # A cursor of its own, which alone knows the table.
-            with self._connection.cursor() as cursor:
-                rows, local = _opened(files)
+            with self._database.cursor() as cursor:
+                if not {scheme for scheme, *_ in places} <= {"file"}:
+                    store = PyArrowFileIO(properties).fs_by_scheme(*places[0][:2])
+                    rows = ds.dataset(paths, rows.schema, format="parquet", filesystem=store)
+                elif paths:
+                    # DuckDB reads local files itself, within its limits.
+                    source, bound["local"] = source + _LOCAL, paths
                 cursor.register("in_store", rows)
-                source = "SELECT * FROM in_store"
-                if local:
-                    source += _LOCAL
-                    bound["local"] = local
-                query = f"WITH {table} AS ({source}) {sql}"
-                return cursor.sql(query, params=bound).to_arrow_table()
+                return cursor.sql(f"WITH {name} AS ({source}) {sql}", params=bound).to_arrow_table()
         except (duckdb.Error, OSError, pa.ArrowException) as error:
             # Its sentence alone: a traceback with variables would show the keys of a store.
             kind = type(error).__name__
@@ -77,19 +219,15 @@ class DuckdbEngine:
             text = f"the lake cannot be read ({kind}); the server's log has the reason"
             raise RefusedError(text) from error
 
-    def close(self) -> None:
-        """Closes the database, which is in memory."""
-        self._connection.close()
+    @contextmanager
+    def _looking(self) -> Iterator[None]:
+        with self._lock, self._translated("looking into the lake"):
+            yield
 
-
-def _opened(files: DataFiles) -> tuple[pa.Table | ds.Dataset, list[str]]:
-    """Returns the rows of files that are in a store, and the paths of those that are not.
-
-    All columns of the table are in the former, also where no file is in a store.
-    """
-    places = [PyArrowFileIO.parse_location(location) for location in files.locations]
-    paths = [path for *_, path in places]
-    if {scheme for scheme, *_ in places} <= {"file"}:
-        return files.schema.empty_table(), paths
-    store = PyArrowFileIO(dict(files.store)).fs_by_scheme(*places[0][:2])
-    return ds.dataset(paths, schema=files.schema, format="parquet", filesystem=store), []
+    def _loaded_table(self, name: str) -> IcebergTable | None:
+        if name not in self._tables:
+            try:
+                self._tables[name] = self._catalog.load_table(f"{NAMESPACE}.{name}")
+            except NoSuchTableError:
+                return None
+        return self._tables[name]

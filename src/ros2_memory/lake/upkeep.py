@@ -29,7 +29,7 @@ from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.lake.rows import bag_id_of
 from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, overlapping
-from ros2_memory.lake.warehouse import WRITTEN, LakeTables, Partitions
+from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -68,7 +68,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     closed = day_of(now - _DAY_NS)
     done = 0
     for name in TABLES:
-        for day, robots in _to_compact(lake.current(name), closed):
+        for day, robots in _to_compact(lake.days(name), closed):
             alive()
             condition = of_robots(robots, day)
             lake.replace(name, condition, lake.rows(name, condition))
@@ -78,14 +78,14 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     return done
 
 
-def _to_compact(table: IcebergTable, closed: date) -> Iterator[tuple[date, list[str]]]:
+def _to_compact(
+    days: Sequence[tuple[date, str, int, int]], closed: date
+) -> Iterator[tuple[date, list[str]]]:
     """Yields what to put together of the days before `closed`: a day, and some of its robots."""
     sizes = sorted(
         (day, robot, size)
-        for robot, days in Partitions().look(table).items()
-        for day, files in days.items()
-        if day < closed and len(files) > FEW_FILES
-        if (size := sum(file.size for file in files)) <= _MOST_BYTES
+        for day, robot, files, size in days
+        if day < closed and files > FEW_FILES and size <= _MOST_BYTES
     )
     for day, of_day in groupby(sizes, itemgetter(0)):
         robots, total = list[str](), 0

@@ -262,7 +262,8 @@ class TrackReader:
     ) -> FragmentKey | None:
         """Returns the key of a stretch's track; None where what it follows from may change."""
         start, last = stretch.window.start, stretch.last
-        if stretch.parts is None or not window.covers(start, last):
+        # Where the scan begins with it, what reaches into it from before is part of it.
+        if start == opened.window.start or stretch.parts is None or not window.covers(start, last):
             return None
         sessions, span = self._view.sessions, TimeWindow(start, last + 1)
         numbers: dict[Session, int] = {}

@@ -336,19 +336,19 @@ class PlaceVisits:
 
 
 @result(
-    NAME("frame_id").merged("inherited"),
+    NAME("frame_id"),
     PLAIN("where").if_known,
     PLAIN("x", "circle.x").if_known,
     PLAIN("y", "circle.y").if_known,
     PLAIN("radius_m", "circle.radius_m").if_known,
-    PLAIN("there_now").if_known.merged("who"),
+    PLAIN("there_now").if_known,
     OBJECTS("places").if_known.along("last_exit"),
     OBJECTS("visits").unless("is_of_places").along("departed"),
-    TOTAL("total", "total", "all_counted").unless("is_of_places").merged("added"),
-    PLAIN("entries").if_known.merged("added"),
-    PLAIN("exits").if_known.merged("added"),
-    MINUTES("minutes", "duration").unless("is_of_places").merged("added"),
-    SECONDS("unknown_s").if_any.merged("added"),
+    TOTAL("total", "total", "all_counted").unless("is_of_places").added,
+    PLAIN("entries").if_known.added,
+    PLAIN("exits").if_known.added,
+    MINUTES("minutes", "duration").unless("is_of_places").added,
+    SECONDS("unknown_s").if_any.added,
     PLAIN("more").if_any,
     span=("oldest", "now"),
 )

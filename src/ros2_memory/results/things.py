@@ -249,10 +249,10 @@ SHORT_THING: Final = Keys(
 def listed_things(form: Keys) -> Keys:
     """Returns the keys of things, each with these keys."""
     return keys(
-        NAME("frame_id").merged("inherited"),
+        NAME("frame_id"),
         objects(form)("things").along("last_seen"),
-        TOTAL("total", "total", "all_counted").merged("added"),
-        COUNTS_BY_NAME("labels").merged("counted"),
+        TOTAL("total", "total", "all_counted").added,
+        COUNTS_BY_NAME("labels").added,
         span=("oldest", "now"),
     )
 

@@ -319,12 +319,12 @@ class _Loader:
                 raise _TakesTooLongError
 
         self._view.memory.large.acquire()
-        sights, epoch_of_slice = joined(
+        sights = joined(
             [topic.packed for stretch in stretches for topic in stretch.sights],
             [epoch for epoch, _ in of_parts],
             [session for _, session in of_parts],
         )
-        things = estimate(sights, self._labels, epoch_of_slice, self._min_score, go_on)
+        things = estimate(sights, self._labels, self._min_score, go_on)
         since = self._read_from
         if crowded:
             since = max(parts[0][0].start, MIN_NS if since is None else since)

@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import running_end
-from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Sights, Spot
+from ros2_memory.analysis.sights import AHEAD_MM, Beside, Fix, Flags, Ints, Look, Spot
 from ros2_memory.core.arrays import distinct_rows
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
     from ros2_memory.analysis.sights import Floats
+    from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.storage.base import Mask
 
 _CELL_MM: Final = 100
@@ -411,15 +412,14 @@ _SCATTERS: Final = 2.0
 
 
 def with_synonyms(
-    sights: Sights,
+    sights: JoinedSights,
     counts: Ints,
-    epoch: Ints,
     labels: Labels,
     go_on: Callable[[], None],
 ) -> list[str]:
     """Returns the keys of the labels of sights, one for all that are names of one thing.
 
-    `epoch` has the coordinate system of each spot, and `counts` how many of its detections count.
+    `counts` has how many detections of each spot count.
     """
     keys = [labels.key(label) for label in sights.labels]
     by_word: dict[str, list[str]] = defaultdict(list)
@@ -436,7 +436,7 @@ def with_synonyms(
     pairs = [pair for alike in by_word.values() for pair in combinations(alike, 2)]
     for one, other in pairs:
         masks = has_key[one], has_key[other]
-        if not are_two(one, other) and _alternate(sights.spots, counts, epoch, *masks):
+        if not are_two(one, other) and _alternate(sights, counts, *masks):
             group = groups[one] | groups[other]
             groups |= dict.fromkeys(group, group)
     # A name that is used for two things does not tell them apart.
@@ -447,22 +447,25 @@ def with_synonyms(
     return [names[groups[key]] or key for key in keys]
 
 
-def _are_beside(sights: Sights, one: Mask, other: Mask) -> bool:
+def _are_beside(sights: JoinedSights, one: Mask, other: Mask) -> bool:
     """Whether messages have both of two labels at one place, more often than by mistake.
 
     Each is given as which labels of the sights are names of it.
     """
     label, beside = sights.spots[:, Spot.LABEL], sights.beside
-    is_both = one[label[beside[:, Beside.SPOT]]] & other[beside[:, Beside.LABEL]]
+    spot, label_beside, n = (beside[:, name] for name in Beside)
+    is_both = one[label[spot]] & other[label_beside]
     rarer = min(int(sights.spots[mask[label], Spot.N].sum()) for mask in (one, other))
-    return bool(beside[is_both, Beside.N].sum() > _BESIDE_SHARE * rarer)
+    return bool(n[is_both].sum() > _BESIDE_SHARE * rarer)
 
 
-def _alternate(spots: Ints, counts: Ints, epoch: Ints, one: Mask, other: Mask) -> bool:
+def _alternate(sights: JoinedSights, counts: Ints, one: Mask, other: Mask) -> bool:
     """Whether two labels take turns at some place, within the scatter of each other."""
+    spots = sights.spots
     of_both = np.flatnonzero((one | other)[spots[:, Spot.LABEL]] & (counts > 0))
-    for number in np.unique(epoch[of_both]).tolist():
-        rows = of_both[epoch[of_both] == number]
+    epoch = sights.epochs[spots[of_both, Spot.SLICE]]
+    for number in np.unique(epoch).tolist():
+        rows = of_both[epoch == number]
         x, y, slices, label = spots[rows][:, [Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL]].T
         place = places_of(x, y, counts[rows], slices)
         for here in (place == nearest for nearest in range(int(place.max(initial=-1)) + 1)):
@@ -510,7 +513,7 @@ _KNOWN_NS: Final = 60 * NS_PER_S
 """What a localiser said holds as long; it says nothing while the robot stands."""
 
 
-def poorly_localised(sights: Sights) -> tuple[Flags, Flags]:
+def poorly_localised(sights: JoinedSights) -> tuple[Flags, Flags]:
     """Returns which spots and which looks are of a slice in which localisation was poor."""
     fixes = sights.fixes
     time = fixes[:, Fix.TIME]

@@ -12,8 +12,7 @@ there (Viterbi, two states) gives the stays.
 from __future__ import annotations
 
 import math
-from itertools import groupby, pairwise, product
-from operator import itemgetter
+from itertools import chain, pairwise, product
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
@@ -28,14 +27,14 @@ from ros2_memory.analysis.sights import (
     Hit,
     Ints,
     Look,
-    Sights,
     Unplaced,
 )
-from ros2_memory.core.arrays import distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import Groups, distinct_rows, in_ranges, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from ros2_memory.columns.sights import JoinedSights
     from ros2_memory.core.timebase import Ns
 
 
@@ -77,51 +76,50 @@ class Cells:
     """The looks of all slices by cell: which looks were from where.
 
     Args:
-        sights: of all slices, in order of time.
-        epoch: by slice, which odometry its poses are in; the same for all that are in a map.
+        sights: of all slices.
         poor: which looks are not where they seem to be; those say nothing of others.
     """
 
-    def __init__(self, sights: Sights, epoch: Ints, poor: Flags | bool = False) -> None:
-        looks = self._looks = sights.looks
-        self.slice, self.n, self.first, self.last, self.topic = (
-            looks[:, column] for column in (Look.SLICE, Look.N, Look.FIRST, Look.LAST, Look.TOPIC)
-        )
-        self.x = looks[:, Look.X].astype(np.float64)
-        self.y = looks[:, Look.Y].astype(np.float64)
-        self.yaw, self.pan = looks[:, Look.YAW] / 10.0, looks[:, Look.PAN] / 10.0
-        columns = (
+    def __init__(self, sights: JoinedSights, poor: Flags | bool = False) -> None:
+        looks = sights.looks
+        names = (Look.SLICE, Look.TOPIC, Look.X, Look.Y, Look.YAW, Look.PAN, Look.N)
+        columns = (looks.columns[name] for name in names)
+        self.slice, self.topic, self.x, self.y, self.yaw, self.pan, self.n = columns
+        self._first, self.last = looks[:, Look.FIRST], looks[:, Look.LAST]
+        grid = (
             looks[:, Look.YAW] // CELL_DECIDEG,
             looks[:, Look.X] // CELL_MM,
             looks[:, Look.Y] // CELL_MM,
-            self.topic + poor * (len(sights.topics) + 1),
-            epoch[self.slice],
+            self.topic + poor * np.int64(len(sights.topics) + 1),
+            sights.epochs[self.slice],
             looks[:, Look.PAN] // CELL_DECIDEG,
             (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM,
         )
-        cells, cell = distinct_rows(columns)
-        self.cell = _joined(cells, cell, np.stack((self.x, self.y, self.yaw)), self.n)[cell]
-        order = np.argsort(narrowed(self.cell), kind="stable")  # of 16 bits it is much faster
-        self._by_cell = order
-        self._slice_starts = np.searchsorted(self.slice, np.arange(sights.slices + 1))
+        cells, cell = distinct_rows([*map(narrowed, grid)])
+        poses = (self.x, self.y, self.yaw / 10.0)
+        self.cell = narrowed(_joined(cells, cell, poses, self.n)[cell])
+        order = np.argsort(self.cell, kind="stable")  # of 16 bits it is much faster
+        self._by_cell = narrowed(order)
+        starts = np.arange(len(sights.epochs) + 1)
+        self._slice_starts = np.searchsorted(self.slice, starts.astype(self.slice.dtype))
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
         after, before = order[1:], order[:-1]
         is_next = self.cell[after] == self.cell[before]
-        is_next &= self.slice[after] - self.slice[before] <= 1
-        self._previous = np.full(len(order), -1, np.int64)
-        self._previous[after] = np.where(is_next, before, -1)
+        is_next &= np.diff(self.slice[order].astype(np.int64)) <= 1
+        previous = np.full(len(order), -1, np.int64)
+        previous[after] = np.where(is_next, before, -1)
+        self._previous = narrowed(previous)
 
     @property
     def looks(self) -> Looks:
         """What answers need of the looks."""
-        begins = np.zeros(int(self.slice.max(initial=-1)) + 1, np.int64)
-        begins[self.slice] = self.first // SLICE_NS * SLICE_NS
-        after, lasted = self.first - begins[self.slice], self.last - self.first
-        poses = (self._looks[:, name] for name in (Look.X, Look.Y, Look.YAW))
-        columns = (self.slice, after // _NS_PER_US, lasted // _NS_PER_US, *poses, self.cell)
-        return Looks(begins, *map(narrowed, columns))
+        begins = np.zeros(int(self.slice.max(initial=0)) + 1, np.int64)
+        begins[self.slice] = self._first // SLICE_NS * SLICE_NS
+        after, lasted = self._first - begins[self.slice], self.last - self._first
+        columns = (after // _NS_PER_US, lasted // _NS_PER_US, self.x, self.y, self.yaw, self.cell)
+        return Looks(begins, self.slice, *map(narrowed, columns))
 
     def looks_from(self, cells: Ints) -> Ints:
         """Returns all looks from some cells of places, by cell."""
@@ -137,7 +135,9 @@ class Cells:
 
     def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
         """Returns how many detections without a place the slice and topic of each look have."""
-        topics = int(self.topic.max(initial=0)) + 1
+        if not len(unplaced):
+            return np.zeros(len(looks), np.int64)
+        topics = np.int64(self.topic.max(initial=0)) + 1
         keys, n = _totals(
             unplaced[:, Unplaced.SLICE] * topics + unplaced[:, Unplaced.TOPIC],
             unplaced[:, Unplaced.N],
@@ -171,12 +171,16 @@ class Cells:
     def seen_at(self, looks: Ints, x: Floats | Ints, y: Floats | Ints) -> tuple[Floats, Floats]:
         """Returns how far (mm) and where (degrees from ahead) the place of each look was."""
         dx, dy = x - self.x[looks], y - self.y[looks]
-        ahead = self.yaw[looks] + self.pan[looks]
-        bearing = (np.degrees(np.arctan2(dy, dx)) - ahead + 180.0) % 360.0 - 180.0
+        bearing = (np.degrees(np.arctan2(dy, dx)) - self.heading(looks) + 180.0) % 360.0 - 180.0
         return np.hypot(dx, dy), bearing
 
+    def heading(self, looks: Ints) -> Floats:
+        """Returns where the detector of each look was turned to (degrees)."""
+        heading: Floats = self.yaw[looks] / 10.0 + self.pan[looks] / 10.0
+        return heading
 
-def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
+
+def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) -> Ints:
     """Returns for each cell of a grid the one that it is part of: the heaviest near it, or itself.
 
     A robot that often stands at one pose, and so at the border of several, looks from one cell.
@@ -188,7 +192,7 @@ def _joined(cells: Ints, cell: Ints, poses: Floats, n: Ints) -> Ints:
         n: the messages of each look.
     """
     weight = np.bincount(cell, n)
-    x, y, yaw = (np.bincount(cell, n * axis) / weight for axis in poses)
+    x, y, yaw = (np.bincount(cell, n * axis.astype(np.float64)) / weight for axis in poses)
     rank = np.argsort(np.argsort(weight, kind="stable"), kind="stable")
     best = rank.copy()
     # With room for a step: what is in order, and each step from it, is found quickest.
@@ -442,22 +446,33 @@ def _sees(cells: Cells, hit_cells: Ints, cell: Ints, n: Ints, hits: Ints) -> Fla
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
     slices, odds, hits, messages = _by_slice(cells, evidence)
-    for place, start, stop, end in _present(odds, _place(slices)):
-        seen = np.flatnonzero(hits[start:stop]) + start
-        if not len(seen):
-            continue
-        # A false detection or two beside a stay are no part of it.
-        clear = seen[odds[seen] >= _CLEAR]
-        seen = clear if len(clear) else seen
-        first, last = int(seen[0]), int(seen[-1])
-        firm = seen[odds[seen] >= _FIRM]
-        firm = firm if len(firm) else seen
-        gone = np.cumsum(odds[firm[-1] + 1 : end]) < math.log(_LEFT_BY_CHANCE)
-        left = int(_number(slices[firm[-1] + 1 + gone.argmax()])) if gone.any() else None
-        ends = slices[[first, last, firm[0], firm[-1]]]
-        first_slice, last_slice, firm_first, firm_last = _number(ends).tolist()
-        n, n_messages = (int(counts[first : last + 1].sum()) for counts in (hits, messages))
-        yield place, Stay(first_slice, last_slice, firm_first, firm_last, n, n_messages, left)
+    start, stop = _present(odds, _place(slices))
+    run, rows = np.repeat(np.arange(len(start)), stop - start), in_ranges(start, stop - start)
+    run, rows = run[hits[rows] > 0], rows[hits[rows] > 0]
+    if not len(rows):
+        return
+    # A false detection or two beside a stay are no part of it.
+    clearness = 1 + np.sum([odds[rows] >= least for least in (_CLEAR, _FIRM)], axis=0)
+    most = Groups.of(distinct_rows([run])[1])
+    clearest = np.repeat(most.ends(clearness)[1], most.sizes)
+    first, last = _ends(run, rows, clearness >= np.minimum(clearest, 2))
+    firm_first, firm_last = _ends(run, rows, clearness >= clearest)
+    place, left = _place(slices[first]), []
+    until = np.searchsorted(slices, (place + 1) << _BITS)
+    for begin, end in zip((firm_last + 1).tolist(), until.tolist(), strict=True):
+        gone = np.cumsum(odds[begin:end]) < math.log(_LEFT_BY_CHANCE)
+        left.append(int(_number(slices[begin + gone.argmax()])) if gone.any() else None)
+    sums = [np.append(0, np.cumsum(counts)).astype(np.int64) for counts in (hits, messages)]
+    totals = (count[last + 1] - count[first] for count in sums)
+    ends = (_number(slices[row]) for row in (first, last, firm_first, firm_last))
+    columns = (column.tolist() for column in (*ends, *totals))
+    yield from zip(place.tolist(), map(Stay._make, zip(*columns, left, strict=True)), strict=True)
+
+
+def _ends(run: Ints, rows: Ints, which: Flags) -> tuple[Ints, Ints]:
+    """Returns the first and the last of those of some rows that are of each run."""
+    run, rows = run[which], rows[which]
+    return rows[np.diff(run, prepend=-1) != 0], rows[np.diff(run, append=-1) != 0]
 
 
 def _by_slice(cells: Cells, evidence: Evidence) -> tuple[Ints, Floats, Ints, Ints]:
@@ -541,28 +556,21 @@ def looks_without(
     return messages, crossed
 
 
-def _present(by_slice: Floats, place: Ints) -> Iterator[tuple[int, int, int, int]]:
-    """Yields the likeliest runs of slices in which a thing was there.
-
-    As the place, [start, stop), and where the slices of this place end.
-    """
-    if not len(place):
-        return
-    # Runs of one sign have one state: fewer steps than slices.
+def _present(by_slice: Floats, place: Ints) -> tuple[Ints, Ints]:
+    """Returns where the likeliest runs of slices in which a thing was there begin and end."""
+    # Slices of one sign have one state: fewer steps than slices.
     is_positive = by_slice >= 0
-    starts = np.flatnonzero(
-        np.diff(place, prepend=-1).astype(bool) | np.diff(is_positive, prepend=is_positive[:1])
-    )
-    spans = pairwise([*starts.tolist(), len(place)])
+    is_first = np.diff(place, prepend=-1) != 0
+    starts = np.flatnonzero(is_first | np.diff(is_positive, prepend=is_positive[:1]))
+    if not len(starts):
+        return starts, starts
     sums = np.add.reduceat(by_slice, starts).tolist()
-    of_places = groupby(zip(place[starts].tolist(), sums, spans, strict=True), itemgetter(0))
-    for number, runs in of_places:
-        _, sums_there, spans_there = zip(*runs, strict=True)
-        states = zip(_states(sums_there), spans_there, strict=True)
-        for is_there, same in groupby(states, itemgetter(0)):
-            if is_there:
-                begins, stops = zip(*(span for _, span in same), strict=True)
-                yield number, begins[0], stops[-1], spans_there[-1][1]
+    spans = pairwise([*np.flatnonzero(is_first[starts]).tolist(), len(starts)])
+    states = chain.from_iterable(_states(sums[begin:end]) for begin, end in spans)
+    is_there = np.fromiter(states, np.bool_, len(starts))
+    begins = is_there & (is_first[starts] | ~np.append(False, is_there[:-1]))
+    ends = is_there & np.append(is_first[starts[1:]] | ~is_there[1:], True)
+    return starts[begins], np.append(starts, len(place))[1:][ends]
 
 
 def _states(sums: Sequence[float]) -> Sequence[bool]:

@@ -21,9 +21,11 @@ from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import packed, united
+from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import open_scan, remembered, scan
+from ros2_memory.index.segment import folder_of
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
 
 if TYPE_CHECKING:
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
+    from ros2_memory.storage.base import IntArray
 
 
 S = TypeVar("S")
@@ -139,12 +142,13 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         window: the stretch.
-        bags: that reach into it, or nearly so.
+        bags: that reach into it, or nearly so; `first_bags` are the first ones of each recording.
         sessions: those that the bags are of, in the order of their names.
     """
 
     window: TimeWindow
     bags: Sequence[BagFile]
+    first_bags: Sequence[BagFile]
     sessions: Sequence[_Lending]
 
 
@@ -236,12 +240,18 @@ class Watching:
                 open_scan(self._view, topic, reach, copies=topic not in self._topics)
                 for topic in self._needed
             ]
-        by_bag = (_numbers_of(self._view, self._topics, bag) for bag in self._bags_in(whole))
-        for number in sorted({*chain.from_iterable(by_bag)}, reverse=True):
+        bags = self._bags_in(window.aligned(SIGHTS_NS).widened(AROUND_NS))
+        firsts, lasts = _ends_of(bags)
+        latest = np.maximum.accumulate(lasts)
+        asked = [bag for bag in bags if bag.start < whole.stop and bag.end >= whole.start]
+        for number in reversed(_numbers_of(self._view, self._topics, asked)):
             stretch = _window(number)
             if not stretch.intersect(window).empty:
                 self._view.bags.check_deadline()
-                yield self._around(stretch, self._bags_in(stretch.widened(AROUND_NS)))
+                near = stretch.widened(AROUND_NS)
+                begin, end = latest.searchsorted(near.start), firsts.searchsorted(near.stop)
+                reaching = [bag for bag in bags[begin:end] if bag.end >= near.start]
+                yield self._around(stretch, reaching)
 
     def _parts_around(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the parts that what is seen in a window follows from; None where not they alone.
@@ -279,8 +289,7 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         files = {bag.file for bag in bags}
-        by_bag = (_numbers_of(self._view, self._topics, bag) for bag in bags)
-        for number in sorted({*chain.from_iterable(by_bag)}):
+        for number in _numbers_of(self._view, self._topics, bags):
             window = _window(number)
             by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
             for rows in self._rows(window):
@@ -298,8 +307,11 @@ class Watching:
         return self._session_of[bag.recording]
 
     def _around(self, window: TimeWindow, bags: Sequence[BagFile]) -> _Surroundings:
-        first_bags: dict[Session, BagFile] = {}
+        of_recordings: dict[str, BagFile] = {}
         for bag in bags:
+            of_recordings.setdefault(folder_of(bag), bag)
+        first_bags: dict[Session, BagFile] = {}
+        for bag in of_recordings.values():
             first_bags.setdefault(self._session(bag), bag)
         is_alone = len(first_bags) == 1
         sessions = [
@@ -309,7 +321,7 @@ class Watching:
         ]
         if not is_alone:
             sessions.sort(key=lambda lending: (min(lending.session), lending.slices or ()))
-        return _Surroundings(window, bags, sessions)
+        return _Surroundings(window, bags, [*of_recordings.values()], sessions)
 
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
@@ -409,7 +421,7 @@ class Watching:
             for _, lender, _ in around.sessions
             if lender
         ]
-        folders = sorted(map(self._sessions.folder, {bag.recording for bag in around.bags}))
+        folders = sorted(map(self._sessions.folder, {bag.recording for bag in around.first_bags}))
         begin = window.start // SLICE_NS
         sessions = [
             (
@@ -497,13 +509,22 @@ def _window(number: int) -> TimeWindow:
     return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
 
 
-def _numbers_of(view: View, topics: Sequence[str], bag: BagFile) -> Iterable[int]:
-    """Returns the numbers of the stretches in which a bag may have messages of some topics."""
-    numbers = range(bag.start // SIGHTS_NS, bag.end // SIGHTS_NS + 1)
-    if len(numbers) <= _MANY:
-        return numbers
-    # Its times are odd: centuries may lie between two messages.
-    window = TimeWindow(bag.start, bag.end).widened(1)
-    by_unit = [rows.times // SIGHTS_NS for topic in topics for rows in scan(view, topic, window)]
-    distinct: list[int] = np.unique(np.concatenate([np.empty(0, np.int64), *by_unit])).tolist()
+def _ends_of(bags: Sequence[BagFile]) -> tuple[IntArray, IntArray]:
+    """Returns the log times of the first and the last message of bags."""
+    starts, ends = [bag.start for bag in bags], [bag.end for bag in bags]
+    return np.array(starts, np.int64), np.array(ends, np.int64)
+
+
+def _numbers_of(view: View, topics: Sequence[str], bags: Sequence[BagFile]) -> list[int]:
+    """Returns the numbers of the stretches in which bags may have messages of some topics."""
+    first, last = (times // SIGHTS_NS for times in _ends_of(bags))
+    sizes = last - first + 1
+    is_odd = sizes > _MANY
+    numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
+    for nth in np.flatnonzero(is_odd).tolist():
+        # Its times are odd: centuries may lie between two messages.
+        window = TimeWindow(bags[nth].start, bags[nth].end).widened(1)
+        for topic in topics:
+            numbers += [rows.times // SIGHTS_NS for rows in scan(view, topic, window)]
+    distinct: list[int] = np.unique(np.concatenate(numbers)).tolist()
     return distinct

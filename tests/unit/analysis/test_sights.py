@@ -21,9 +21,10 @@ from ros2_memory.analysis.sights import (
 from tests.support.sights import (
     Message,
     PlacedDetection,
-    joined_of,
     no_sights,
+    rows_of_tables,
     sights_of_messages,
+    whole,
 )
 
 HERE = (0.0, 0.0, 0.0)
@@ -128,19 +129,18 @@ def test_sights_are_joined_in_any_order(
     other: list[tuple[int, None, list[PlacedDetection]]],
 ) -> None:
     parts = [built("/a", one), built("/b", other), no_sights()]
-    forward, backward = joined_of(parts)[0], joined_of(parts[::-1])[0]
+    forward, backward = whole(parts), whole(parts[::-1])
     assert forward.topics == backward.topics
-    for table, same in zip(forward.tables, backward.tables, strict=True):
-        assert table.tolist() == same.tolist()
+    assert rows_of_tables(forward) == rows_of_tables(backward)
 
 
 def test_fixes_are_kept_where_no_detector_published() -> None:
     poses, sigma = np.array([[1.0, -2.0, math.pi / 2]]), np.array([0.25])
     alone = fixes_of(np.array([13 * SECOND]), poses, sigma)
-    both, _ = joined_of([sights_of([mug(1.0)]), alone])
-    assert both.fixes.tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
-    assert both.fixes[0, Fix.SIGMA] == 250
-    assert both.slices == 2
+    both = whole([sights_of([mug(1.0)]), alone])
+    assert both.fixes[:].tolist() == [[1, 13 * SECOND, 1000, -2000, 900, 250]]
+    assert both.fixes[:, Fix.SIGMA] == [250]
+    assert len(both.epochs) == 2
 
 
 def test_what_is_seen_at_the_end_of_64_bits_has_a_time_that_fits() -> None:
@@ -153,5 +153,5 @@ def test_numbers_of_more_than_32_bits_are_packed() -> None:
     messages = [
         Message("/detections", nth * SECOND, pose, []) for nth, pose in enumerate([HERE, far])
     ]
-    both, _ = joined_of([sights_of_messages(messages), sights_of([mug(1.0)])])
+    both = whole([sights_of_messages(messages), sights_of([mug(1.0)])])
     assert sorted(both.looks[:, Look.X].tolist()) == [0, 0, 9 * 10**9]

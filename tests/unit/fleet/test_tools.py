@@ -138,11 +138,12 @@ def test_rows_of_all_are_the_newest_of_the_rows_of_each(
         assert found[key] == pytest.approx(sum(one[key] for one in own.values()))
     labels = sum((Counter(one.get("labels", {})) for one in own.values()), Counter[str]())
     assert found.get("labels", {}) == labels
-    there = {robot for robot, one in own.items() if one.get("there_now")}
-    assert {*found.get("there_now", ())} == there
+    for robot, one in own.items():
+        said = found | found["by_robot"].get(robot, {})
+        for key in ("frame_id", "there_now", "total", "searched_from", "searched_to"):
+            assert said.get(key) == one.get(key), (robot, key)
     for row in found[rows]:
         one = own[row.pop("robot_name")]
-        assert row.pop("frame_id", None) == one.get("frame_id")
         assert row in one[rows]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from datetime import date, timedelta
 from pathlib import Path
 
@@ -12,9 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engine import Lake, LakeFile, Parameters
 from ros2_memory.lake.tables import TABLES, Row
-from ros2_memory.lake.warehouse import DataFiles, Parameters
+from tests.support.lakes import lake_in
 
 DAY = date(2026, 11, 20)
 ROBOTS = ("attic", "hall", "it's")
@@ -25,10 +24,10 @@ Select = Callable[..., pa.Table]
 
 
 @pytest.fixture(scope="module")
-def select(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Select:
+def select(tmp_path_factory: pytest.TempPathFactory) -> Select:
     """Runs a select over all files of `sightings`: of three robots, each with two days."""
     folder, table = tmp_path_factory.mktemp("lake"), TABLES["sightings"]
-    locations: list[str] = []
+    files: list[LakeFile] = []
     for robot in ROBOTS:
         for day in (0, 1):
             keys = {"robot": robot, "bag_id": f"{robot}{day}", "day": DAY + timedelta(days=day)}
@@ -43,13 +42,13 @@ def select(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Se
                 }
                 for nth, (label, score) in enumerate([*seen, ("unscored", None)])
             ]
-            path = folder / f"{len(locations)}.parquet"
+            path = folder / f"{len(files)}.parquet"
             pq.write_table(table.filled(rows), path)
-            locations.append(path.as_uri())
-    files = DataFiles(table.arrow_schema, tuple(locations), {})
+            files.append(LakeFile(path.as_uri()))
+    lake = Lake(lake_in(folder))
 
     def run(sql: str, parameters: Parameters) -> pa.Table:
-        return engine.select(sql, "sightings", files, parameters)
+        return lake.select(sql, "sightings", files, parameters)
 
     return run
 
@@ -78,20 +77,17 @@ def test_a_text_is_never_sql(select: Select) -> None:
 
 
 def test_a_column_that_a_file_lacks_is_null_and_a_file_that_is_gone_is_reported(
-    tmp_path: Path, engine: DuckdbEngine
+    tmp_path: Path,
 ) -> None:
     row = {"robot": "hall", "bag_id": "a", "day": DAY, "topic": "/seen", "first_ns": 0}
     whole = TABLES["things"].filled([{**row, "label": "cup", "spread_m": 0.1}])
     path = tmp_path / "old.parquet"
     pq.write_table(whole.drop_columns(["spread_m"]), path)
-    files = DataFiles(TABLES["things"].arrow_schema, (path.as_uri(),), {})
+    lake, files = Lake(lake_in(tmp_path)), [LakeFile(path.as_uri())]
     sql = "SELECT label, spread_m FROM things"
-    assert engine.select(sql, "things", files, {}).to_pylist() == [
-        {"label": "cup", "spread_m": None}
-    ]
-    none = replace(files, locations=())
-    assert engine.select(sql, "things", none, {}).num_rows == 0
+    assert lake.select(sql, "things", files).to_pylist() == [{"label": "cup", "spread_m": None}]
+    assert lake.select(sql, "things", ()).num_rows == 0
     path.unlink()
     with pytest.raises(RefusedError, match="the lake cannot be read") as raised:
-        engine.select(sql, "things", files, {})
+        lake.select(sql, "things", files)
     assert str(tmp_path) not in str(raised.value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import date, timedelta
 from functools import partial
 from pathlib import Path
@@ -19,32 +19,34 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engine import Days, Lake, LakeFile, Parameters
 from ros2_memory.lake.memory import newest
 from ros2_memory.lake.tables import day_of
-from ros2_memory.lake.warehouse import DataFiles, Days, LakeFile, Parameters
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap
 from tests.support.clocks import FixedClock
 from tests.support.fleets import NOW, SEEN, START_S, reply
-from tests.support.lakes import lake_robot, robot_bags, ship
+from tests.support.lakes import lake_in, lake_robot, lake_robots, robot_bags, ship
 
 DAY_S = 86_400
 
 
-class WatchedEngine(DuckdbEngine):
+class WatchedLake(Lake):
     """Keeps which files were read."""
 
-    def __init__(self, engine: DuckdbEngine) -> None:
-        self._engine = engine
+    def __init__(self, folder: Path) -> None:
+        super().__init__(lake_in(folder), memory_mb=256, threads=1)
         self.read: set[str] = set()
 
-    def select(self, sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
-        self.read.update(files.locations)
-        return self._engine.select(sql, table, files, parameters)
+    def select(
+        self, sql: str, name: str, files: Iterable[LakeFile], parameters: Parameters | None = None
+    ) -> pa.Table:
+        files = [*files]
+        self.read.update(file.location for file in files)
+        return super().select(sql, name, files, parameters)
 
-    def days(self) -> set[date]:
+    def days_read(self) -> set[date]:
         """The days of the files that were read since it was last asked."""
         folders = (part for each in self.read for part in each.split("/"))
         found = {date.fromisoformat(each[4:]) for each in folders if each.startswith("day=")}
@@ -55,9 +57,9 @@ class WatchedEngine(DuckdbEngine):
 class Shipping:
     """A robot whose bags are shipped a few at a time."""
 
-    def __init__(self, folder: Path, engine: DuckdbEngine) -> None:
+    def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self.engine = WatchedEngine(engine)
+        self.lake = WatchedLake(folder / "lake")
         self._passes = 0
 
     def ship(self, starts_s: Sequence[int], label: str = "cup", name: str = "") -> None:
@@ -70,13 +72,13 @@ class Shipping:
             write_mcap(bags / "rec" / f"{name or f'rec_{start_s}'}.mcap", messages)
         ship(self._folder / "lake", [robot_bags("hall", bags)], most_bags=500)
 
-    def robot(self, **how: int) -> Memory:
-        return lake_robot(self._folder / "lake", self.engine, **how)
+    def robot(self, **how: Any) -> Memory:
+        return lake_robots(self.lake, ["hall"], **how)["hall"]
 
 
 @pytest.fixture
-def shipping(tmp_path: Path, engine: DuckdbEngine) -> Shipping:
-    return Shipping(tmp_path, engine)
+def shipping(tmp_path: Path) -> Shipping:
+    return Shipping(tmp_path)
 
 
 def starts(robot: Memory) -> list[int]:
@@ -89,7 +91,7 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
     robot = shipping.robot()
     assert starts(robot) == [old, old + 60, now]
     days = [day_of(at * NS_PER_S) for at in (old - DAY_S, old, old + DAY_S, now)]
-    assert shipping.engine.days() == {days[1], days[3]}
+    assert shipping.lake.days_read() == {days[1], days[3]}
     for new, looked_at in (
         ([], set()),
         ([now + 60], {days[3]}),
@@ -98,7 +100,7 @@ def test_only_days_with_new_files_are_read_again(shipping: Shipping) -> None:
         if new:
             shipping.ship(new, label="fork")
         assert {*new} <= {*starts(robot)}
-        assert shipping.engine.days() == looked_at
+        assert shipping.lake.days_read() == looked_at
 
 
 def test_a_bag_keeps_its_path_where_a_late_one_comes_before_it(shipping: Shipping) -> None:
@@ -127,13 +129,13 @@ def test_a_bag_of_older_days_is_found_while_these_are_looked_at_again(
     shipping.ship([older + 60], label="fork")
     index.refresh()
     found: list[BagSummary] = []
-    select = shipping.engine.select
+    select = shipping.lake.select
 
-    def selected(sql: str, table: str, files: DataFiles, parameters: Parameters) -> pa.Table:
+    def selected(*asked: Any) -> pa.Table:
         found.append(robot.reader.summarize(bag.path))
-        return select(sql, table, files, parameters)
+        return select(*asked)
 
-    monkeypatch.setattr(shipping.engine, "select", selected)
+    monkeypatch.setattr(shipping.lake, "select", selected)
     assert len(index.snapshot(older * NS_PER_S).bags) == 3
     assert set(found) == {bag.summary}
 
@@ -155,7 +157,7 @@ def test_days_that_are_looked_at_late_show_nothing_about_the_robots_clock(
 
 
 def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_robot(
-    tmp_path: Path, engine: DuckdbEngine
+    tmp_path: Path,
 ) -> None:
     bags = tmp_path / "bags"
     for name, begin in (("one/one_0", 0), ("one/one_1", 15), ("two/two_0", 30)):
@@ -164,7 +166,7 @@ def test_pauses_between_splits_and_between_recordings_are_told_apart_as_on_the_r
     on_robot = robot_bags("hall", bags)
     ship(tmp_path / "lake", [on_robot])
     pause = (START_S + 24) * NS_PER_S, (START_S + 30) * NS_PER_S
-    for robot in (on_robot.memory, lake_robot(tmp_path / "lake", engine)):
+    for robot in (on_robot.memory, lake_robot(tmp_path / "lake")):
         assert [*robot.index.refresh().gaps] == [pause]
 
 
@@ -220,7 +222,7 @@ DAYS = 7
 
 
 @pytest.fixture(scope="module")
-def memory(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Memory:
+def memory(tmp_path_factory: pytest.TempPathFactory) -> Memory:
     """A robot of which one day at a time is looked at: it saw a mug, a day later a fork, then cups.
 
     Its track is of another topic since.
@@ -235,7 +237,7 @@ def memory(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Me
             messages.append(detections(at + 2, ["spoon"], topic="/vision/old"))
         write_mcap(folder / "bags" / "rec" / f"rec_{DAYS - ago}.mcap", messages)
     ship(folder / "lake", [robot_bags("hall", folder / "bags")], most_bags=9)
-    return lake_robot(folder / "lake", engine, days=1, most_bags=1)
+    return lake_robot(folder / "lake", days=1, most_bags=1)
 
 
 @pytest.fixture

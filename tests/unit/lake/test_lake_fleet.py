@@ -14,15 +14,13 @@ from typing import Any
 import anyio
 import pytest
 
-from ros2_memory.bootstrap_fleet import build_fleet, engine_of
+from ros2_memory.bootstrap_fleet import build_fleet, open_lake
 from ros2_memory.config import DuckdbNode, load_settings
 from ros2_memory.core.errors import ConfigError, InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet
 from ros2_memory.history.context import Call
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.lake.tables import TABLES
-from ros2_memory.lake.warehouse import DataFiles
 from ros2_memory.server import keep_fleet_fresh
 from tests.support.bags import text, write_mcap
 from tests.support.fleets import SEEN, START_S, reply
@@ -257,14 +255,12 @@ def test_an_engine_has_the_settings_of_its_group_and_is_named_with_its_extra(
     given = [*overrides(tmp_path), "lake.engine.memory_mb=64", "lake.engine.threads=1"]
     node = load_settings(given, {}).lake.engine
     assert isinstance(node, DuckdbNode)
-    engine = engine_of(node)
-    [row] = engine.select(
+    lake = open_lake(load_settings(given, {}), node)
+    [row] = lake.select(
         "SELECT current_setting('memory_limit') AS memory, current_setting('threads') AS threads",
         "bags",
-        DataFiles(TABLES["bags"].arrow_schema, (), {}),
-        {},
+        (),
     ).to_pylist()
-    engine.close()
     assert row == {"memory": "64.0 MiB", "threads": 1}
     with pytest.raises(ConfigError, match=r"^lake\.engine\.address: unknown key; use one of: _tar"):
         load_settings([*given, "lake.engine.address=auto"], {})

@@ -15,7 +15,6 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.history.context import Memory
-from ros2_memory.lake.engine import DuckdbEngine
 from ros2_memory.lake.memory import LakeIndex
 from ros2_memory.lake.tables import packed_messages, unpacked_messages
 from ros2_memory.lake.upkeep import Tombstone, forget_in_lake
@@ -39,15 +38,15 @@ EVERYTHING = TimeWindow.everything()
 CHANNEL = Channel("/any", "cdr", Schema("any"))
 
 
-def shipped(folder: Path, engine: DuckdbEngine) -> tuple[Memory, Memory]:
+def shipped(folder: Path) -> tuple[Memory, Memory]:
     """The memory over a robot's bags, and over the lake that they were shipped into."""
     robot = robot_bags("hall", folder / "bags")
     assert ship(folder / "lake", [robot]).bags == 2
-    return robot.memory, lake_robot(folder / "lake", engine, stores=folder / "cache")
+    return robot.memory, lake_robot(folder / "lake", stores=folder / "cache")
 
 
 @pytest.fixture
-def both(engine: DuckdbEngine, tmp_path: Path) -> tuple[Memory, Memory]:
+def both(tmp_path: Path) -> tuple[Memory, Memory]:
     """Two recordings whose messages are of equal and of unlike sizes, and images."""
     draw = Random(3)
     for recording in range(2):
@@ -60,7 +59,7 @@ def both(engine: DuckdbEngine, tmp_path: Path) -> tuple[Memory, Memory]:
             image = draw.randbytes(5_000)
             messages.append(Msg("/camera", "sensor_msgs/msg/Image", at + 3, image, at - 5))
         write_mcap(tmp_path / "bags" / f"r{recording}" / "one_0.mcap", messages)
-    return shipped(tmp_path, engine)
+    return shipped(tmp_path)
 
 
 def test_bags_and_their_messages_are_those_of_the_robot(both: tuple[Memory, Memory]) -> None:
@@ -87,9 +86,7 @@ def times_of(reader: BagReader, path: Path, topic: str, window: TimeWindow) -> l
     return sorted(time for batch in batches for time in batch.log_times.tolist())
 
 
-def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
-    engine: DuckdbEngine, tmp_path: Path
-) -> None:
+def test_recordings_that_a_handover_joins_are_one_run_of_odometry(tmp_path: Path) -> None:
     names = ("one", "two")
     for number, name in enumerate(names):
         at = AT + 20 * number * NS_PER_S
@@ -101,8 +98,7 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
         write_handover(tmp_path / "bags" / name, handover)
     assert ship(tmp_path / "lake", [robot]).bags == 2
     bags, lake = (
-        fleet_of({"hall": memory})
-        for memory in (robot.memory, lake_robot(tmp_path / "lake", engine))
+        fleet_of({"hall": memory}) for memory in (robot.memory, lake_robot(tmp_path / "lake"))
     )
     asked: dict[str, object] = {"start": START_S, "end": START_S + 60}
     for tool in ("trajectory_summary", "find_things"):
@@ -111,9 +107,7 @@ def test_recordings_that_a_handover_joins_are_one_run_of_odometry(
         assert reply(lake, tool, asked) == expected
 
 
-def test_copies_among_images_are_told_by_their_publish_times(
-    engine: DuckdbEngine, tmp_path: Path
-) -> None:
+def test_copies_among_images_are_told_by_their_publish_times(tmp_path: Path) -> None:
     for recording, beats in enumerate((range(20), range(10, 30))):
         messages: list[Msg] = []
         for n in beats:
@@ -122,7 +116,7 @@ def test_copies_among_images_are_told_by_their_publish_times(
             image = Msg("/camera", "sensor_msgs/msg/Image", sent + recording, b"%06d" % n, sent)
             messages += [said, image]
         write_mcap(tmp_path / "bags" / f"r{recording}" / f"r{recording}_0.mcap", messages)
-    bags, robot = shipped(tmp_path, engine)
+    bags, robot = shipped(tmp_path)
     span: dict[str, object] = {"start": START_S - 1, "end": START_S + 99, "by": "day"}
     for is_stored in (False, True):
         if is_stored:
@@ -154,11 +148,11 @@ def test_columns_are_stored_of_what_is_there_and_those_of_forgotten_bags_go(
 
 
 def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
-    engine: DuckdbEngine, tmp_path: Path
+    tmp_path: Path,
 ) -> None:
     write_bag(tmp_path / "hall", 0)
     ship_from(tmp_path)
-    robot = lake_robot(tmp_path / "lake", engine)
+    robot = lake_robot(tmp_path / "lake")
     [bag] = robot.index.snapshot().bags
     with location(tmp_path / "lake").writable() as tables:
         forget_in_lake(tables, Tombstone("hall", bag.start, bag.end))
@@ -170,9 +164,7 @@ def test_a_bag_that_went_since_the_index_was_read_is_not_taken_for_an_empty_one(
             [*robot.reader.records(bag.path, ["/chatter"], EVERYTHING)]
 
 
-def test_messages_of_one_log_time_keep_the_order_of_the_file(
-    engine: DuckdbEngine, tmp_path: Path
-) -> None:
+def test_messages_of_one_log_time_keep_the_order_of_the_file(tmp_path: Path) -> None:
     """Those of a topic with two channels, and of several topics."""
     draw, stamped = Random(5), "ros2_vision_interfaces/msg/StampedString"
     messages: list[Msg] = []
@@ -185,7 +177,7 @@ def test_messages_of_one_log_time_keep_the_order_of_the_file(
     write_mcap(tmp_path / "bags" / "r0" / "one_0.mcap", messages)
     on_robot = robot_bags("hall", tmp_path / "bags")
     assert ship(tmp_path / "lake", [on_robot]).bags == 1
-    bags, robot = on_robot.memory, lake_robot(tmp_path / "lake", engine)
+    bags, robot = on_robot.memory, lake_robot(tmp_path / "lake")
     [bag], [other] = bags.index.snapshot().bags, robot.index.snapshot().bags
     for topics in (["/said"], ["/said", "/heard", "/alone"]):
         for newest_first in (False, True):

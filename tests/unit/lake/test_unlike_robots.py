@@ -15,7 +15,7 @@ from pyiceberg.expressions import AlwaysTrue
 
 from ros2_memory.core.timebase import iso_local
 from ros2_memory.fleet.robots import Fleet, Robot
-from ros2_memory.lake.engine import DuckdbEngine
+from ros2_memory.lake.engine import Lake
 from ros2_memory.lake.shipper import Shipped
 from tests.support.bags import text, write_mcap
 from tests.support.clocks import FixedClock
@@ -53,7 +53,7 @@ class World(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def world(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
     folder, lake = tmp_path_factory.mktemp("robots"), tmp_path_factory.mktemp("lake")
     of_robots = [
         robot_bags(name, write(folder / name), messages=MESSAGES) for name, write in ROBOTS.items()
@@ -67,7 +67,10 @@ def world(engine: DuckdbEngine, tmp_path_factory: pytest.TempPathFactory) -> Ite
     }
     with location(lake).opened() as catalog:
         of_lake = lake_robots(
-            catalog, engine, [*ROBOTS], stores=tmp_path_factory.mktemp("cache"), now=NOW
+            Lake(catalog, memory_mb=256, threads=1),
+            [*ROBOTS],
+            stores=tmp_path_factory.mktemp("cache"),
+            now=NOW,
         )
         for name in ("damaged", "twin"):
             store_columns(of_lake[name])

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Hashable
     from pathlib import Path
 
-    from ros2_memory.analysis.sights import Sights
+    from ros2_memory.columns.sights import JoinedSights
 
 
 T = TypeVar("T")
@@ -212,8 +212,8 @@ def test_what_came_after_a_window_is_not_compared_where_it_is_too_much(
     monkeypatch.setattr(known, "_MOST_SPOTS", 3)
     compared: list[int] = []
 
-    def estimated(sights: Sights, *others: Any) -> Estimate:
-        compared.append(sights.slices)
+    def estimated(sights: JoinedSights, *others: Any) -> Estimate:
+        compared.append(len(sights.epochs))
         return estimate(sights, *others)
 
     monkeypatch.setattr(known, "estimate", estimated)

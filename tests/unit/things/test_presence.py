@@ -8,7 +8,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.sights import CELL_MM, Hit, Look, Sights
+from ros2_memory.analysis.sights import CELL_MM, Hit, Look
+from ros2_memory.columns.sights import JoinedSights
+from ros2_memory.core.arrays import Columns
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.things.presence import (
     Cells,
@@ -17,7 +19,7 @@ from ros2_memory.things.presence import (
     looks_without,
     stays_at,
 )
-from tests.support.sights import no_sights
+from tests.support.sights import whole
 
 _looks = st.lists(
     st.tuples(st.integers(0, 1), st.integers(0, 2), st.integers(1, 16), st.integers(-6, 3)),
@@ -28,6 +30,7 @@ _looks = st.lists(
 
 
 _unplaced = st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3)
+NOTHING = whole([])
 _ANYWHERE = np.array([[1e9, -180.0, 180.0]])
 
 
@@ -39,7 +42,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     cells, hits = _seen(given_looks, unplaced)
     place = np.array([[3000.0, 100.0]])
     found = evidence_at(
-        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), unplaced=no_sights().unplaced
+        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), unplaced=NOTHING.unplaced[:]
     )
 
     whole = _with_every_look(cells, found, hits)
@@ -66,7 +69,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
     cells, hits = _seen([*given_looks, *others], unplaced)
     place = np.array(is_second, np.int64)[: len(hits)]
     places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
-    found = evidence_at(cells, _ANYWHERE, places, hits, place, unplaced=no_sights().unplaced)
+    found = evidence_at(cells, _ANYWHERE, places, hits, place, unplaced=NOTHING.unplaced[:])
     stays = [*stays_at(cells, found)]
 
     assert stays == sorted(stays, key=lambda each: each[0])
@@ -78,7 +81,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
             places[[nth]],
             mine,
             np.zeros(len(mine), np.int64),
-            unplaced=no_sights().unplaced,
+            unplaced=NOTHING.unplaced[:],
         )
         at_once = found.at(nth)
         assert at_once.looks.tolist() == alone.looks.tolist()
@@ -104,7 +107,7 @@ def _seen(
         if seen > 0:  # few looks see it
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
-    cells = Cells(_sights(looks, bag + 1), np.zeros(bag + 1, np.int64))
+    cells = Cells(_sights(looks, bag + 1))
     return cells, np.array(rows, np.int64).reshape(-1, len(Hit))
 
 
@@ -122,7 +125,6 @@ def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidenc
     return Evidence(looks, cell, cells.n[looks], hits, found.blind, found.times, fair)
 
 
-def _sights(looks: list[tuple[int, ...]], bags: int) -> Sights:
-    none = no_sights()
-    rows = np.array(looks, np.int64).reshape(-1, len(Look))
-    return replace(none, topics=("/detections",), labels=("cup",), looks=rows, slices=bags)
+def _sights(looks: list[tuple[int, ...]], bags: int) -> JoinedSights:
+    rows = Columns(np.array(looks, np.int64).reshape(-1, len(Look)).T)
+    return replace(whole([]), topics=("/detections",), looks=rows, epochs=np.zeros(bags, np.int64))

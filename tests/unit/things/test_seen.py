@@ -13,7 +13,7 @@ import pytest
 
 from ros2_memory.columns import scan
 from ros2_memory.columns.scanner import Scanner
-from ros2_memory.columns.sights import joined
+from ros2_memory.columns.sights import JoinedSights, joined
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.history.view import View
 from ros2_memory.things import placing, seen
@@ -21,12 +21,12 @@ from ros2_memory.things.find import find_things
 from ros2_memory.things.seen import SIGHTS_NS, Watching
 from tests.support.bags import McapLayout, text, write_mcap, write_splits
 from tests.support.column_worlds import EVERYTHING, World, store_file
+from tests.support.sights import rows_of_tables
 from tests.unit.things.test_find import AWAY, BEGIN, HERE, looked
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.analysis.sights import Sights
     from ros2_memory.results import Thing
     from tests.support.bags import Msg
 
@@ -39,9 +39,9 @@ def day() -> list[Msg]:
     return [*looked(0, 30, HERE, ("mug", 3.0, 0.5)), *looked(30, 60, AWAY), *later]
 
 
-def sights_in(memory: Memory) -> Sights:
+def sights_in(memory: Memory) -> JoinedSights:
     stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
-    return joined([part.packed for stretch in stretches for part in stretch.sights])[0]
+    return joined([part.packed for stretch in stretches for part in stretch.sights])
 
 
 def things_in(memory: Memory) -> tuple[Thing, ...]:
@@ -80,8 +80,7 @@ def test_sights_are_the_same_however_a_history_is_cut(tmp_path: Path) -> None:
         found.append(sights_in(World.of(tmp_path / f"{split_s}").memory))
     for other in found[1:]:
         assert other.labels == found[0].labels == ("cup", "mug")
-        for table, same in zip(found[0].tables, other.tables, strict=True):
-            assert table.tolist() == same.tolist()
+        assert rows_of_tables(other) == rows_of_tables(found[0])
 
 
 def test_another_process_finds_stored_sights_and_reads_no_messages(
@@ -119,15 +118,14 @@ def test_joined_sights_say_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         things = ("mug", 3.0, 0.5), (f"cup {nth}", 2.0, -1.0)
         write_splits(tmp_path / f"rec_{nth}", looked(begin, begin + 60, HERE, *things), 20.0)
     plain = World.of(tmp_path).memory
-    tables, things_there, starts = sights_in(plain).tables, things_in(plain), starts_in(plain)
+    sights, things_there, starts = sights_in(plain), things_in(plain), starts_in(plain)
     world = made_in(tmp_path)
     make(world.memory, is_joined=True)
     # Of more spots than are wanted no more are yielded than those of ten minutes.
     assert starts_in(another(world), most=1) == starts
     monkeypatch.delattr(placing, "sights_of")
     for memory in (another(world), another(with_joined_alone(world))):
-        for table, same in zip(tables, sights_in(memory).tables, strict=True):
-            assert table.tolist() == same.tolist()
+        assert rows_of_tables(sights_in(memory)) == rows_of_tables(sights)
         assert things_in(memory) == things_there
         assert 2 < len(starts_in(memory)) < len(starts)
 

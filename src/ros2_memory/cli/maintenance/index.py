@@ -31,6 +31,7 @@ from ros2_memory.columns.fill import Progress
 from ros2_memory.config import Settings
 from ros2_memory.core.errors import ConfigError, RecorderError
 from ros2_memory.core.logging_setup import configure_logging
+from ros2_memory.core.malloc import keep_freed
 from ros2_memory.core.text import counted
 from ros2_memory.serving.backfill import Backfill
 
@@ -40,8 +41,8 @@ NICENESS: Final = 15
 _PR_SET_PDEATHSIG: Final = 1  # linux/prctl.h
 _BATCH: Final = 4096
 """Bags stored before the program looks which others closed meanwhile, among all that wait."""
-_FOLLOWED: Final = 256
-"""Bags stored before what follows from them is made."""
+_FOLLOWED: Final = 6
+"""Batches stored before what follows from them is made: of an hour all is still in the cache."""
 _CACHE_MB: Final = 32
 _RARELY: Final = (50_000, 20, 100)
 """Thresholds of `gc`: columns make no cycles, and the index of a week has many objects."""
@@ -59,6 +60,7 @@ def index(
     Uses the settings of the server, which also does this in the background. What is stored changes
     only the speed of answers.
     """
+    keep_freed()
     settings, _ = load_given(bag_dir, words)
     if for_server is not None:
         _fill_for_server(settings, for_server)
@@ -137,15 +139,14 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
         goes_on = True
         while goes_on:
             progress = backfill.progress()
-            done = tried = followed = 0
-            for batch in backfill.batches():
+            done = tried = 0
+            for nth, batch in enumerate(backfill.batches(), start=1):
                 if tried >= _BATCH:
                     break
                 show(replace(progress, stored=min(progress.stored + done, progress.closed)))
                 tried += len(batch.bags)
                 done += backfill.store(batch)
-                if tried - followed >= _FOLLOWED:
-                    followed = tried
+                if nth % _FOLLOWED == 0:
                     backfill.follow()
             goes_on = backfill.follow() or done > 0
     backfill.prune()

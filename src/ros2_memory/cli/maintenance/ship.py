@@ -119,12 +119,11 @@ def _forget(
         LakeError: the lake cannot be read or written; the next start finishes it.
     """
     from ros2_memory.lake.upkeep import Tombstone, append_tombstone, forget_in_lake  # noqa: PLC0415
-    from ros2_memory.lake.warehouse import Partitions  # noqa: PLC0415 - as in `ship`
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:
-        in_lake = Partitions().look(lake.current("bags"))
-        names = {*in_lake, *(configured.name for configured in robots)}
+        in_lake = {name for _, name, *_ in lake.days("bags")}
+        names = in_lake.union(configured.name for configured in robots)
         if robot not in names:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "

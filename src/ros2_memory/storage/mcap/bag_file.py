@@ -45,6 +45,7 @@ from ros2_memory.storage.errors import (
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bulk import (
     ReadChunks,
+    are_declared,
     bare_batches,
     batches_of,
     loose_place,
@@ -73,6 +74,7 @@ from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
     BodyStream,
+    Declarations,
     closing_of,
     file_records,
     is_finished,
@@ -138,6 +140,7 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
+            file.hold()
             index = _Reading(self, file, has_totals=True).verified()
         return summarize_channels(
             index.channels,
@@ -246,29 +249,35 @@ class _Reading:
 
         A bag is chosen for a question by these times: a wrong one would hide its messages.
         """
-        index = self.index
+        index, declared = self.index, self.index.declared
+        if declared is None:  # it was made of the messages
+            return index
         totals = index.totals.values()
         ends = sorted({end for total in totals for end in (total.first, total.last)})
         odd = (*index.chunks[:1], *index.chunks[-1:], *_out_of_order(index.chunks))
         looked_at = {chunk.offset for chunk in odd}
         left = _VERIFIED_BYTES
+        chosen: list[Chunk] = []
         for chunk in index.chunks:
             nth = bisect_left(ends, chunk.start)
             is_end = nth < len(ends) and ends[nth] <= chunk.end
-            if chunk.index_places is None or not (is_end or chunk.offset in looked_at):
+            if not (is_end or chunk.offset in looked_at):
                 continue
             left -= chunk.length
             if left < 0:
                 break
-            try:
-                self._require_declared(chunk)
-            except _ContradictedError as error:
-                return self._without_indexes(error)
-            except UnreadableError:
-                continue
+            chosen.append(chunk)
+        for group in read_groups(self._file, chosen, self._bags.limit):
+            for chunk in () if are_declared(group, declared) else group.chunks:
+                try:
+                    self._require_declared(chunk, declared)
+                except _ContradictedError as error:
+                    return self._without_indexes(error)
+                except UnreadableError:
+                    continue
         return index
 
-    def _require_declared(self, chunk: Chunk) -> None:
+    def _require_declared(self, chunk: Chunk, declared: Declarations) -> None:
         """Compares a chunk with what its indexes and the summary section say of it.
 
         Raises:
@@ -277,12 +286,10 @@ class _Reading:
         """
         data = self._chunk_data(chunk)
         places = in_file_order(self._pairs(chunk, data).offsets)
-        declared = self.index.declared
         try:
             with as_unreadable():
-                agrees = declared is None or all(
-                    declared.agrees(*declaration) for declaration in declarations_of(data, places)
-                )
+                found = declarations_of(data, places, np.array([len(data)]))
+                agrees = all(declared.agrees(*declaration) for declaration in found)
         except UnreadableError as error:
             raise _ContradictedError(reason_of(error)) from error
         if not agrees:

@@ -8,6 +8,7 @@ some 200 indexes of a few messages each, and takes three times as long. Whatever
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import chain, pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -18,12 +19,13 @@ from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.large_reads import LARGE_BYTES
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.base import BATCH_BYTES, Batch, Channel, IntArray, Mask, batched
-from ros2_memory.storage.errors import SizeLimit, UnreadableError
+from ros2_memory.storage.errors import SizeLimit, UnreadableError, as_unreadable
 from ros2_memory.storage.mcap.chunk import (
     NOT_THERE,
     Chunk,
     Pairs,
     chunk_head,
+    declarations_of,
     decompressed_chunk,
     in_file_order,
     index_groups,
@@ -38,6 +40,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.file_io import OpenFile
+    from ros2_memory.storage.mcap.records import Declarations
 
 MAX_GROUP_CHUNKS: Final = 4096
 _UINT32: Final = np.dtype("<u4")
@@ -142,6 +145,38 @@ def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[by
     return whole[at + RECORD.size : end], whole[end : at + size]
 
 
+def compared(
+    content: ReadChunks, pairs: Pairs
+) -> tuple[IntArray, np.ndarray[tuple[int], np.dtype[np.void]]]:
+    """Returns where messages begin in the buffer of decompressed chunks, and their heads.
+
+    Raises:
+        UnreadableError: a message is not in the records, ends past its chunk, or is there twice.
+    """
+    sizes = np.array(content.sizes)
+    ends = np.cumsum(sizes)
+    at = pairs.offsets + (ends - sizes)[pairs.chunks]
+    if (pairs.offsets < 0).any():
+        raise UnreadableError(NOT_THERE)
+    heads = require_indexed(pairs, content.buffer or b"", at, ends[pairs.chunks])
+    in_file_order(at)
+    return at, heads
+
+
+def are_declared(content: ReadChunks, declared: Declarations) -> bool:
+    """Returns whether chunks have the messages that their indexes name, and no others.
+
+    And declare channels as `declared` does. False also where one of them cannot be read.
+    """
+    with suppress(UnreadableError), as_unreadable():
+        buffer, ends = content.buffer, np.cumsum(content.sizes)
+        if buffer is not None:
+            places, _ = compared(content, pairs_in(content.chunks, content.indexes))
+            found = declarations_of(buffer, places, ends)
+            return all(declared.agrees(*declaration) for declaration in found)
+    return False
+
+
 def batches_of(
     content: ReadChunks,
     pairs: Pairs,
@@ -164,16 +199,8 @@ def batches_of(
     buffer = content.buffer or b""
     if not pairs.times.size:
         return iter(())
-    sizes = np.array(content.sizes)
-    ends = np.cumsum(sizes)
-    begins = ends - sizes
-    begin, end = begins[pairs.chunks], ends[pairs.chunks]
-    at = pairs.offsets + begin
-    if (pairs.offsets < 0).any():
-        raise UnreadableError(NOT_THERE)
-    heads = require_indexed(pairs, buffer, at, end)
+    at, heads = compared(content, pairs)
     stops = at + RECORD.size + heads["length"]
-    in_file_order(at)
     order = _in_window(pairs, window)
     at, numbers = at[order], pairs.channels[order]
     steps = np.array([place_of(chunk) for chunk in content.chunks])[pairs.chunks[order]]

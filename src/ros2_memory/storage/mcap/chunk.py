@@ -309,12 +309,13 @@ def in_file_order(places: IntArray) -> IntArray:
     return ordered
 
 
-def declarations_of(data: bytes, places: IntArray) -> list[tuple[int, bytes]]:
-    """Returns the schema and channel records of a chunk; walks only the bytes between messages.
+def declarations_of(data: bytes, places: IntArray, chunk_ends: IntArray) -> list[tuple[int, bytes]]:
+    """Returns the schema and channel records of chunks; walks only the bytes between messages.
 
     Args:
-        data: the decompressed records of the chunk.
-        places: where all of its messages begin in these, ascending.
+        data: the decompressed records of the chunks.
+        places: where all of their messages begin in these.
+        chunk_ends: where each chunk ends in these, ascending.
 
     Returns:
         The opcode and the body of each.
@@ -326,8 +327,10 @@ def declarations_of(data: bytes, places: IntArray) -> list[tuple[int, bytes]]:
     lengths = gathered(data, _HEAD, places)["length"]
     if ((lengths < 0) | (lengths > size)).any():
         raise UnreadableError(NOT_THERE)
-    begins = np.concatenate([_ZERO, places + RECORD.size + lengths])
-    ends = np.append(places, size)
+    begins = np.concatenate([_ZERO, chunk_ends[:-1], places + RECORD.size + lengths])
+    ends = np.concatenate([places, chunk_ends])
+    begins.sort()
+    ends.sort()
     if bool((begins > ends).any()):
         raise UnreadableError(NOT_THERE)
     declarations: list[tuple[int, bytes]] = []

@@ -397,7 +397,7 @@ def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
         UnreadableError: a message index is not what the summary section says.
     """
     try:
-        index, stated = _index_without_totals(file)
+        index, stated = _index_without_totals(file, is_sound=is_sound)
     except (DoubtError, OSError):
         raise
     except Exception as error:
@@ -422,7 +422,7 @@ def index_from_summary(file: OpenFile, *, is_sound: bool = False) -> McapIndex:
     )
 
 
-def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
+def _index_without_totals(file: OpenFile, *, is_sound: bool) -> tuple[McapIndex, Statistics]:
     """Returns the index without what its messages amount to, and what the file states of that."""
     start, (channels, channel_bytes, declared), chunks, stated = read_summary(file)
     if stated is None or not declared.resolved or stated.channel_count > len(channels):
@@ -437,7 +437,7 @@ def _index_without_totals(file: OpenFile) -> tuple[McapIndex, Statistics]:
     declared_channels = frozenset(channels)
     if not all(map(declared_channels.issuperset, {chunk.channels for chunk in filled})):
         raise DoubtError("its chunk indexes name channels that it does not declare")
-    if chunks:
+    if chunks and not is_sound:
         _require_chunks_as_indexed(file, start, chunks)
     if not _agrees(stated, chunks, filled):
         raise DoubtError
