@@ -482,13 +482,17 @@ def _steps_back(view: View) -> Mapping[Path, Ns]:
 
 def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -> bool:
     """Whether two recordings hold messages in a window, and each lacks most of the other's."""
+    around = both.widened(COPY_HORIZON_NS)
+    spans = [segment.recordings(topic) for segment in view.timeline.segments_in(around)]
+    # One that a wrong clock dated spans years, mostly without a bag.
+    if not all(any(path in by and around.overlaps(*by[path][:2]) for by in spans) for path in pair):
+        return False
     differing, key = view.timeline.memo.of(_DIFFERING, dict), (topic, pair, both)
     if key in differing:
         return differing[key]
     noted = view.notes.added
-    near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
+    near = view.stream.overlapping_bags([topic], around)
     bags = [[span for span in near if span.bag.recording == path] for path in pair]
-    # One that a wrong clock dated spans years, mostly without a bag.
     are_two = all(bags) and not view.sessions.are_joined(*pair)
     differ = are_two and _bags_differ(view, topic, bags, both)
     if view.notes.added == noted:  # else something could not be read, and may be next time
