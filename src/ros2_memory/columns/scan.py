@@ -8,10 +8,11 @@ columns are unpacked when they are first used.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -147,9 +148,9 @@ class Scan:
         self._scanner = scanner
         self._request = request
         self._coverage: Coverage | None = None
-        self._shared = [
-            span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
-        ]
+        since = bisect_right(request.shared, request.window.start, key=itemgetter(1))
+        until = bisect_left(request.shared, request.window.stop, since, key=itemgetter(0))
+        self._shared = [*request.shared[since:until]]
         self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()

@@ -119,7 +119,7 @@ class Caches:
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
-        statics: by session and topics, the static transforms of a timeline.
+        statics: by topics, the static transforms of sessions of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw.
         things: by settings, what was estimated of all bags of a timeline.
     """
@@ -132,7 +132,7 @@ class Caches:
     decoded: ByteLru[list[list[Table]]]
     pairs: ByteLru[frozenset[Pair]]
     clock_steps: ByteLru[tuple[ClockStep, ...]]
-    statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]]
+    statics: ByteLru[tuple[Timeline, Mapping[frozenset[str], Sequence[StampedTransform]]]]
     sights: ByteLru[object]
     things: ByteLru[tuple[Timeline, object]]
 
