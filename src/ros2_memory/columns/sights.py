@@ -288,11 +288,13 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
     whole = np.concatenate(wide, axis=2)
     columns = np.empty((len(whole), len(part)), np.int64)
     firsts = np.flatnonzero(np.diff(part, prepend=-1))
-    sizes = np.diff(firsts, append=len(part))
     # One by one: a column is in the processor's cache, and all of a week would take 50 MB more.
-    for column, of_column in zip(columns, whole, strict=True):
-        coded = np.ascontiguousarray(of_column.T).view(f"<u{width}")[:, 0]
-        steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
-        np.cumsum(steps, out=column)
-        np.subtract(column, np.repeat(column[firsts] - steps[firsts], sizes), out=column)
+    for column, of_column in zip(columns, whole, strict=True) if len(part) else ():
+        coded = of_column[0].astype(f"<u{width}")
+        for nth, plane in enumerate(of_column[1:], 1):
+            if plane.any():  # most have few bytes
+                coded |= plane.astype(coded.dtype) << (8 * nth)
+        column[:] = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
+        column[firsts[1:]] -= np.add.reduceat(column, firsts)[:-1]
+        np.cumsum(column, out=column)
     return columns
