@@ -196,14 +196,12 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
     best = rank.copy()
     # With room for a step: what is in order, and each step from it, is found quickest.
     sizes = cells.max(axis=0, initial=0) - cells.min(axis=0, initial=0) + 3
-    keys = _hashed(cells, sizes)
+    keys, weights = _hashed(cells, sizes), _hashed(np.eye(3, cells.shape[1], dtype=np.int64), sizes)
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
-        beside = cells.copy()
-        beside[:, :3] += step
-        beside[:, 0] %= _YAWS
-        wanted = _hashed(beside, sizes)
+        turned = (cells[:, 0] + step[0]) % _YAWS - cells[:, 0]
+        wanted = keys + turned * weights[0] + weights[1:] @ step[1:]
         place = np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)
         one = np.flatnonzero((ordered[place] == wanted) & (cells[:, 0] >= 0))
         other = order[place[one]]
