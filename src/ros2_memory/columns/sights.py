@@ -134,18 +134,14 @@ def joined(
     names: Names = {}, {}
     # Of each table and column, those of the parts that are unpacked together, in few bytes.
     pieces: list[list[list[Ints]]] = [[[] for _ in range(size + 1)] for size in _COLUMNS]
-    spots = looks = 0
     for begin in range(0, max(len(parts), 1), _AT_ONCE):
         tables, part_of = _unpacked(parts[begin : begin + _AT_ONCE], names)
-        for at in (_HITS, _SCORES, _BESIDE):
-            tables[at][0] += spots
-        tables[_HITS][Hit.LOOK] += (tables[_HITS][Hit.LOOK] >= 0) * looks
-        spots, looks = spots + tables[_SPOTS].shape[1], looks + tables[_LOOKS].shape[1]
         for of_table, table, numbers in zip(pieces, tables, part_of, strict=True):
             for of_column, column in zip(of_table, (*table, numbers + begin), strict=True):
                 of_column.append(narrowed(column))
     columns = [[*map(_concatenated, of_table)] for of_table in pieces]
     part = [table.pop() for table in columns]
+    _number_rows(columns, part, len(parts))
     for kind, places in enumerate(_NAMED):
         rank = np.argsort([names[kind][name] for name in sorted(names[kind])]).astype(np.int64)
         for at, column in places:
@@ -177,29 +173,42 @@ def _concatenated(pieces: list[Ints]) -> Ints:
     return column
 
 
+def _number_rows(columns: Sequence[list[Ints] | Ints], part: Sequence[Ints], parts: int) -> None:
+    """Numbers the spots and looks that tables name through all parts, no more for each of these."""
+    spots, looks = (
+        np.append(0, np.cumsum(np.bincount(part[at], minlength=parts))).astype(np.int64)
+        for at in (_SPOTS, _LOOKS)
+    )
+    for at in (_HITS, _SCORES, _BESIDE):
+        columns[at][0] = columns[at][0] + spots[part[at]]
+    look = columns[_HITS][Hit.LOOK]
+    columns[_HITS][Hit.LOOK] = np.where(look < 0, -1, look + looks[part[_HITS]])
+
+
 def _number_slices(columns: list[list[Ints]], part: Sequence[Ints], epoch: Ints) -> Ints:
     """Numbers the slices in tables, which are of some parts; returns the epoch of each."""
-    begins = []
-    for at in _IN_SLICES:
-        is_other = np.ones(len(part[at]), np.bool_)
-        is_other[1:] = (np.diff(columns[at][0]) != 0) | (np.diff(part[at]) != 0)
-        begins.append(np.flatnonzero(is_other))
-    runs = zip(_IN_SLICES, begins, strict=True)
-    of_runs = [(columns[at][0][begin], epoch[part[at][begin]]) for at, begin in runs]
-    slices, epochs = map(np.concatenate, zip(*of_runs, strict=True))
-    rows, number = distinct_rows((slices, epochs))
-    numbers = np.split(narrowed(number), np.cumsum([len(begin) for begin in begins])[:-1])
-    for at, begin, of_table in zip(_IN_SLICES, begins, numbers, strict=True):
-        columns[at][0] = np.repeat(of_table, np.diff(begin, append=len(part[at])))
-    return rows[:, 1]
+    begins = {at: _begins(columns[at][0], part[at]) for at in _IN_SLICES}
+    of_runs = [(columns[at][0][rows], epoch[part[at][rows]]) for at, rows in begins.items()]
+    slices, number = distinct_rows([*map(np.concatenate, zip(*of_runs, strict=True))])
+    number = narrowed(number)
+    for at, rows in begins.items():
+        columns[at][0] = np.repeat(number[: len(rows)], np.diff(rows, append=len(part[at])))
+        number = number[len(rows) :]
+    return slices[:, 1]
+
+
+def _begins(*columns: Ints) -> Ints:
+    """Returns the rows that differ from the one before, and the first."""
+    is_other = np.ones(len(columns[0]), np.bool_)
+    is_other[1:] = np.any([np.diff(column) != 0 for column in columns], axis=0)
+    return np.flatnonzero(is_other)
 
 
 def _order(keys: Sequence[Ints]) -> Ints:
     """Returns the rows in the order of some columns; equal ones stay in their order."""
-    _, number = distinct_rows(keys)
-    begins = np.flatnonzero(np.diff(number, prepend=-1))
-    by_run = np.argsort(number[begins], kind="stable")  # many rows of one number follow each other
-    return in_ranges(begins[by_run], np.diff(begins, append=len(number))[by_run])
+    begins = _begins(*keys)  # many rows that are alike follow each other
+    order = np.argsort(distinct_rows([key[begins] for key in keys])[1], kind="stable")
+    return in_ranges(begins[order], np.diff(begins, append=len(keys[0]))[order])
 
 
 def _by_spot(columns: Sequence[Ints], order: Ints) -> list[Ints]:
@@ -214,7 +223,8 @@ def _by_spot(columns: Sequence[Ints], order: Ints) -> list[Ints]:
 def united(parts: Sequence[bytes]) -> bytes:
     """Returns packed parts as one: their rows one after the other."""
     topics, labels = names = dict[str, int](), dict[str, int]()
-    tables, _ = _unpacked(parts, names)
+    tables, part = _unpacked(parts, names)
+    _number_rows(tables, part, len(parts))
     return packed(Sights((*topics,), (*labels,), *(table.T for table in tables)))
 
 
@@ -224,17 +234,14 @@ def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
     Where a stretch of the clock ends, both that it parts have the fix.
     """
     order = np.lexsort((*columns[:0:-1], session))
-    is_other = np.ones(len(order), np.bool_)
-    changes = [np.diff(column[order]) != 0 for column in (*columns, session)]
-    is_other[1:] = np.any(changes, axis=0)
-    return order[is_other]
+    return order[_begins(*(column[order] for column in (*columns, session)))]
 
 
 def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], list[Ints]]:
     """Returns the tables of all parts, and the part of each row of these.
 
-    Each table has its columns one after the other; numbers of spots and looks are of all these
-    parts. `names` has the numbers of topics and labels, and gets those of others.
+    Each table has its columns one after the other. `names` has the numbers of topics and labels,
+    and gets those of others.
     """
     planes: list[list[Bytes]] = [[] for _ in TABLES]
     own_names, heads = [], []
@@ -260,10 +267,6 @@ def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], list[In
         table[times.first] = (table[times.first] + table[0] * _SLICE_US) * NS_PER_US
         if times.last is not None:
             table[times.last] = table[times.last] * NS_PER_US + table[times.first]
-    for at in (_HITS, _SCORES, _BESIDE):
-        tables[at][0] += (np.cumsum(sizes[_SPOTS]) - sizes[_SPOTS])[part_of[at]]
-    look = tables[_HITS][Hit.LOOK]
-    look += (look >= 0) * (np.cumsum(sizes[_LOOKS]) - sizes[_LOOKS])[part_of[_HITS]]
     # Many parts have the same names.
     distinct = {text: json.loads(text) for text in own_names}
     for kind, (places, numbers_of) in enumerate(zip(_NAMED, names, strict=True)):
@@ -288,11 +291,13 @@ def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:
     whole = np.concatenate(wide, axis=2)
     columns = np.empty((len(whole), len(part)), np.int64)
     firsts = np.flatnonzero(np.diff(part, prepend=-1))
-    sizes = np.diff(firsts, append=len(part))
     # One by one: a column is in the processor's cache, and all of a week would take 50 MB more.
-    for column, of_column in zip(columns, whole, strict=True):
-        coded = np.ascontiguousarray(of_column.T).view(f"<u{width}")[:, 0]
-        steps = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
-        np.cumsum(steps, out=column)
-        np.subtract(column, np.repeat(column[firsts] - steps[firsts], sizes), out=column)
+    for column, of_column in zip(columns, whole, strict=True) if len(part) else ():
+        coded = of_column[0].astype(f"<u{width}")
+        for nth, plane in enumerate(of_column[1:], 1):
+            if plane.any():  # most have few bytes
+                coded |= plane.astype(coded.dtype) << (8 * nth)
+        column[:] = ((coded >> 1) ^ -(coded & 1)).view(f"<i{width}")
+        column[firsts[1:]] -= np.add.reduceat(column, firsts)[:-1]
+        np.cumsum(column, out=column)
     return columns

@@ -77,6 +77,8 @@ _NEWEST_BESIDE: Final = 9
 """So many slices say how many there are now: of more, some may have been taken away since."""
 _STAYS_AT_ONCE: Final = 64
 """So many are compared with all at once."""
+_SPOTS_AT_ONCE: Final = 16_384
+"""About so many spots of labels are looked at together."""
 _RESTLESS_MOVES: Final = 6
 _RESTLESS_SHARE: Final = 0.2
 
@@ -347,8 +349,9 @@ def estimate(
     keys = with_synonyms(sights, observed.counts, labels, go_on)
     groups = _groups(observed, keys)
     _find_places(groups, observed)
-    for group in groups:
-        _find_stays(group, observed)
+    spots_before = np.cumsum([0, *(len(group.rows) for group in groups)]) // _SPOTS_AT_ONCE
+    for _, some in groupby(zip(spots_before.tolist(), groups, strict=False), itemgetter(0)):
+        _find_stays([group for _, group in some], observed)
     _remove_false_stays(groups, observed, keys)
     instances: list[Instance] = []
     movers: list[Mover] = []
@@ -454,11 +457,11 @@ class _Observations:
         return good if self.counts[good].sum() >= _FEWEST else rows
 
     def sightings(self, rows: Ints) -> Sightings:
-        """Returns some spots as sightings of one thing."""
-        spots = self.sights.spots[rows]
-        place = spots[:, [Spot.X, Spot.Y]].astype(np.float64)
-        times = spots[:, Spot.FIRST], spots[:, Spot.LAST]
-        return Sightings(place, self.counts[rows], spots[:, Spot.DEV], self.side[rows], *times)
+        """Returns some spots as sightings."""
+        names = (Spot.X, Spot.Y, Spot.DEV, Spot.FIRST, Spot.LAST)
+        x, y, dev, *times = (self.sights.spots[rows, name] for name in names)
+        place = np.stack((x, y), axis=1, dtype=np.float64)
+        return Sightings(place, self.counts[rows], dev, self.side[rows], *times)
 
 
 def _lowest_bin(min_score: float) -> int:
@@ -491,7 +494,10 @@ def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
         if not moves_by_itself(group.key):
             observed.go_on()
             single += [(group, rows) for rows in _add_shared_places(group, observed)]
-    steps = stays_in([observed.sightings(rows) for _, rows in single])
+    if not single:
+        return
+    thing = np.repeat(np.arange(len(single)), [len(rows) for _, rows in single])
+    steps = stays_in(observed.sightings(np.concatenate([rows for _, rows in single])), thing)
     for (group, rows), step in zip(single, steps, strict=True):
         group.places += [rows[step == number] for number in range(int(step.max()) + 1)]
 
@@ -526,36 +532,41 @@ def _are_several(place: Ints, groups: Ints) -> Flags:
     return several
 
 
-def _find_stays(group: _Group, observed: _Observations) -> None:
-    """Finds when a label was at its places."""
-    if not group.places:
+def _find_stays(groups: Sequence[_Group], observed: _Observations) -> None:
+    """Finds when labels were at their places, which are numbered in the order of the groups."""
+    there = [place for group in groups for place in group.places]
+    if not there:
         return
-    spots = observed.sights.spots
-    rows = np.concatenate(group.places)
-    place = np.repeat(np.arange(len(group.places)), [len(place) for place in group.places])
+    spots, rows = observed.sights.spots, np.concatenate(there)
+    place = np.repeat(np.arange(len(there)), [len(spots_there) for spots_there in there])
+    group_of = np.repeat(np.arange(len(groups)), [len(group.places) for group in groups])
     n = observed.counts[rows]
     sums = [np.bincount(place, n * spots[rows, column]) for column in (Spot.X, Spot.Y)]
     centres = np.stack(sums, axis=1) / np.bincount(place, n)[:, None]
     sizes, look, n_of_look = observed.hits.rows_of(rows)
     hits = np.stack((np.repeat(spots[rows, Spot.SLICE], sizes), look, n_of_look), axis=1)
     place_of_hit = np.repeat(place, sizes)
-    group.evidence = evidence_at(
+    evidence = evidence_at(
         observed.cells,
         observed.fields,
         centres,
         hits,
         place_of_hit,
-        unplaced=group.unplaced,
+        unplaced=[group.unplaced for group in groups],
+        label=group_of,
     )
     observed.go_on()
-    stays = [*stays_at(observed.cells, group.evidence)]
+    stays = [*stays_at(observed.cells, evidence)]
     # Rows of a place are in the order of their slices.
     width = len(observed.sights.epochs)
     slices, number = place * width + spots[rows, Spot.SLICE], [number for number, _ in stays]
     ends = np.array([(stay.first_slice, stay.last_slice + 1) for _, stay in stays], np.int64)
     ends = ends.reshape(-1, 2) + np.array(number, np.int64)[:, None] * width
     begin, end = np.searchsorted(slices, ends).T
-    group.stays = _placed(observed, stays, rows[in_ranges(begin, end - begin)], end - begin)
+    for group in groups:
+        group.evidence = evidence
+    for stay in _placed(observed, stays, rows[in_ranges(begin, end - begin)], end - begin):
+        groups[group_of[stay.place]].stays.append(stay)
 
 
 def _placed(

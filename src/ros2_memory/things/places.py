@@ -36,7 +36,7 @@ from ros2_memory.core.timebase import NS_PER_S
 from ros2_memory.things.labels import Labels, last_word, moves_by_itself
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator
 
     from ros2_memory.analysis.sights import Floats
     from ros2_memory.columns.sights import JoinedSights
@@ -195,7 +195,7 @@ _USUAL: Final = 8
 
 
 class Sightings(NamedTuple):
-    """Sightings of one thing in order of time, at least one.
+    """Sightings of things, of each in order of time, at least one.
 
     Attributes:
         xy: the mean of `n` looks (mm); `dev` is their root mean square distance from it.
@@ -219,13 +219,14 @@ def visits_of(first: Ints, last: Ints, thing: Ints | int = 0) -> Ints:
     return np.concatenate(([0], np.cumsum(begins)))
 
 
-def stays_in(things: Sequence[Sightings]) -> list[Ints]:
-    """Returns for the sightings of each thing the number of the stay of each, from 0."""
-    if not things:
-        return []
-    series = _Series.of(things)
+def stays_in(sightings: Sightings, thing: Ints) -> list[Ints]:
+    """Returns the number of the stay of each sighting, from 0 for each thing.
+
+    `thing` has their numbers, from 0 without a gap, in order.
+    """
+    series = _Series.of(sightings, thing)
     begins = np.flatnonzero(np.diff(series.thing, prepend=-1))
-    variance = _visit_variances(*_differences(series), len(things))
+    variance = _visit_variances(*_differences(series), len(begins))
     stays = np.cumsum(_are_moved(series, variance))
     return np.split(stays - stays[begins][series.thing], begins[1:])
 
@@ -242,10 +243,10 @@ class _Series(NamedTuple):
     thing: Ints
 
     @classmethod
-    def of(cls, things: Sequence[Sightings]) -> _Series:
-        sizes = np.array([len(sightings.n) for sightings in things])
-        thing, begins = np.repeat(np.arange(len(things)), sizes), np.cumsum(sizes) - sizes
-        xy, n, dev, side, first, last = map(np.concatenate, zip(*things, strict=True))
+    def of(cls, sightings: Sightings, thing: Ints) -> _Series:
+        xy, n, dev, side, first, last = sightings
+        sizes = np.bincount(thing)
+        begins = np.cumsum(sizes) - sizes
         squares = n * dev**2 / 2
         looks = np.add.reduceat(n, begins) - sizes + _USUAL
         usual = (np.add.reduceat(squares, begins) + _USUAL * _LOOK_MM**2) / looks

@@ -86,16 +86,7 @@ class Cells:
         columns = (looks.columns[name] for name in names)
         self.slice, self.topic, self.x, self.y, self.yaw, self.pan, self.n = columns
         self._first, self.last = looks[:, Look.FIRST], looks[:, Look.LAST]
-        grid = (
-            looks[:, Look.YAW] // CELL_DECIDEG,
-            looks[:, Look.X] // CELL_MM,
-            looks[:, Look.Y] // CELL_MM,
-            self.topic + poor * np.int64(len(sights.topics) + 1),
-            sights.epochs[self.slice],
-            looks[:, Look.PAN] // CELL_DECIDEG,
-            (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM,
-        )
-        cells, cell = distinct_rows([*map(narrowed, grid)])
+        cells, cell = distinct_rows([*map(narrowed, self._grid(sights, poor))])
         poses = (self.x, self.y, self.yaw / 10.0)
         self.cell = narrowed(_joined(cells, cell, poses, self.n)[cell])
         order = np.argsort(self.cell, kind="stable")  # of 16 bits it is much faster
@@ -111,6 +102,16 @@ class Cells:
         previous = np.full(len(order), -1, np.int64)
         previous[after] = np.where(is_next, before, -1)
         self._previous = narrowed(previous)
+
+    def _grid(self, sights: JoinedSights, poor: Flags | bool) -> Iterator[Ints]:
+        """Yields yaw, x and y of looks in the grid of cells, and what else tells cells apart."""
+        looks = sights.looks
+        for name, size in ((Look.YAW, CELL_DECIDEG), (Look.X, CELL_MM), (Look.Y, CELL_MM)):
+            yield looks[:, name] // size
+        yield self.topic + poor * np.int64(len(sights.topics) + 1)
+        yield sights.epochs[self.slice]
+        yield looks[:, Look.PAN] // CELL_DECIDEG
+        yield (looks[:, Look.Z] + STOREY_MM // 2) // STOREY_MM
 
     @property
     def looks(self) -> Looks:
@@ -135,8 +136,6 @@ class Cells:
 
     def totals_in(self, looks: Ints, unplaced: Ints) -> Ints:
         """Returns how many detections without a place the slice and topic of each look have."""
-        if not len(unplaced):
-            return np.zeros(len(looks), np.int64)
         topics = np.int64(self.topic.max(initial=0)) + 1
         keys, n = _totals(
             unplaced[:, Unplaced.SLICE] * topics + unplaced[:, Unplaced.TOPIC],
@@ -197,14 +196,12 @@ def _joined(cells: Ints, cell: Ints, poses: Sequence[Ints | Floats], n: Ints) ->
     best = rank.copy()
     # With room for a step: what is in order, and each step from it, is found quickest.
     sizes = cells.max(axis=0, initial=0) - cells.min(axis=0, initial=0) + 3
-    keys = _hashed(cells, sizes)
+    keys, weights = _hashed(cells, sizes), _hashed(np.eye(3, cells.shape[1], dtype=np.int64), sizes)
     order = np.argsort(keys, kind="stable")
     ordered = keys[order]
     for step in [*product((-1, 0, 1), repeat=3)][14:]:  # the others are from those to these
-        beside = cells.copy()
-        beside[:, :3] += step
-        beside[:, 0] %= _YAWS
-        wanted = _hashed(beside, sizes)
+        turned = (cells[:, 0] + step[0]) % _YAWS - cells[:, 0]
+        wanted = keys + turned * weights[0] + weights[1:] @ step[1:]
         place = np.minimum(np.searchsorted(ordered, wanted), len(order) - 1)
         one = np.flatnonzero((ordered[place] == wanted) & (cells[:, 0] >= 0))
         other = order[place[one]]
@@ -342,12 +339,13 @@ def evidence_at(
     rows: Ints,
     place: Ints,
     *,
-    unplaced: Ints,
+    unplaced: Sequence[Ints],
+    label: Ints,
 ) -> Evidence:
     """Returns the evidence on places (mm) from rows of `Hit` with `SPOT` as the slice.
 
-    `fields` are as of `fields_of_view`, `place` has the number of the place of each row, and
-    `unplaced` the rows of the label.
+    `fields` are as of `fields_of_view`, `place` has the number of the place of each row, `label`
+    that of the label of each place, and `unplaced` the rows of each label.
     """
     has_look, n = rows[:, Hit.LOOK] >= 0, rows[:, Hit.N]
     blind, times = _totals(_keys(place, rows[:, Hit.SPOT])[~has_look], n[~has_look])
@@ -373,7 +371,11 @@ def evidence_at(
     fair = sees[cell]
     fair[fair] = _are_in_view(cells, fields, places, looks[fair])
     numbers = _number(looks)
-    n = np.maximum(cells.n[numbers] - cells.totals_in(numbers, unplaced), hits)
+    n = cells.n[numbers].astype(np.int64)
+    for nth in [nth for nth, rows_of_label in enumerate(unplaced) if len(rows_of_label)]:
+        of_label = np.flatnonzero(label[_place(looks)] == nth)
+        n[of_label] -= cells.totals_in(numbers[of_label], unplaced[nth])
+    cell, n, hits = map(narrowed, (cell, np.maximum(n, hits), hits))
     return Evidence(looks, cell, n, hits, blind, times, fair)
 
 
@@ -502,7 +504,7 @@ def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:
     often each cell sees it while it is there.
     """
     cell, n, hits = evidence.cell, evidence.n, evidence.hits[hit]
-    messages = np.bincount(cell[there], n[there], int(cell.max(initial=-1)) + 1)
+    messages = np.bincount(cell[there], n[there], int(cell.max(initial=0)) + 1)
     rate = (np.bincount(cell[hit], hits, len(messages)) + _PRIOR) / (messages + 2 * _PRIOR)
     rate = rate.clip(2 * _FALSE_RATE, 0.98)
     for_hit, for_miss = np.log(rate / _FALSE_RATE), np.log((1 - rate) / (1 - _FALSE_RATE))

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ros2_memory.analysis.sights import Look, fixes_of
+from ros2_memory.analysis.sights import Ints, Look, fixes_of
 from ros2_memory.columns.sights import joined, packed
 from ros2_memory.things.places import Sightings, poorly_localised, stays_in
 from tests.support.bags import Msg, header, make, point, quaternion, write_splits
@@ -138,6 +138,11 @@ def sightings(
     return Sightings(np.array(xy), n, np.array(dev), np.array(side), begin, begin + 9 * S)
 
 
+def stays_of(things: list[Sightings]) -> list[Ints]:
+    together = Sightings(*map(np.concatenate, zip(*things, strict=True)))
+    return stays_in(together, np.repeat(np.arange(len(things)), [len(one.n) for one in things]))
+
+
 NOISE: Final = [
     {},
     {"visit_mm": 30.0},
@@ -152,14 +157,14 @@ def test_nearly_all_small_moves_are_found_and_none_is_made_up(noise: dict[str, A
     for seed in range(40):
         draw = np.random.default_rng(seed)
         still = [sightings(draw, [(0.0, 0.0)] * 12, **noise) for _ in LABELS]
-        assert not any(stay.any() for stay in stays_in(still))
+        assert not any(stay.any() for stay in stays_of(still))
         moved = []
         for _ in LABELS:
             away, angle = draw.uniform(200, 600), draw.uniform(0, 2 * math.pi)
             new = (away * math.cos(angle), away * math.sin(angle))
             moved.append(sightings(draw, [(0.0, 0.0)] * 10 + [new] * 2, **noise))
         truth = [0] * 20 + [1] * 4
-        right += sum(stay.tolist() == truth for stay in stays_in(moved))
+        right += sum(stay.tolist() == truth for stay in stays_of(moved))
     assert right >= 0.99 * 40 * len(LABELS)
 
 
@@ -168,7 +173,7 @@ def test_one_far_look_moves_nothing() -> None:
     seen = sightings(draw, [(0.0, 0.0)] * 6 + [(500.0, 0.0)])
     looks = seen.n.copy()
     looks[-2:] = 1
-    [stay] = stays_in([seen._replace(n=looks)])
+    [stay] = stays_of([seen._replace(n=looks)])
     assert not stay.any()
 
 
@@ -186,7 +191,7 @@ def test_stays_do_not_depend_on_where_the_map_begins(
     seen = sightings(draw, moved, bias_mm=50.0, sides=5)
     turned = np.array([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]])
     other = seen._replace(xy=seen.xy @ turned + np.array(off), side=seen.side @ turned)
-    assert stays_in([seen])[0].tolist() == stays_in([other])[0].tolist()
+    assert stays_of([seen])[0].tolist() == stays_of([other])[0].tolist()
 
 
 # -- while localisation was poor -----------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any, Final
 
 import numpy as np
 from hypothesis import given
@@ -30,7 +31,7 @@ _looks = st.lists(
 
 
 _unplaced = st.dictionaries(st.integers(0, 100), st.integers(1, 3), max_size=3)
-NOTHING = whole([])
+UNPLACED: Final[Any] = {"unplaced": [whole([]).unplaced[:]], "label": np.zeros(2, np.int64)}
 _ANYWHERE = np.array([[1e9, -180.0, 180.0]])
 
 
@@ -41,9 +42,7 @@ def test_looks_that_can_tell_nothing_are_left_out_and_change_nothing(
     """From where the robot mostly stands, all looks of a week are at what it once saw there."""
     cells, hits = _seen(given_looks, unplaced)
     place = np.array([[3000.0, 100.0]])
-    found = evidence_at(
-        cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), unplaced=NOTHING.unplaced[:]
-    )
+    found = evidence_at(cells, _ANYWHERE, place, hits, np.zeros(len(hits), np.int64), **UNPLACED)
 
     whole = _with_every_look(cells, found, hits)
     left_out = np.setdiff1d(whole.looks, found.looks)
@@ -69,7 +68,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
     cells, hits = _seen([*given_looks, *others], unplaced)
     place = np.array(is_second, np.int64)[: len(hits)]
     places = np.array([[3000.0, 100.0], [500.0, -2000.0]])
-    found = evidence_at(cells, _ANYWHERE, places, hits, place, unplaced=NOTHING.unplaced[:])
+    found = evidence_at(cells, _ANYWHERE, places, hits, place, **UNPLACED)
     stays = [*stays_at(cells, found)]
 
     assert stays == sorted(stays, key=lambda each: each[0])
@@ -81,7 +80,7 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
             places[[nth]],
             mine,
             np.zeros(len(mine), np.int64),
-            unplaced=NOTHING.unplaced[:],
+            **UNPLACED,
         )
         at_once = found.at(nth)
         assert at_once.looks.tolist() == alone.looks.tolist()
