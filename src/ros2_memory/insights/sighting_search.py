@@ -286,13 +286,10 @@ class _TopicRuns:
         tested = stacked(self._waiting[::-1])
         self._waiting, self._messages = [], 0
         after, self._begins = self._begins, int(tested.times[0])
-        times, is_near = tested.times, after - int(tested.times[-1]) <= SILENCE_NS
-        is_open, is_silent = (
-            self._is_open and is_near,
-            np.diff(times, prepend=times[0]) > SILENCE_NS,
-        )
-        others = np.flatnonzero((tested.met == NOT_MET) | is_silent)
-        rows = np.flatnonzero(tested.met == MET)
+        times, met = tested.times, tested.met
+        is_silent = np.diff(times, prepend=times[0]) > SILENCE_NS
+        is_open = self._is_open and after - int(times[-1]) <= SILENCE_NS
+        others, rows = np.flatnonzero((met == NOT_MET) | is_silent), np.flatnonzero(met == MET)
         if not rows.size and not others.size:
             self._is_open = is_open
             return
@@ -302,18 +299,9 @@ class _TopicRuns:
         stops = np.append(starts, rows.size)[1:]
         until = np.append(times[others], MAX_NS)[ends[stops - 1]]
         lasts = times[rows[stops - 1]]
-        runs = np.empty((starts.size, len(Run._fields)), np.int64)
-        columns = (
-            self._topic,
-            times[rows[starts]],
-            lasts,
-            stops - starts,
-            np.minimum(until, after),
-            np.searchsorted(times[rows], lasts, side="right") - stops,
-            1,
-        )
-        for nth, column in enumerate(columns):
-            runs[::-1, nth] = column
+        later = np.searchsorted(times[rows], lasts, side="right") - stops
+        columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later, 1)
+        runs = np.stack(np.broadcast_arrays(self._topic, *columns), axis=1)[::-1]
         if is_open and ends[-1:].tolist() == [others.size]:
             self._runs[-1][-1, _FIRST] = runs[0, _FIRST]
             self._runs[-1][-1, _MESSAGES] += runs[0, _MESSAGES]

@@ -137,8 +137,8 @@ def find_matches(
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if total == 0:
-        is_bounded = where is not None or bool(during)
-        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=is_bounded)
+        bounded = scope.is_bounded
+        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=bounded)
     total = total if scope.since is None else None
     return Sightings(
         sightings,
