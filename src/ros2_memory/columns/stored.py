@@ -141,9 +141,10 @@ def lazy_columns(
         owners = cast("IntArray", column(f"{path}#"))
         return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
-    kept, lists = columns.keys(), sequences.keys()
+    kept: Collection[str] = columns
+    lists: Collection[str] = sequences
     if dropped:
         # Owners that are all equal take no bytes: they stay where the columns beside them go.
-        kept = {name: path for name, path in columns.items() if path not in dropped}.keys()
-        lists = {name: path for name, path in sequences.items() if f"{path}#" not in dropped}.keys()
+        kept = [name for name, path in columns.items() if path not in dropped]
+        lists = [name for name, path in sequences.items() if f"{path}#" not in dropped]
     return Lazily(kept, lambda name: column(columns[name])), Lazily(lists, elements)

@@ -270,7 +270,9 @@ class _LeafTest(NamedTuple):
                 raise
             return TruthValues(np.zeros_like(may), may)
         if may is None:
-            flags = [*map(self._passes_text, words)]
+            flags = [*map(self.decided.get, words)]
+            if None in flags:  # else no call is needed for each
+                flags = [*map(self._passes_text, words)]
         else:
             used = np.bincount(codes[may], minlength=len(words)) > 0
             flags = [

@@ -101,12 +101,8 @@ class TimeBins:
         pieces = np.searchsorted(self.edges, np.asarray(times, np.int64), side="right") - 1
         return np.clip(pieces, 0, len(self.member) - 1)
 
-    def membership(self, times: ArrayLike) -> Flags:
-        """Returns for each time and each bin whether it is in the bin; as `pieces` for others."""
-        return self.member[self.pieces(times)]
-
     def lengths(self, starts: ArrayLike, stops: ArrayLike) -> Ints:
-        """Returns how much (ns) of half-open spans falls into each bin, all spans together.
+        """Returns how much (ns) of half-open spans falls into each piece, all spans together.
 
         What lies outside of the window does not count.
         """
@@ -114,7 +110,7 @@ class TimeBins:
         elapsed_until_edges = _summed_ages(self.edges, start_times) - _summed_ages(
             self.edges, np.maximum(start_times, np.asarray(stops, np.int64))
         )
-        return np.diff(elapsed_until_edges) @ self.member.astype(np.int64)
+        return np.diff(elapsed_until_edges)
 
 
 def _summed_ages(edges: Ints, times: Ints) -> Ints:
@@ -369,12 +365,16 @@ class BinnedWindow:
 
     def add_lengths(self, column: str, kind: BinColumn, spans: Sequence[tuple[Ns, Ns]]) -> None:
         """Adds how much (ns) of half-open spans, which do not overlap, falls into each bin."""
-        self.add(column, kind, self._time_in_bins(spans).tolist(), self._time_in_window(spans))
+        self.add_sums(column, kind, self._time_in_pieces(spans))
 
-    def add_counts(self, column: str, times: ArrayLike) -> None:
+    def add_counts(self, column: str, times: Ints) -> None:
         """Adds how many of these times each bin has."""
-        counts = self.bins.membership(times).sum(axis=0)
-        self.add(column, "count", counts.tolist(), len(np.asarray(times)))
+        pieces = self.bins.pieces(times)
+        self.add_sums(column, "count", np.bincount(pieces, minlength=len(self.bins.member)))
+
+    def add_sums(self, column: str, kind: BinColumn, of_pieces: Ints) -> None:
+        """Adds what the pieces of each bin have together."""
+        self.add(column, kind, (of_pieces @ self.bins.member).tolist(), int(of_pieces.sum()))
 
     def add_held(self, held: Ints) -> None:
         """Adds how often something began, its first and last time, and how long it held.
@@ -394,18 +394,24 @@ class BinnedWindow:
         lasting = united(zip(starts[is_long].tolist(), stops[is_long].tolist(), strict=True))
         self.add_lengths("seconds", "duration", without(lasting, self.gaps))
         self.add_first("first", begins)
-        last = self._last_held(starts, stops)
-        self.add("last", "time", last, max(stops.tolist(), default=None))
+        self.add_last("last", self._last_held(starts, stops), max(stops.tolist(), default=None))
         self.usual = self.usual_of(begins)
 
     def add_first(self, column: str, times: Ints) -> None:
         """Adds the first of these times in each bin."""
-        in_bins = self.bins.membership(times)
-        first = [int(times[in_bin].min()) if in_bin.any() else None for in_bin in in_bins.T]
+        firsts = np.full(len(self.bins.member), MAX_NS)
+        np.minimum.at(firsts, self.bins.pieces(times), times)
+        of_bins = (int(firsts[in_bin].min(initial=MAX_NS)) for in_bin in self.bins.member.T)
+        first = [None if at == MAX_NS else at for at in of_bins]
         self.add(column, "time", first, min(times.tolist(), default=None))
 
-    def _last_held(self, starts: Ints, stops: Ints) -> Values:
-        """Returns for each bin when something held there for the last time."""
+    def add_last(self, column: str, of_pieces: Ints, whole: Ns | None) -> None:
+        """Adds the last time in each bin, by those in pieces; `MIN_NS` where there is none."""
+        of_bins = (int(of_pieces[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
+        self.add(column, "time", [None if at == MIN_NS else at for at in of_bins], whole)
+
+    def _last_held(self, starts: Ints, stops: Ints) -> Ints:
+        """Returns for each piece when something held there for the last time; `MIN_NS`: never."""
         piece_ends = self.bins.edges[1:] - 1
         first_pieces, last_pieces = self.bins.pieces(starts), self.bins.pieces(stops)
         newest = np.full(len(piece_ends), MIN_NS)
@@ -413,8 +419,7 @@ class BinnedWindow:
         spans = np.stack((first_pieces, last_pieces), axis=1)[first_pieces < last_pieces]
         for first, last in spans.tolist():
             newest[first:last] = piece_ends[first:last]
-        last_of_bins = (int(newest[in_bin].max(initial=MIN_NS)) for in_bin in self.bins.member.T)
-        return [None if last == MIN_NS else last for last in last_of_bins]
+        return newest
 
     def usual_of(self, times: Ints) -> Usual | None:
         """Returns the usual time of day of the first of these times in each day.
@@ -439,19 +444,13 @@ class BinnedWindow:
                 cut_days.add(day)
         return recorded_days - cut_days
 
-    def _time_in_bins(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
-        """Returns how much time (ns) of half-open spans passed in each bin."""
+    def _time_in_pieces(self, spans: Sequence[tuple[Ns, Ns]]) -> Ints:
+        """Returns how much time (ns) of half-open spans passed in each piece."""
         starts, stops = np.array(spans, np.int64).reshape(-1, 2).T.clip(*self._counted_bounds)
         lengths = self.bins.lengths(starts, stops)
         for skipped in self.elapsed.skipped:
             lengths -= self.bins.lengths(starts.clip(*skipped), stops.clip(*skipped))
         return lengths
-
-    def _time_in_window(self, spans: Sequence[tuple[Ns, Ns]]) -> Ns:
-        """Returns how much time (ns) of half-open spans passed in the window."""
-        start, stop = self._counted_bounds
-        inside = ((max(begin, start), min(end, stop)) for begin, end in spans)
-        return self.elapsed.among(span for span in inside if span[0] < span[1])
 
     @property
     def _counted_bounds(self) -> tuple[Ns, Ns]:
@@ -477,11 +476,10 @@ class BinnedWindow:
     def answer(self) -> Bins:
         """Returns the answer, with notes on what could not be read."""
         start, end = bounds = self._counted_bounds
-        recorded = self._time_in_bins([bounds]) - self._time_in_bins(self.gaps)
-        recorded_in_all = self._time_in_window([bounds]) - self._time_in_window(self.gaps)
+        recorded = self._time_in_pieces([bounds]) - self._time_in_pieces(self.gaps)
         note_unread(self.view, self.asked)
         note_edges(self.view, self.asked)
-        columns = zip(recorded.tolist(), *self._values, strict=True)
+        columns = zip((recorded @ self.bins.member).tolist(), *self._values, strict=True)
         rows = [*zip(self.bins.names, columns, strict=True)]
         if self._since is not None:
             is_late = self.bins.edges[1:] > self._since
@@ -496,7 +494,7 @@ class BinnedWindow:
             end=end,
             columns=(("recorded_s", "duration"), *self._columns),
             rows=tuple(rows),
-            all=(recorded_in_all, *self._all),
+            all=(int(recorded.sum()), *self._all),
             usual=self.usual,
             usual_exit=self.usual_exit,
             notes=self.view.notes.sentences(),

@@ -156,9 +156,9 @@ def count_matches(
     binned.add_unknown(scope.unknown)
     binned.add_held(held)
     if not held.size:
-        is_bounded = where is not None or bool(during)
+        bounded = scope.is_bounded
         view.notes.add(
-            *notes_on_never(view, topic, condition, asked, min_score, is_bounded=is_bounded)
+            *notes_on_never(view, topic, condition, asked, min_score, is_bounded=bounded)
         )
     return binned.answer()
 

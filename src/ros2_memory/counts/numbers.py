@@ -504,12 +504,9 @@ def count_range(
     counts, first, last = count_messages(view, name, binned.counted, edges)
     if not counts.any():
         raise no_data_between(view, (name,), asked)
-    member = binned.bins.member
-    binned.add("count", "count", (counts @ member).tolist(), int(counts.sum()))
-    has_some = counts > 0
-    binned.add_first("first", first[has_some])
-    lasts = [max(last[has_some & in_bin].tolist(), default=None) for in_bin in member.T]
-    binned.add("last", "time", lasts, last.max())
+    binned.add_sums("count", "count", counts)
+    binned.add_first("first", first[counts > 0])
+    binned.add_last("last", last, int(last.max()))
     for field, cells in zip(names, cells_of_fields, strict=True):
         if cells[-1] is None:
             view.notes.add(f"{field} holds no number in the window")

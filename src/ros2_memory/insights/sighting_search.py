@@ -7,7 +7,7 @@ Where a scope does not hold, a match counts as no match.
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from ros2_memory.columns.units import Rows
+    from ros2_memory.core.arrays import Ints
     from ros2_memory.history.reverse_search import ReverseSearch
     from ros2_memory.history.view import View
     from ros2_memory.places.where import Scope
@@ -211,72 +212,8 @@ class Run(NamedTuple):
     begun: int
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Runs:
-    """Runs, the newest first; a column for each attribute of `Run`, topics by their number."""
-
-    topic: IntArray
-    first: IntArray
-    last: IntArray
-    messages: IntArray
-    until: IntArray
-    later: IntArray
-    begun: IntArray
-
-
-_NO_RUNS: Final = Runs(*[np.zeros(0, np.int64)] * 7)
-
-
-class BlockRuns(NamedTuple):
-    """Consecutive matches in a block.
-
-    Attributes:
-        runs: the newest first.
-        goes_back: whether an earlier match may belong to the oldest.
-        goes_on: whether a later match may belong to the newest.
-        is_blank: whether it has neither a match nor a message that surely is none.
-    """
-
-    runs: Runs
-    goes_back: bool
-    goes_on: bool
-    is_blank: bool
-
-
-def runs_of(topic: int, tested: Tested, after: Ns, *, apart: bool) -> BlockRuns:
-    """Returns the runs of matches in some messages, of which there is at least one.
-
-    A run ends with a message that does not match, and where none comes for longer than
-    `SILENCE_NS`. With `apart` each match is a run of its own. The next block begins at `after`.
-    """
-    times, met = tested.times, tested.met
-    begins = np.diff(times, prepend=times[0]) > SILENCE_NS
-    others = np.flatnonzero((met == NOT_MET) | begins)
-    rows = np.flatnonzero(met == MET)
-    # Of two matches, this differs where a message that is none, or a silence, lies between them.
-    ends = np.searchsorted(others, rows, side="right")
-    starts = np.arange(rows.size)
-    if not apart:
-        starts = np.flatnonzero(np.diff(ends, prepend=-1) > 0)
-    stops = np.append(starts, rows.size)[1:]
-    until = np.append(times[others], MAX_NS)[ends[stops - 1]]
-    firsts, lasts = times[rows[starts]], times[rows[stops - 1]]
-    later = np.searchsorted(times[rows], lasts, side="right") - stops
-    runs = Runs(
-        np.full(starts.size, topic),
-        firsts,
-        lasts,
-        stops - starts,
-        np.minimum(until, after),
-        later,
-        np.ones_like(starts),
-    )
-    return BlockRuns(
-        rows_of(runs, slice(None, None, -1)),
-        goes_back=not apart and ends[:1].tolist() == [0],
-        goes_on=not apart and ends[-1:].tolist() == [others.size],
-        is_blank=not rows.size and not others.size,
-    )
+_FIRST, _LAST, _MESSAGES, _BEGUN = 1, 2, 3, 6
+"""Columns of runs as an array: as `Run` has them, a topic by its number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,21 +222,24 @@ class SearchedRuns:
 
     Attributes:
         topics: their names, by number.
-        runs: the newest first.
+        table: the runs, a row for each, the newest first.
         searched_to: a log time; all that is newer was searched. None: all of the window was.
         is_over: whether the search ended since its time was over.
     """
 
     topics: Sequence[str]
-    runs: Runs
+    table: Ints
     searched_to: Ns | None = None
     is_over: bool = False
 
-    def listed(self, which: IntArray | slice[int | None, int | None]) -> list[Run]:
+    @property
+    def spans(self) -> Ints:
+        """The first and the last log time of each, and whether it is known to begin then."""
+        return self.table[:, [_FIRST, _LAST, _BEGUN]]
+
+    def runs(self, which: Ints | slice[int | None, int | None]) -> list[Run]:
         """Returns some of the runs."""
-        runs = rows_of(self.runs, which)
-        columns = (getattr(runs, column.name).tolist() for column in fields(runs))
-        return [Run(self.topics[topic], *run) for topic, *run in zip(*columns, strict=True)]
+        return [Run(self.topics[topic], *run) for topic, *run in self.table[which].tolist()]
 
 
 class _TopicRuns:
@@ -308,21 +248,21 @@ class _TopicRuns:
     def __init__(self, topic: int, *, apart: bool) -> None:
         self._topic = topic
         self._apart = apart
-        self._runs: list[Runs] = []
+        self._runs: list[Ints] = []
         self._is_open = False
         self._begins: Ns = MAX_NS
         self._waiting: list[Tested] = []
         self._messages = 0
 
-    def runs(self, *, cut: bool) -> list[Runs]:
+    def runs(self, *, cut: bool) -> list[Ints]:
         """Returns tables of runs. With `cut` the oldest may have begun earlier than is known."""
         self._join()
         if not (cut and self._is_open):
             return self._runs
-        *newer, oldest = self._runs
-        begun = oldest.begun.copy()
-        begun[-1] = 0
-        return [*newer, replace(oldest, begun=begun)]
+        *newer, last = self._runs
+        oldest = last.copy()
+        oldest[-1, _BEGUN] = 0
+        return [*newer, oldest]
 
     def add(self, block: Block) -> None:
         """Adds the next older block."""
@@ -346,19 +286,29 @@ class _TopicRuns:
         tested = stacked(self._waiting[::-1])
         self._waiting, self._messages = [], 0
         after, self._begins = self._begins, int(tested.times[0])
-        added = runs_of(self._topic, tested, after, apart=self._apart)
-        is_near = after - int(tested.times[-1]) <= SILENCE_NS
-        if added.is_blank:
-            self._is_open = self._is_open and is_near
+        times, met = tested.times, tested.met
+        is_silent = np.diff(times, prepend=times[0]) > SILENCE_NS
+        is_open = self._is_open and after - int(times[-1]) <= SILENCE_NS
+        others, rows = np.flatnonzero((met == NOT_MET) | is_silent), np.flatnonzero(met == MET)
+        if not rows.size and not others.size:
+            self._is_open = is_open
             return
-        runs = added.runs
-        if self._is_open and is_near and added.goes_on:
-            self._runs[-1].first[-1] = runs.first[0]
-            self._runs[-1].messages[-1] += runs.messages[0]
-            runs = rows_of(runs, slice(1, None))
-        if runs.first.size:
+        # Of two matches, this differs where a message that is none, or a silence, lies between.
+        ends = np.searchsorted(others, rows, side="right")
+        starts = np.flatnonzero(self._apart | (np.diff(ends, prepend=-1) > 0))
+        stops = np.append(starts, rows.size)[1:]
+        until = np.append(times[others], MAX_NS)[ends[stops - 1]]
+        lasts = times[rows[stops - 1]]
+        later = np.searchsorted(times[rows], lasts, side="right") - stops
+        columns = (times[rows[starts]], lasts, stops - starts, np.minimum(until, after), later, 1)
+        runs = np.stack(np.broadcast_arrays(self._topic, *columns), axis=1)[::-1]
+        if is_open and ends[-1:].tolist() == [others.size]:
+            self._runs[-1][-1, _FIRST] = runs[0, _FIRST]
+            self._runs[-1][-1, _MESSAGES] += runs[0, _MESSAGES]
+            runs = runs[1:]
+        if len(runs):
             self._runs.append(runs)
-        self._is_open = added.goes_back
+        self._is_open = not self._apart and ends[:1].tolist() == [0]
 
     def end_in(self, view: View, topic: str, gap: TimeWindow) -> None:
         """Ends the oldest run if the topic has a message in a time that was not searched.
@@ -418,17 +368,16 @@ def find_runs(
         found = SearchedRuns(
             topics, _newest_first(by_topic.values(), cut=True), reached, is_over=True
         )
-        if not found.runs.first.size:
+        if not len(found.table):
             raise
         return _parts_in(view, found, scope, latched)
     found = SearchedRuns(topics, _newest_first(by_topic.values()))
     found = _parts_in(view, found, scope, latched)
-    if enough is not None and found.runs.first.size > enough:
+    if enough is not None and len(found.table) > enough:
         # Whether more was searched than had to be depends on how the rows are stored.
-        since = int(found.runs.first[enough - 1])
-        search.note_untested(replace(scope.window, start=since))
+        search.note_untested(replace(scope.window, start=int(found.spans[enough - 1, 0])))
         return replace(found, searched_to=reached)
-    search.close(scope.window, is_found=found.runs.first.size > 0, ruled_out=tester.ruled_out)
+    search.close(scope.window, is_found=len(found.table) > 0, ruled_out=tester.ruled_out)
     return found
 
 
@@ -440,7 +389,7 @@ def _parts_in(
         return found
     _, end = scope.window.asked()
     parts: list[tuple[int, ...]] = []
-    for run in found.listed(slice(None)):
+    for run in found.runs(slice(None)):
         topic = found.topics.index(run.topic)
         if run.topic not in latched:
             parts.append((topic, *run[1:]))
@@ -455,8 +404,7 @@ def _parts_in(
                 last = max(first, min(run.last, stop))
                 begun = run.begun if first == run.first else 0
                 parts.append((topic, first, last, messages, run.until, 0, begun))
-    columns = np.array(parts, np.int64).reshape(-1, 7).T
-    return replace(found, runs=_in_order([Runs(*columns)]))
+    return replace(found, table=_in_order(np.array(parts, np.int64).reshape(-1, 7)))
 
 
 def _scoped(block: Block, scope: Scope) -> Block:
@@ -490,15 +438,14 @@ def _has_messages(view: View, topic: str, gap: TimeWindow) -> bool:
 def _has_enough(by_topic: Collection[_TopicRuns], enough: int, reached: Ns) -> bool:
     """Returns whether no match older than a moment can change the newest runs."""
     runs = _newest_first(by_topic, cut=True)
-    newest = rows_of(runs, slice(enough))
-    return runs.first.size > enough and newest.last[-1] >= reached and bool(newest.begun.all())
+    newest = runs[:enough]
+    return len(runs) > enough and newest[-1, _LAST] >= reached and bool(newest[:, _BEGUN].all())
 
 
-def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool = False) -> Runs:
+def _newest_first(by_topic: Collection[_TopicRuns], *, cut: bool = False) -> Ints:
     tables = [table for topic_runs in by_topic for table in topic_runs.runs(cut=cut)]
-    return _in_order([_NO_RUNS, *tables])
+    return _in_order(np.concatenate([np.empty((0, len(Run._fields)), np.int64), *tables]))
 
 
-def _in_order(tables: Sequence[Runs]) -> Runs:
-    runs = stacked(tables)
-    return rows_of(runs, np.argsort(-runs.last, kind="stable"))
+def _in_order(runs: Ints) -> Ints:
+    return runs[np.argsort(-runs[:, _LAST], kind="stable")]

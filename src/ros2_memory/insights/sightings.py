@@ -137,8 +137,8 @@ def find_matches(
     start, end = _searched_times(view, window, [row.first for row in rows])
     notes = view.notes.sentences()
     if total == 0:
-        is_bounded = where is not None or bool(during)
-        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=is_bounded)
+        bounded = scope.is_bounded
+        notes += notes_on_never(view, topic, condition, window, min_score, is_bounded=bounded)
     total = total if scope.since is None else None
     return Sightings(
         sightings,
@@ -227,10 +227,10 @@ def _runs_as_sightings(
             f"the search ran out of time at {unix_text(result.searched_to or MIN_NS)}: to "
             "continue, pass that time as end"
         )
-    runs = result.listed(
+    runs = result.runs(
         slice(None, -shown.limit - 1, -1) if shown.oldest_first else slice(shown.limit)
     )
-    searched, total = scope.window, len(result.runs.first) if result.searched_to is None else None
+    searched, total = scope.window, len(result.table) if result.searched_to is None else None
     if total is None:
         searched = TimeWindow(runs[-1].first, searched.stop)
     view.notes.retract_outside(searched)
@@ -277,14 +277,13 @@ def read_sightings(
     if result.is_over:
         view.bags.finish_within(_LEFT_TO_SAY_S)
     start, end = scope.window.asked()
-    runs, is_log = result.runs, np.array([*map(view.timeline.is_log, topics)], np.bool_)
-    until, states = runs.last.copy(), np.flatnonzero(~is_log[runs.topic])
-    until[states] = [_lasted_until(view, run, scope) for run in result.listed(states)]
+    spans, is_log = result.spans, np.array([*map(view.timeline.is_log, topics)], np.bool_)
+    states = np.flatnonzero(~is_log[result.table[:, 0]])
+    spans[states, 1] = [_lasted_until(view, run, scope) for run in result.runs(states)]
     # Without a scope the oldest may have begun before what there was time to search.
-    begun = runs.begun if scope.is_bounded else np.ones_like(until)
-    spans: Ints = np.column_stack((runs.first, until, begun))
+    spans[:, 2] |= not scope.is_bounded
     if result.is_over:
-        return spans, int(runs.first[-1])
+        return spans, int(spans[-1, 0])
     earlier = [
         (first, last, False)
         for topic in topics

@@ -391,13 +391,11 @@ class TimeArgument(Arguments):
     Attributes:
         replaces: the placeholder, `moment` or `span`.
         text: what a tool's description says for {when}.
-        extra_reply: the keys that a reply has in addition.
         either: the names of arguments of which exactly one must be given.
     """
 
     replaces: ClassVar[str]
     text: ClassVar[str]
-    extra_reply: ClassVar[str] = ""
     either: ClassVar[tuple[str, ...]] = ()
 
     def chosen(self) -> object:
@@ -430,8 +428,7 @@ class Ago(TimeArgument):
     """A time some seconds before now."""
 
     replaces = "moment"
-    text = "some seconds ago"
-    extra_reply = "age_s"
+    text = "some seconds ago, with age_s"
     ago_s: Annotated[_AtLeast0, Field(examples=[10], alias="seconds_ago")]
 
 

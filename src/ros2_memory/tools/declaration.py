@@ -362,8 +362,7 @@ class ToolDeclaration:
         if name is first or when is None:
             text = self.description.format(when=when.text if when else "", **defaults)
         else:
-            extra = f", with {when.extra_reply}" if when.extra_reply else ""
-            text = f"As {first.name}, {when.text}{extra}."
+            text = f"As {first.name}, {when.text}."
         if self.blocking:
             text = f"Blocking. {text}"
         if self.shows_example and name is first:

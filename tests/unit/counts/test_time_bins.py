@@ -42,7 +42,7 @@ def at(text: str, zone_name: str = "UTC") -> int:
 
 
 def hours(bins: TimeBins) -> dict[str, float]:
-    found = bins.lengths([bins.edges[0]], [bins.edges[-1]])
+    found = bins.lengths([bins.edges[0]], [bins.edges[-1]]) @ bins.member
     return {name: int(length) / S / H for name, length in zip(bins.names, found, strict=True)}
 
 
@@ -76,7 +76,7 @@ def test_every_time_is_in_the_bin_of_its_local_time(
         "weekday": local.strftime("%A"),
         "hour": f"{local.hour:02d}:00",
     }[by]
-    assert bins.names[int(bins.membership([when])[0].argmax())] == expected
+    assert bins.names[int(bins.member[bins.pieces([when])[0]].argmax())] == expected
     assert bins.day_of is not None
     assert bins.day_of[bins.pieces([when])[0]] == local.date().toordinal() - EPOCH
 
