@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from itertools import chain
 from threading import Lock
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from ros2_memory.index.segment import Segment, TopicExtent
     from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
+
+
+_NEVER: Final = TimeWindow(0, 0)
 
 
 class CoveredSegment(NamedTuple):
@@ -152,13 +155,17 @@ class Covering:
             return coverage
 
     def _covered_segments(self, timeline: Timeline, state: State) -> list[CoveredSegment]:
-        has_changed = self._latest is None or self._latest[1].state != state
+        before = state if self._latest is None else self._latest[1].state
+        changed = self.store.begins_since(before, state) if before != state else _NEVER
         remembered = {
             id(segment): covered
             for segment in timeline.segments
             if (covered := self._by_id.get(id(segment))) is not None
             and covered.segment is segment
-            and not (has_changed and covered.missing)
+            and not (
+                covered.missing
+                and changed.overlaps(covered.missing[0].start, covered.missing[-1].start)
+            )
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
         bags = [bag for segment in unknown for bag in segment.bags]

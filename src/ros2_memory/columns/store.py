@@ -45,7 +45,7 @@ from ros2_memory.columns.writing import (
 from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.timebase import MIN_NS, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
@@ -114,12 +114,17 @@ class State(NamedTuple):
     Attributes:
         part: the newest part.
         deletion: the newest deletion: while it is the same, what was stored is stored.
-        change: the newest change, of another connection or of this one.
+        change: the newest change, of this connection.
+        bag: the newest bag.
+        renewal: changes of another connection, and how often this one has changed a bag: while it
+            is the same, only newer bags are stored since.
     """
 
     part: int
     deletion: int
-    change: tuple[int, int]
+    change: int
+    bag: int
+    renewal: tuple[int, int]
 
 
 class Written(NamedTuple):
@@ -191,6 +196,7 @@ class ColumnStore(Database):
         self._topics: dict[int, Topic] = {}
         self._layouts = Layouts()
         self._known: _Known | None = None
+        self._renewals = 0
 
     # Reading
 
@@ -198,12 +204,31 @@ class ColumnStore(Database):
         """Returns what tells whether anything has changed."""
 
         def ask(connection: sqlite3.Connection) -> State:
-            [part] = connection.execute("SELECT max(id) FROM part").fetchone()
+            part, bag = connection.execute(
+                "SELECT (SELECT max(id) FROM part), (SELECT max(id) FROM bag)"
+            ).fetchone()
             [others] = connection.execute("PRAGMA data_version").fetchone()
-            change = others, connection.total_changes
-            return State(self.offset + int(part or 0), self._deletion(connection), change)
+            return State(
+                self.offset + int(part or 0),
+                self._deletion(connection),
+                connection.total_changes,
+                int(bag or 0),
+                (others, self._renewals),
+            )
 
-        return self.read(ask, State(-1, -1, (-1, -1)))
+        return self.read(ask, State(-1, -1, -1, -1, (-1, -1)))
+
+    def begins_since(self, before: State, now: State) -> TimeWindow:
+        """Returns a window (log time) in which the bags begin that are stored since a state.
+
+        The deletion is the same.
+        """
+        if before.renewal != now.renewal:
+            return _ALL_TIME
+        query = "SELECT min(first_ns), max(first_ns) FROM bag WHERE id > ?"
+        unknown: tuple[Ns | None, Ns | None] = MIN_NS, MAX_NS
+        first, last = self._asked(lambda rows: rows.fetchone(), unknown, query, before.bag)
+        return TimeWindow(first or 0, 0 if last is None else last + 1)
 
     def known_files(self, bag_dir: Path, paths: Iterable[str]) -> dict[str, BagFile]:
         """Returns which bags of some whole paths are stored, as they were indexed, by their paths.
@@ -556,6 +581,7 @@ class ColumnStore(Database):
                 " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
                 (key.sidecar_ns, *key[:3], bag.summary.packed, bag.summary.schema.to_json()),
             )
+            self._renewals += 1
             return cursor.rowcount > 0
 
         return self.write(write)
@@ -577,9 +603,14 @@ class ColumnStore(Database):
         if not self.write(long.begin):
             return False
         is_whole = False
+
+        def end(connection: sqlite3.Connection) -> bool:
+            self._renewals += 1
+            return long.end(connection)
+
         try:
             goes_on = all(self.write(partial(long.add, tables=tables)) for tables in groups)
-            is_whole = goes_on and self.write(long.end)
+            is_whole = goes_on and self.write(end)
         finally:
             if not is_whole:
                 self.write(long.delete_half)

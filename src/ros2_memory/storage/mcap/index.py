@@ -298,6 +298,13 @@ class Contents:
             self._spans.append((numbers[of_long], long_times, long_times, ones))
         short_numbers, *short = (column[~is_long] for column in spans)
         self._spans.append((short_numbers, short[0], short[1], short[2]))
+        numbers, firsts, lasts, counts = spans
+        is_same = numbers[1:] == numbers[:-1]
+        if not (is_same & (firsts[1:] < lasts[:-1])).any():
+            # They follow each other, as in most files: those of a channel are one.
+            begin = np.append(0, np.flatnonzero(~is_same) + 1)
+            last = np.append(begin[1:], numbers.size) - 1
+            spans = numbers[begin], firsts[begin], lasts[last], np.add.reduceat(counts, begin)
         rows = zip(*(column.tolist() for column in spans), strict=True)
         for number, first, last, count in rows:
             total = self.totals.get(number)
@@ -338,11 +345,15 @@ class Contents:
         if last - first <= SHORTEST_SILENCE_NS:  # as most splits
             return {}
         numbers, *spans = map(np.concatenate, zip(*self._spans, strict=True))
+        order = np.lexsort((spans[0], numbers))
+        apart = spans[0][order[1:]] - spans[1][order[:-1]] > SHORTEST_SILENCE_NS
+        may_pause = {*numbers[order[1:][apart]].tolist()}
         by_channel = {
             number: pauses_among(
                 *(column[numbers == number] for column in spans), longer_than=SHORTEST_SILENCE_NS
             )
             for number in self.totals
+            if number in may_pause
         }
         return {number: pauses for number, pauses in by_channel.items() if pauses}
 
