@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING
 
 from ros2_memory.core.logging_setup import configure_logging
 from ros2_memory.core.timebase import NS_PER_S, WallClock
-from ros2_memory.lake.engine import Partitions
 from ros2_memory.lake.tables import TABLES
 from ros2_memory.lake.upkeep import expire
-from ros2_memory.lake.warehouse import LakeLocation
+from ros2_memory.lake.warehouse import LakeLocation, Partitions
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Reads a lake: which files its tables have now, and DuckDB, inside of this process, over these.
+"""Reads a lake: DuckDB, inside of this process, over the files that its tables have now.
 
 DuckDB is given the data files that hold what a question is about, and never looks at the lake's
 catalogue itself. It loads no extension.
@@ -11,21 +11,18 @@ import threading
 import time
 from collections import defaultdict
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from datetime import date, timedelta
-from itertools import chain
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, TypeAlias
 
 import duckdb
 import pyarrow as pa
 import pyarrow.dataset as ds
 from pyiceberg.exceptions import NoSuchTableError
 from pyiceberg.io.pyarrow import PyArrowFileIO
-from pyiceberg.manifest import ManifestContent, ManifestFile
-from pyiceberg.transforms import IdentityTransform
 
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.lake.tables import NAMESPACE, TABLES
+from ros2_memory.lake.warehouse import Partitions
 from ros2_memory.storage.cache import ByteLru
 
 if TYPE_CHECKING:
@@ -33,6 +30,8 @@ if TYPE_CHECKING:
 
     from pyiceberg.catalog import Catalog as IcebergCatalog
     from pyiceberg.table import Table as IcebergTable
+
+    from ros2_memory.lake.warehouse import Days, LakeFile
 
 _SETTINGS: Final = {
     "autoinstall_known_extensions": "false",
@@ -43,84 +42,12 @@ _LOCAL: Final = (
     " UNION ALL BY NAME"
     " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
 )
-_EPOCH: Final = date(1970, 1, 1)
-_LAST: Final = "\U0010ffff"
-"""After all ids of bags."""
 _MESSAGE_BYTES: Final = 64 << 20
 
 log = get_logger(__name__)
 
 
-class LakeFile(NamedTuple):
-    """A Parquet file by its URI, and how many rows it has.
-
-    No id of a bag in it is before `first`, nor after `last`.
-    """
-
-    location: str
-    rows: int = 0
-    first: str = ""
-    last: str = _LAST
-
-
 Parameters: TypeAlias = "Mapping[str, str | int | float | Sequence[str]]"
-Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
-"""The files of one robot in one table by day, in order of the days."""
-
-
-class Partitions:
-    """The files of the versions of one table that it was last shown. Not thread-safe."""
-
-    def __init__(self) -> None:
-        self._snapshot: int | None = None
-        self._read: dict[str, Sequence[tuple[str, date, LakeFile]]] = {}
-        self._robots: dict[str, dict[date, list[LakeFile]]] = {}
-
-    def look(self, table: IcebergTable) -> Mapping[str, Days]:
-        """Returns the files of a table's current version, by robot.
-
-        Raises:
-            RefusedError: another program wrote what cannot be read by robot and day.
-        """
-        snapshot = table.current_snapshot()
-        if snapshot is None or snapshot.snapshot_id == self._snapshot:
-            return self._robots
-        read = {}
-        for manifest in snapshot.manifests(table.io):
-            path = manifest.manifest_path
-            read[path] = self._read.get(path) or [*_files(table, manifest)]
-        robots: dict[str, dict[date, list[LakeFile]]] = {}
-        for robot, day, file in sorted(chain.from_iterable(read.values())):
-            robots.setdefault(robot, {}).setdefault(day, []).append(file)
-        self._read, self._robots, self._snapshot = read, robots, snapshot.snapshot_id
-        return robots
-
-
-def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
-    name = f"the lake's table {table.name()[-1]}"
-    entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
-    if entries and manifest.content is ManifestContent.DELETES:
-        do = "rewrite them into its data files first (copy-on-write)"
-        raise RefusedError(f"{name} has delete files, which another program wrote: {do}")
-    spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
-    positions = {
-        schema.find_column_name(part.source_id): position
-        for position, part in enumerate(spec.fields)
-        if isinstance(part.transform, IdentityTransform)
-    }
-    for column in ("robot", "day"):
-        if column not in positions:
-            why = f"has files that are not of one {column}, which another program wrote"
-            raise RefusedError(f"{name} {why}: partition it by robot and day again")
-    bag_id = schema.find_field("bag_id").field_id
-    for data in (entry.data_file for entry in entries):
-        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
-        first, last = (
-            bytes((bounds or {}).get(bag_id) or b"").decode()
-            for bounds in (data.lower_bounds, data.upper_bounds)
-        )
-        file = LakeFile(data.file_path, data.record_count, first, last or _LAST)
-        yield str(data.partition[positions["robot"]]), day, file
 
 
 class Lake:

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.heartbeat import Heartbeat
     from ros2_memory.core.large_reads import LargeReads
     from ros2_memory.core.timebase import Clock, Ns
-    from ros2_memory.lake.engine import Days, Lake
+    from ros2_memory.lake.engine import Lake
+    from ros2_memory.lake.warehouse import Days
 
 MOST_BAGS: Final = 45_000
 """Bags that are looked at together: a month of minutes, or some years of ten a day."""

@@ -32,7 +32,7 @@ from ros2_memory.lake.tables import TABLES, day_of, of_bags, of_ids, of_robots, 
 from ros2_memory.lake.warehouse import WRITTEN, LakeTables
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
     from datetime import date
     from pathlib import Path
 
@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pyiceberg.table import Table as IcebergTable
 
     from ros2_memory.bag_dir.state_files import Forgetting
+    from ros2_memory.lake.warehouse import Days
     from ros2_memory.storage.base import BagReader
 
 log = get_logger(__name__)
@@ -78,14 +79,14 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     return done
 
 
-def _to_compact(
-    days: Sequence[tuple[date, str, int, int]], closed: date
-) -> Iterator[tuple[date, list[str]]]:
+def _to_compact(by_robot: Mapping[str, Days], closed: date) -> Iterator[tuple[date, list[str]]]:
     """Yields what to put together of the days before `closed`: a day, and some of its robots."""
     sizes = sorted(
         (day, robot, size)
-        for day, robot, files, size in days
-        if day < closed and files > FEW_FILES and size <= _MOST_BYTES
+        for robot, days in by_robot.items()
+        for day, files in days.items()
+        if day < closed and len(files) > FEW_FILES
+        if (size := sum(file.size for file in files)) <= _MOST_BYTES
     )
     for day, of_day in groupby(sizes, itemgetter(0)):
         robots, total = list[str](), 0

@@ -30,24 +30,27 @@ from contextlib import (
     suppress,
 )
 from dataclasses import dataclass, field
+from datetime import date, timedelta
+from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from pyiceberg.catalog.rest import RestCatalog
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.io import FileIO, load_file_io
 from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
+from pyiceberg.manifest import ManifestContent, ManifestFile
+from pyiceberg.transforms import IdentityTransform
 
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.json_files import Int64, JsonLog
 from ros2_memory.bag_dir.lock import read_holder, write_holder
-from ros2_memory.core.errors import LakeError
+from ros2_memory.core.errors import LakeError, RefusedError
 from ros2_memory.core.timebase import NS_PER_MS, Ns, WallClock
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from datetime import date
+    from collections.abc import Iterator, Mapping, Sequence
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
@@ -65,6 +68,9 @@ RECORD: Final = "ros2-memory.written"
 """The setting of a `RecordingFileIO` that names the folder of its record."""
 _MOST_CHARS: Final = 500
 _MASK: Final = "********"
+_EPOCH: Final = date(1970, 1, 1)
+_LAST: Final = "\U0010ffff"
+"""After all ids of bags."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,16 +242,11 @@ class LakeTables:
         with self.location.translated(f"reading the lake's {name}"):
             return self.tables[name].refresh()
 
-    def days(self, name: str) -> list[tuple[date, str, int, int]]:
-        """Returns for each day of each robot how many files a table has, and their bytes."""
+    def days(self, name: str) -> Mapping[str, Days]:
+        """Returns the files of a table by robot; see `Partitions`."""
         table = self.current(name)
         with self.location.translated(f"looking into the lake's {name}"):
-            of_days = table.inspect.partitions().to_pylist() if table.current_snapshot() else []
-            return [
-                (row["partition"]["day"], row["partition"]["robot"], row["file_count"], size)
-                for row in of_days
-                if (size := row["total_data_file_size_in_bytes"])
-            ]
+            return Partitions().look(table)
 
     def rows(
         self, name: str, condition: BooleanExpression, columns: tuple[str, ...] = ("*",)
@@ -335,3 +336,76 @@ def _id_in(state_dir: Path) -> str:
         return path.read_text(encoding="utf-8").strip()
     except OSError as error:
         raise LakeError(f"{path} cannot be read or written: {error.strerror}") from error
+
+
+class LakeFile(NamedTuple):
+    """A Parquet file by its URI, how many rows it has, and its size (bytes).
+
+    No id of a bag in it is before `first`, nor after `last`.
+    """
+
+    location: str
+    rows: int = 0
+    size: int = 0
+    first: str = ""
+    last: str = _LAST
+
+
+Days: TypeAlias = "Mapping[date, Sequence[LakeFile]]"
+"""The files of one robot in one table by day, in order of the days."""
+
+
+class Partitions:
+    """The files of the versions of one table that it was last shown. Not thread-safe."""
+
+    def __init__(self) -> None:
+        self._snapshot: int | None = None
+        self._read: dict[str, Sequence[tuple[str, date, LakeFile]]] = {}
+        self._robots: dict[str, dict[date, list[LakeFile]]] = {}
+
+    def look(self, table: IcebergTable) -> Mapping[str, Days]:
+        """Returns the files of a table's current version, by robot.
+
+        Raises:
+            RefusedError: another program wrote what cannot be read by robot and day.
+        """
+        snapshot = table.current_snapshot()
+        if snapshot is None or snapshot.snapshot_id == self._snapshot:
+            return self._robots
+        read = {}
+        for manifest in snapshot.manifests(table.io):
+            path = manifest.manifest_path
+            read[path] = self._read.get(path) or [*_files(table, manifest)]
+        robots: dict[str, dict[date, list[LakeFile]]] = {}
+        for robot, day, file in sorted(chain.from_iterable(read.values())):
+            robots.setdefault(robot, {}).setdefault(day, []).append(file)
+        self._read, self._robots, self._snapshot = read, robots, snapshot.snapshot_id
+        return robots
+
+
+def _files(table: IcebergTable, manifest: ManifestFile) -> Iterator[tuple[str, date, LakeFile]]:
+    name = f"the lake's table {table.name()[-1]}"
+    entries = manifest.fetch_manifest_entry(table.io, discard_deleted=True)
+    if entries and manifest.content is ManifestContent.DELETES:
+        do = "rewrite them into its data files first (copy-on-write)"
+        raise RefusedError(f"{name} has delete files, which another program wrote: {do}")
+    spec, schema = table.specs()[manifest.partition_spec_id], table.schema()
+    positions = {
+        schema.find_column_name(part.source_id): position
+        for position, part in enumerate(spec.fields)
+        if isinstance(part.transform, IdentityTransform)
+    }
+    for column in ("robot", "day"):
+        if column not in positions:
+            why = f"has files that are not of one {column}, which another program wrote"
+            raise RefusedError(f"{name} {why}: partition it by robot and day again")
+    bag_id = schema.find_field("bag_id").field_id
+    for data in (entry.data_file for entry in entries):
+        day = _EPOCH + timedelta(days=data.partition[positions["day"]])
+        first, last = (
+            bytes((bounds or {}).get(bag_id) or b"").decode()
+            for bounds in (data.lower_bounds, data.upper_bounds)
+        )
+        of_file = data.file_path, data.record_count, data.file_size_in_bytes
+        file = LakeFile(*of_file, first, last or _LAST)
+        yield str(data.partition[positions["robot"]]), day, file

@@ -11,8 +11,9 @@ import pyarrow.parquet as pq
 import pytest
 
 from ros2_memory.core.errors import RefusedError
-from ros2_memory.lake.engine import Lake, LakeFile, Parameters
+from ros2_memory.lake.engine import Lake, Parameters
 from ros2_memory.lake.tables import TABLES, Row
+from ros2_memory.lake.warehouse import LakeFile
 from tests.support.lakes import lake_in
 
 DAY = date(2026, 11, 20)

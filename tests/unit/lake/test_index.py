@@ -19,9 +19,10 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Deadline
 from ros2_memory.fleet.robots import Fleet, Robot
 from ros2_memory.history.context import Call, Memory
-from ros2_memory.lake.engine import Days, Lake, LakeFile, Parameters
+from ros2_memory.lake.engine import Lake, Parameters
 from ros2_memory.lake.memory import newest
 from ros2_memory.lake.tables import day_of
+from ros2_memory.lake.warehouse import Days, LakeFile
 from ros2_memory.queries import find_last_match
 from ros2_memory.results import Match
 from tests.support.bags import Msg, detections, text, write_mcap

@@ -122,8 +122,7 @@ def _forget(
 
     tombstone = Tombstone(robot, window.start, window.stop)
     with location.writable() as lake:
-        in_lake = {name for _, name, *_ in lake.days("bags")}
-        names = in_lake.union(configured.name for configured in robots)
+        names = {*lake.days("bags"), *(configured.name for configured in robots)}
         if robot not in names:
             raise InvalidArgumentsError(
                 f"there is no robot {abbreviate(robot)} in the lake or in fleet.robots; there are: "
