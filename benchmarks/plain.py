@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import zstandard
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
-from rosbags.rosbag2 import Reader
 
 from benchmarks.payloads import typestore
 
@@ -94,6 +93,9 @@ def asked(bags: Sequence[Bag], scan: Scan) -> tuple[float, bool]:
 
 
 def _count(bag: Bag, scan: Scan) -> int:
+    # Not above: the server whose memory is measured is forked from this process.
+    from rosbags.rosbag2 import Reader  # noqa: PLC0415
+
     with Reader(bag.path) as reader:
         wanted = [each for each in reader.connections if each.topic == scan.topic]
         if not wanted:

@@ -6,6 +6,7 @@ away, up to the length of tf2's cache (10 s); a static one however far back it w
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -103,11 +104,12 @@ def transform_at(
             answer = _transform_of_session(view, session, frames, at, explains=explains)
             answers.append((session, answer))
         except NoDataError as error:
-            failures.append(error)
+            # A traceback has this frame, which has the failures: they would stay for long.
+            failures.append(error.with_traceback(None))
         if recorded is None and answers:
             break
     if not answers:
-        raise failures[0]
+        raise failures.pop(0)
     _note_sessions(view, frames, at, answers)
     _, answer = answers[0]
     return answer
@@ -160,26 +162,29 @@ def _transform_of_session(
     limits, (parent, child) = view.limits, frames
     static = static_at(view.sessions.static(session), at)
 
-    def look_up(moving: Sequence[StampedTransform]) -> FoundTransform:
+    def look_up(moving: Sequence[StampedTransform], reach: Ns = TF_CACHE_NS) -> FoundTransform:
         tree = frames_of(view, static, moving, parent)
-        return FoundTransform(tree.lookup(child, at), tree.clock)
+        return FoundTransform(tree.lookup(child, at), tree.clock, reach)
 
-    for half_width in _HALF_WIDTHS:
-        window = TimeWindow.around(at, half_width)
-        moving = view.sessions.moving(session, window)
-        try:
-            return look_up(moving)._replace(reach=half_width)
-        except NoDataError as error:
-            failure = error
-    if limits.tf_clock == "stamp":
-        moving = list(_stamped_near(view, at, session))
-        try:
-            return look_up(moving)
-        except NoDataError as error:
-            raise _stamp_failure(error, at, nothing_near=not moving) from error
-    if not explains:
-        raise failure
-    raise _explain_failure(view, failure, frames, at, session, nothing_near=not moving) from failure
+    *shorter, longest = _HALF_WIDTHS
+    for half_width in shorter:
+        moving = view.sessions.moving(session, TimeWindow.around(at, half_width))
+        with suppress(NoDataError):
+            return look_up(moving, half_width)
+    moving = view.sessions.moving(session, TimeWindow.around(at, longest))
+    # Here, too, no variable has an error.
+    try:
+        return look_up(moving, longest)
+    except NoDataError as error:
+        if limits.tf_clock == "stamp":
+            stamped = [*_stamped_near(view, at, session)]
+            try:
+                return look_up(stamped)
+            except NoDataError as failure:
+                raise _stamp_failure(failure, at, nothing_near=not stamped) from failure
+        if not explains:
+            raise
+        raise _explain_failure(view, error, frames, at, session, nothing_near=not moving) from error
 
 
 def frames_of(
