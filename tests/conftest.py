@@ -17,7 +17,7 @@ import structlog
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.support.composed import composed_once
+from tests.support.composed import shipped_once
 from tests.support.examples import examples
 from tests.support.forked_commands import ADDRESS, forking
 from tests.support.measured import (
@@ -196,7 +196,7 @@ def types_compiled_once() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _configuration_composed_once() -> Iterator[None]:
     """Hydra takes long to compose what most tests have in common, and its lines are not ours."""
-    with patch("ros2_memory.config.compose", composed_once):
+    with shipped_once():
         yield
 
 

@@ -20,8 +20,8 @@ __all__ = ["exits"]
 
 pytestmark = pytest.mark.xdist_group("home")
 
-FROM, UNTIL = ("", "") if LONG else ("T10:00", "T12:00")
-"""A long run asks about whole days, another one about the outing before noon of each."""
+FROM, UNTIL = ("", "") if LONG else ("T10:20", "T10:50")
+"""A long run asks about whole days, another one about half an hour of each."""
 DAY: Final = f"start=2026-03-02{FROM} end=2026-03-02{UNTIL}"
 OTHER_DAY: Final = f"with_start=2026-03-03{FROM} with_end=2026-03-03{UNTIL}"
 SEEN: Final = "topic=*/scene_objects condition_type=contains value=mug"
