@@ -169,10 +169,10 @@ def _imported() -> dict[str, Callable[[], int]]:
     from ros2_memory import bootstrap  # noqa: F401, PLC0415
     from ros2_memory.cli import ask, cat, doctor, export, info  # noqa: F401, PLC0415
     from ros2_memory.cli.__main__ import run  # noqa: PLC0415
+    from ros2_memory.config import load_message_schemas, load_settings  # noqa: PLC0415
     from ros2_memory.recorder import __main__ as recorder  # noqa: PLC0415
     from ros2_memory.recorder import ros2bag  # noqa: F401, PLC0415
     from ros2_memory.server import main  # noqa: PLC0415
-    from ros2_memory.config import load_message_schemas, load_settings  # noqa: PLC0415
     from ros2_memory.serving import auth, mcp_server, web_app  # noqa: F401, PLC0415
     from tests.support.composed import shipped_once  # noqa: PLC0415
 
