@@ -61,6 +61,9 @@ for _number, _handler in (
         signal.signal(_number, _handler)
 
 
+# Where nothing configures the log: a traceback with the variables of each frame takes seconds.
+structlog.dev.ConsoleRenderer.get_active().exception_formatter = structlog.dev.plain_traceback
+
 # What is imported and collected stays: the collector would go through all of it time and again,
 # for a third of the processor time of collecting, and for 0.4 s each later time.
 gc.disable()

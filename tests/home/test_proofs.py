@@ -52,8 +52,12 @@ QUESTIONS: Final = {
 }
 
 
-RESTS_ON_ALL: Final = ("list_recorded_topics", "data_time_range", "list_frames")
-"""Answers whose proof is all messages, as that of `memory_status` is."""
+LIKE_OTHERS: Final = (
+    *("list_recorded_topics", "data_time_range", "list_frames"),
+    *("get_topic_in_last", "recent_trajectory_summary"),
+    *(tool for tool in QUESTIONS if tool.endswith("_seconds_ago")),
+)
+"""The proof is all messages, as that of `memory_status` is; or another tool asks about another time."""
 
 
 def test_there_is_a_question_for_every_tool_that_reads() -> None:
@@ -61,7 +65,7 @@ def test_there_is_a_question_for_every_tool_that_reads() -> None:
 
 
 @pytest.mark.usefixtures("in_utc")
-@pytest.mark.parametrize("tool", [each for each in QUESTIONS if LONG or each not in RESTS_ON_ALL])
+@pytest.mark.parametrize("tool", [each for each in QUESTIONS if LONG or each not in LIKE_OTHERS])
 def test_the_same_question_over_the_proof_has_the_same_answer(
     home: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, tool: str
 ) -> None:
