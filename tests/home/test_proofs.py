@@ -57,7 +57,7 @@ LIKE_OTHERS: Final = (
     *("get_topic_in_last", "recent_trajectory_summary"),
     *(tool for tool in QUESTIONS if tool.endswith("_seconds_ago")),
 )
-"""The proof is all messages, as that of `memory_status` is; or another tool asks about another time."""
+"""Their proof is all messages, as that of `memory_status` is, or they ask as others do."""
 
 
 def test_there_is_a_question_for_every_tool_that_reads() -> None:
