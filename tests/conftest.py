@@ -17,7 +17,7 @@ import structlog
 from hypothesis import settings
 from xdist.remote import Producer
 
-from tests.support.composed import composed_once
+from tests.support.composed import shipped_once
 from tests.support.examples import examples
 from tests.support.forked_commands import ADDRESS, forking
 from tests.support.measured import (
@@ -60,6 +60,9 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
+
+# Where nothing configures the log: a traceback with the variables of each frame takes seconds.
+structlog.dev.ConsoleRenderer.get_active().exception_formatter = structlog.dev.plain_traceback
 
 # What is imported and collected stays: the collector would go through all of it time and again,
 # for a third of the processor time of collecting, and for 0.4 s each later time.
@@ -196,7 +199,7 @@ def types_compiled_once() -> Iterator[None]:
 @pytest.fixture(scope="session", autouse=True)
 def _configuration_composed_once() -> Iterator[None]:
     """Hydra takes long to compose what most tests have in common, and its lines are not ours."""
-    with patch("ros2_memory.config.compose", composed_once):
+    with shipped_once():
         yield
 
 

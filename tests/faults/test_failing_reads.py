@@ -1,6 +1,6 @@
 """A disk that fails: whatever it fails at, nothing false is answered, and all is there afterwards.
 
-`FAULTS_READS` is how many calls are made to fail one after another for each kind of file (8 unless
+`FAULTS_READS` is how many calls are made to fail one after another for each kind of file (4 unless
 given); with 0 every single one is: that takes an hour.
 """
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.history.context import Memory
 
-READS = int(os.environ.get("FAULTS_READS", "8"))
+READS = int(os.environ.get("FAULTS_READS", "4"))
 COUNT = 3
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 SEED: Final = 1
 OF_EACH: Final = 300 if LONG else 2
-OF_INDEXES: Final = 1200 if LONG else 8
+OF_INDEXES: Final = 1200 if LONG else 4
 _INDEXES: Final = ("message_indexes", "chunk_indexes", "statistics", "sqlite_indexes")
 UNKNOWN: Final = "no_such_class"
 

@@ -20,8 +20,8 @@ __all__ = ["exits"]
 
 pytestmark = pytest.mark.xdist_group("home")
 
-FROM, UNTIL = ("", "") if LONG else ("T10:00", "T12:00")
-"""A long run asks about whole days, another one about the outing before noon of each."""
+FROM, UNTIL = ("", "") if LONG else ("T10:20", "T10:50")
+"""A long run asks about whole days, another one about half an hour of each."""
 DAY: Final = f"start=2026-03-02{FROM} end=2026-03-02{UNTIL}"
 OTHER_DAY: Final = f"with_start=2026-03-03{FROM} with_end=2026-03-03{UNTIL}"
 SEEN: Final = "topic=*/scene_objects condition_type=contains value=mug"
@@ -52,8 +52,12 @@ QUESTIONS: Final = {
 }
 
 
-RESTS_ON_ALL: Final = ("list_recorded_topics", "data_time_range", "list_frames")
-"""Answers whose proof is all messages, as that of `memory_status` is."""
+LIKE_OTHERS: Final = (
+    *("list_recorded_topics", "data_time_range", "list_frames"),
+    *("get_topic_in_last", "recent_trajectory_summary"),
+    *(tool for tool in QUESTIONS if tool.endswith("_seconds_ago")),
+)
+"""Their proof is all messages, as that of `memory_status` is, or they ask as others do."""
 
 
 def test_there_is_a_question_for_every_tool_that_reads() -> None:
@@ -61,7 +65,7 @@ def test_there_is_a_question_for_every_tool_that_reads() -> None:
 
 
 @pytest.mark.usefixtures("in_utc")
-@pytest.mark.parametrize("tool", [each for each in QUESTIONS if LONG or each not in RESTS_ON_ALL])
+@pytest.mark.parametrize("tool", [each for each in QUESTIONS if LONG or each not in LIKE_OTHERS])
 def test_the_same_question_over_the_proof_has_the_same_answer(
     home: Path, tmp_path: Path, exits: Program, monkeypatch: pytest.MonkeyPatch, tool: str
 ) -> None:

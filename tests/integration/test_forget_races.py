@@ -29,7 +29,7 @@ from tests.support.memories import ROOT
 from tests.support.processes import until
 
 S = 10**9
-ROUNDS = 24 if LONG else 8
+ROUNDS = 24 if LONG else 4
 SPLITS = 12
 T0 = time.time_ns() // S * S - 3600 * S
 

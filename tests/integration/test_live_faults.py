@@ -23,7 +23,7 @@ from tests.timing import Watch, driven
 if TYPE_CHECKING:
     from pathlib import Path
 
-KILLS: Final = 50 if LONG else 10
+KILLS: Final = 50 if LONG else 6
 SEED: Final = int(os.environ.get("EPISODIC_SEED", "20261120"))
 CHUNK_BYTES: Final = 16384  # recorder.chunk_bytes
 PROMISED_S: Final = 2.0

@@ -20,6 +20,7 @@ from mcp.client.sse import sse_client
 from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.server import _show_page, main
+from tests.support.examples import LONG
 from tests.support.forked_commands import Forked
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
@@ -214,7 +215,7 @@ async def test_an_empty_memory_answers_and_a_directory_that_comes_later_is_found
             assert span["earliest"] == T0_S
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGTERM, *LONG * [signal.SIGINT]])
 def test_a_signal_ends_it_with_clients_connected(
     bag_dir: Path, tmp_path: Path, number: signal.Signals
 ) -> None:
@@ -320,7 +321,7 @@ def _end_of_stdin(bag_dir: Path) -> None:
     assert rest == b""
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("number", [signal.SIGINT, *LONG * [signal.SIGTERM]])
 def test_a_signal_ends_it_while_it_waits_for_stdin(bag_dir: Path, number: signal.Signals) -> None:
     in_time(lambda: _end_while_waiting(bag_dir, number))
 

@@ -10,12 +10,12 @@ from typing import Final
 
 LONG: Final = os.environ.get("EPISODIC_LONG") == "1"
 """Whether a run may take hours."""
-_FEWEST: Final = 8
+_FEWEST: Final = 5
 
 
 def examples(full: int) -> int:
-    """How many examples of a property are drawn: `full` in a long run, else a third, at least 8.
+    """How many examples of a property are drawn: `full` in a long run, else a fifth, at least 5.
 
-    Of a property that has fewer than 8 in full, all.
+    Of a property that has fewer than 5 in full, all.
     """
-    return full if LONG else min(full, max(_FEWEST, full // 3))
+    return full if LONG else min(full, max(_FEWEST, full // 5))

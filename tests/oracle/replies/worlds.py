@@ -37,7 +37,7 @@ WRITTEN_NS: Final = 1_785_000_000 * S
 """When files were written whose end is not known, or cannot be."""
 COMMITTED: Final = Path(__file__).resolve().parents[2] / "data"
 
-RECORDED, REAL, HOME, DAY, ODD = "recorded", "real", "home", "robot day", "odd"
+RECORDED, REAL, HOME, ODD = "recorded", "real", "home", "odd"
 
 
 @dataclass(frozen=True)
@@ -296,8 +296,9 @@ def _own_worlds() -> Iterator[ReplyWorld]:
     whole_days = partial(_write_home, Scale(13, 2, 1.0))
     yield ReplyWorld("home_13_whole_days", HOME, whole_days, 80, long=True)
     for seed in (1, 2):
-        yield ReplyWorld(f"robot_day_{seed}", DAY, partial(_write_day, seed, SHORT), 150)
-    yield ReplyWorld("robot_day_3_six_hours", DAY, partial(_write_day, 3, FULL), 80, long=True)
+        write = partial(_write_day, seed, SHORT)
+        yield ReplyWorld(f"robot_day_{seed}", HOME, write, 150, long=seed > 1)
+    yield ReplyWorld("robot_day_3_six_hours", HOME, partial(_write_day, 3, FULL), 80, long=True)
     pose_topics = {"two_robots": ("data.pose_topic=/boat/odom",)}
     for name in odd.WORLDS:
         for seed in (1, 2):
@@ -305,7 +306,8 @@ def _own_worlds() -> Iterator[ReplyWorld]:
             write = partial(_odd_world, name, seed)
             yield ReplyWorld(f"{name}_{seed}", ODD, write, 70, settings)
     for seed in range(1, 9):
-        yield ReplyWorld(f"history_{seed}", ODD, partial(_write_history, seed), 60)
+        write = partial(_write_history, seed)
+        yield ReplyWorld(f"history_{seed}", ODD, write, 60, long=seed > 4)
     yield ReplyWorld("noisy_robot", ODD, partial(write_noisy_robot, "replies"), 90)
     yield ReplyWorld("moving_map", ODD, lambda folder: write_moving_map(folder, 3), 80)
     made: Mapping[str, Callable[[Path], None]] = {

@@ -46,7 +46,7 @@ SEARCHES: list[tuple[str, str, JsonValue]] = [
     ("/vision/*", "contains", "cup"),
 ]
 SEGMENT = timeline.SEGMENT_BAGS
-EXAMPLES = 200 if LONG else 10
+EXAMPLES = 200 if LONG else 5
 """Histories for each clock, others in every run; some dozens of questions are asked of each."""
 
 

@@ -66,7 +66,7 @@ QUESTIONS: Final[list[tuple[str, dict[str, Any]]]] = [
 
 
 @settings(
-    max_examples=60 if LONG else 10, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+    max_examples=60 if LONG else 5, deadline=None, suppress_health_check=[HealthCheck.too_slow]
 )
 @given(
     kind=st.sampled_from(["odd", "moving map", "things"]),

@@ -53,6 +53,7 @@ from tests.support.bags import (
     write_mcap,
 )
 from tests.support.clocks import SettableClock
+from tests.support.examples import LONG
 from tests.support.housekeepers import keeper_of, own_all
 from tests.support.memories import reply_over, shipped_extractor
 from tests.support.noting_reader import fail_reading
@@ -479,7 +480,7 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Undisturbed:
     return Undisturbed(before, after, whole, poses_in(after))
 
 
-@pytest.mark.parametrize("steps", range(7))
+@pytest.mark.parametrize("steps", range(7) if LONG else (0, 2, 3, 5, 6))
 def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, undisturbed: Undisturbed, steps: int
 ) -> None:
@@ -500,7 +501,7 @@ def test_a_kill_at_any_step_counts_no_message_twice_and_loses_none(
     assert not [*bag_dir.glob("rec_A/*.mcap")]
 
 
-@pytest.mark.parametrize("after", [0, 1, 50, 150])
+@pytest.mark.parametrize("after", [0, 50])
 def test_a_write_that_fails_leaves_the_day_as_it_was(bag_dir: Path, after: int) -> None:
     split(bag_dir, 0)
     keep_all(bag_dir)

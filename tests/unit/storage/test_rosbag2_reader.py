@@ -56,7 +56,8 @@ sys.stdin.read()
 
 @pytest.fixture
 def scratch_root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Where temporary files of this test lie."""
+    """Where temporary files of this test lie; garbage is looked for among its own objects alone."""
+    gc.freeze()
     root = tmp_path / "temporary"
     root.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(root))

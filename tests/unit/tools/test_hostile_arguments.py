@@ -15,7 +15,7 @@ from ros2_memory.serving.dispatch import Dispatcher
 from ros2_memory.tools.build import build_tools
 from ros2_memory.tools.declaration import Signature
 from ros2_memory.tools.replies import Replies, Reply
-from tests.support.examples import examples
+from tests.support.examples import LONG, examples
 from tests.support.hostile_arguments import DEEP, MEGABYTE, NUMBERS, OTHERS, TEXTS, calls, nested
 from tests.support.memories import memory_of
 from tests.support.robot_run import ANSWERED, write_run
@@ -74,7 +74,9 @@ def test_every_argument_stands_every_hostile_value(
     dispatcher: Dispatcher, name: str, argument: str
 ) -> None:
     good = next((given for tool, given, _ in ANSWERED if tool == name), {"label": "here"})
-    for value in (*NUMBERS, *TEXTS, *OTHERS):
+    values = (*NUMBERS, *TEXTS, *OTHERS)
+    # What one argument does not stand in a short run, others do.
+    for value in values if LONG else values[EVERY.index((name, argument)) % 3 :: 3]:
         shown = held(asked(dispatcher, name, {**good, argument: value}))
         if isinstance(shown, dict) and shown.get("error") == "invalid_arguments":
             assert argument in shown["detail"] or "start" in shown["detail"], (value, shown)

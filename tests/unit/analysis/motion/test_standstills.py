@@ -104,7 +104,7 @@ def worlds(draw: st.DrawFn, noise: float = 0.0) -> World:
     )
 
 
-@settings(max_examples=150 if LONG else 25, deadline=None)
+@settings(max_examples=150 if LONG else 15, deadline=None)
 @given(worlds())
 def test_a_standstill_of_any_phase_is_exact_to_a_message(made: World) -> None:
     period = made.period + 1e-6
@@ -148,7 +148,7 @@ def test_a_robot_that_turns_in_circles_with_few_poses_does_not_stand(
     assert standstills_of([(n * S // hz, place) for n, place in enumerate(at)]) == ()
 
 
-@settings(max_examples=150 if LONG else 25, deadline=None)
+@settings(max_examples=150 if LONG else 15, deadline=None)
 @given(st.one_of(worlds(), worlds(noise=0.01)), SLICES)
 def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
     whole, parts = (
@@ -235,7 +235,7 @@ def check_disjoint(found: tuple[Standstill, ...], poses: Poses) -> None:
     assert sum(each.end - each.start for each in found) <= poses[-1][0] - poses[0][0]
 
 
-@settings(max_examples=150 if LONG else 25, deadline=None)
+@settings(max_examples=150 if LONG else 15, deadline=None)
 @given(restless(), SLICES)
 def test_standstills_under_any_noise_are_in_order_and_disjoint(poses: Poses, blocks: int) -> None:
     found = standstills_of(poses)
