@@ -38,7 +38,7 @@ def test_nothing_is_gathered_behind_the_end() -> None:
 @given(st.lists(st.tuples(st.integers(-(2**63), 2**63 - 1), st.integers(-9, 300))))
 def test_columns_have_the_rows_of_their_table_in_fewer_bytes(rows: list[tuple[int, int]]) -> None:
     table = np.array(rows, np.int64).reshape(-1, 2)
-    columns = Columns(table)
+    columns = Columns(table.T)
     which = np.arange(len(rows))[::-2]
 
     assert len(columns) == len(rows)
