@@ -36,7 +36,7 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     lines = (*bodies, call("data_time_range", "{}", LAST))
     write_command(tmp_path)
     process = subprocess.Popen(
-        [tmp_path / "ros2-memory-server", "data.now=latest"],
+        [str(tmp_path / "ros2-memory-server"), "data.now=latest"],
         env=env | {"MEMORY_BAG_DIR": str(tmp_path / "bags")},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

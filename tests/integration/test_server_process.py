@@ -251,7 +251,7 @@ def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
         port = taken.getsockname()[1]
         env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT=str(port))
         write_command(bag_dir.parent)
-        program = [bag_dir.parent / "ros2-memory-server", "logging.level=error"]
+        program = [str(bag_dir.parent / "ros2-memory-server"), "logging.level=error"]
         ended = subprocess.run(program, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stdout == ""

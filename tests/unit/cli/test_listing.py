@@ -334,7 +334,7 @@ class TestCat:
 
     def test_a_reader_that_ends_early_is_no_error(self, folder: Path, tmp_path: Path) -> None:
         write_command(tmp_path)
-        program = [tmp_path / "ros2-memory", "cat", "/odom", folder / "a"]
+        program = [str(tmp_path / "ros2-memory"), "cat", "/odom", str(folder / "a")]
         reading, writing = os.pipe()
         os.close(reading)  # as `head` does once it has its lines
         done = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, check=False)

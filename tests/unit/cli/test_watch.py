@@ -104,7 +104,7 @@ def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
 def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     write_command(tmp_path)
-    program = [tmp_path / "ros2-memory", "watch", "--count", "1"]
+    program = [str(tmp_path / "ros2-memory"), "watch", "--count", "1"]
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
     with subprocess.Popen(program, stdout=theirs, stderr=subprocess.PIPE, env=env) as process:
         os.close(theirs)
