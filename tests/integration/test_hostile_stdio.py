@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import sys
 import threading
 from typing import IO, TYPE_CHECKING
 
 from tests.soak.clients import hostile_bodies, opening
 from tests.soak.wire import call
+from tests.support.forked_commands import write_command
 from tests.support.processes import PATIENCE_S
 from tests.support.robot_run import T0_S, write_run
 
@@ -34,8 +34,9 @@ def test_stdio_survives_whatever_is_written_to_it(tmp_path: Path) -> None:
     env = {name: text for name, text in os.environ.items() if not name.startswith(ours)}
     bodies = (*opening(), *(body for body, _ in hostile_bodies()), *GARBAGE, *UNPARSED)
     lines = (*bodies, call("data_time_range", "{}", LAST))
+    write_command(tmp_path)
     process = subprocess.Popen(
-        [sys.executable, "-m", "ros2_memory.server", "data.now=latest"],
+        [str(tmp_path / "ros2-memory-server"), "data.now=latest"],
         env=env | {"MEMORY_BAG_DIR": str(tmp_path / "bags")},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,

@@ -21,7 +21,7 @@ from mcp.client.stdio import StdioServerParameters, stdio_client
 
 from ros2_memory.server import _show_page, main
 from tests.support.examples import LONG
-from tests.support.forked_commands import Forked
+from tests.support.forked_commands import Forked, write_command
 from tests.support.processes import PATIENCE_S, until
 from tests.support.robot_run import CALLS, T0_S, ask, ask_everything, write_run
 from tests.timing import in_time
@@ -185,7 +185,7 @@ async def test_every_transport_gives_the_same_replies(bag_dir: Path, tmp_path: P
         async with Client(stdio_client(alone, errlog=log)) as client:
             await ask_everything(client)
             expected = await replies(client)
-    with serving(bag_dir, tmp_path / "log", program=PROGRAM) as served:
+    with serving(bag_dir, tmp_path / "log") as served:
         async with Client(served.url("/mcp")) as client:
             assert await replies(client) == expected
         async with Client(served.url("/mcp"), mode="legacy") as client:
@@ -250,9 +250,9 @@ def test_a_port_in_use_is_told_in_one_line(bag_dir: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         env = environment(bag_dir, MCP_TRANSPORT="sse", MCP_PORT=str(port))
-        ended = subprocess.run(
-            command("logging.level=error"), env=env, capture_output=True, text=True, check=False
-        )
+        write_command(bag_dir.parent)
+        program = [str(bag_dir.parent / "ros2-memory-server"), "logging.level=error"]
+        ended = subprocess.run(program, env=env, capture_output=True, text=True, check=False)
     assert ended.returncode == 1
     assert ended.stdout == ""
     assert ended.stderr == (

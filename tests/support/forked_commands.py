@@ -31,14 +31,18 @@ ADDRESS: Final = "EPISODIC_FORKING"
 """The variable that tells workers the name of the socket, an abstract one without its NUL."""
 _CALLER: Final = """\
 #!{python} -IS
-import json, os, socket, sys
+import json, os, signal, socket, sys
 with socket.socket(socket.AF_UNIX) as peer:
     peer.connect({address!r})
     socket.send_fds(peer, [b"!"], [0, 1, 2])
-    asked = ["ros2-memory", sys.argv[1:], os.getcwd(), dict(os.environ), os.nice(0)]
+    program = os.path.basename(sys.argv[0])
+    asked = [program, sys.argv[1:], os.getcwd(), dict(os.environ), os.nice(0)]
     peer.sendall(json.dumps(asked).encode())
     peer.shutdown(socket.SHUT_WR)
-    _, code = peer.makefile()
+    told = peer.makefile()
+    number = int(told.readline())
+    signal.signal(signal.SIGTERM, lambda signal, frame: os.kill(number, signal))
+    code = told.readline()
 sys.exit(int(code) % 256)
 """
 
@@ -66,10 +70,11 @@ def forking() -> Iterator[None]:
 
 
 def write_command(folder: Path) -> None:
-    """Adds `ros2-memory`, for PATH, to a folder: it forks the command."""
-    program = folder / "ros2-memory"
-    program.write_text(_CALLER.format(python=sys.executable, address=_address()))
-    program.chmod(0o755)
+    """Adds `ros2-memory` and `ros2-memory-server`, for PATH, to a folder: they are forked."""
+    for name in ("ros2-memory", "ros2-memory-server"):
+        program = folder / name
+        program.write_text(_CALLER.format(python=sys.executable, address=_address()))
+        program.chmod(0o755)
 
 
 class Forked(subprocess.Popen[bytes]):

@@ -1,7 +1,7 @@
 """In which tests coverage is measured, which takes up to five times as long as the test itself.
 
 Measured is the first example of each plain test; what the others run, tests of the same room or of
-the tools above it run as well: 92 % of all lines and branches together, the gate is 85 %.
+the tools above it run as well: 89 % of all lines and branches together, the gate is 85 %.
 """
 
 from __future__ import annotations
@@ -24,6 +24,9 @@ _P = ParamSpec("_P")
 _R = TypeVar("_R")
 
 UNMEASURED: Final = (
+    "cli/test_cli.py",
+    "cli/test_forget.py",
+    "cli/test_plot.py",
     "columns/test_example_queries.py",
     "columns/test_fill.py",
     "columns/test_forget.py",
@@ -42,7 +45,9 @@ UNMEASURED: Final = (
     "lake/test_rows.py",
     "lake/test_shipper.py",
     "oracle/*.py",
-    "recorder/test_supervisor.py",
+    "recorder/test_days.py",
+    "recorder/test_screened_recordings.py",
+    "recorder/test_supervisor*.py",
     "soak/*.py",
     "test_*_real_bags.py",
     "test_any_cut.py",
@@ -61,6 +66,7 @@ UNMEASURED: Final = (
     "test_gaps_within.py",
     "test_hostile_*.py",
     "test_instances.py::test_nearly_every_label",
+    "test_latched_carry.py",
     "test_map_placement.py",
     "test_outline.py",
     "test_path_length.py",
@@ -72,10 +78,11 @@ UNMEASURED: Final = (
     "test_robot_tracks.py",
     "test_same_answers.py",
     "test_standstills.py",
-    "test_storage_limits.py::test_chunks_beyond",
+    "test_storage_limits.py",
     "test_store.py::test_a_full_disk",
     "test_thinned_moments.py",
     "test_time_zero.py",
+    "test_unfinished_bags.py",
     "test_unknown_time.py",
     "test_unlike_robots.py",
     "test_visits.py",
@@ -86,7 +93,7 @@ UNMEASURED: Final = (
 """Files, or tests of a file by how their names begin, that are not measured.
 
 They ask much of everything at once, of hours of poses, or of programs over and over, and what they
-run others run too: the lines and branches that they alone reach are 1 % of all.
+run others run too: the lines and branches that they alone reach are 4 % of all.
 """
 FOREIGN: Final = (
     "omegaconf:OmegaConf.load",

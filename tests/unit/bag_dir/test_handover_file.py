@@ -16,10 +16,8 @@ from ros2_memory.bag_dir.handover_file import (
     Overlap,
     read_handover,
     write_handover,
-    write_handovers,
 )
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
-from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 MOMENTS = st.integers(MIN_NS, MAX_NS)
@@ -52,37 +50,6 @@ FULL = Handover(
     end=Overlap(8_900, 9_500, ("rec_2_7.mcap", "rec_2_8.mcap")),
     notes=("a note",),
 )
-
-
-def excluded(handover: Handover, file: str, publish_time: int, log_time: int) -> bool:
-    return any(each.excludes(publish_time, log_time) for each in handover.exclusions(file))
-
-
-class TestCounting:
-    def test_a_message_received_outside_the_overlap_counts_whenever_it_was_published(self) -> None:
-        assert not excluded(FULL, "rec_2_0.mcap", 10, 899)
-        assert not excluded(FULL, "rec_2_0.mcap", 10, 1_100)
-        assert not excluded(FULL, "rec_2_8.mcap", 9_400, 8_899)
-        assert not excluded(FULL, "rec_2_8.mcap", 9_400, 9_500)
-
-    def test_without_a_publish_time_the_cut_is_by_log_time(self) -> None:
-        old = Handover(next="b", counts_until=50, end=Overlap(0, 101, ("a_9.mcap",)))
-        assert not excluded(old, "a_9.mcap", 0, 49)
-        assert excluded(old, "a_9.mcap", 0, 50)
-
-    @given(
-        cut=st.integers(0, 100),
-        publish_time=st.integers(1, 100),
-        log_times=st.tuples(st.integers(0, 100), st.integers(0, 100)),
-    )
-    def test_in_the_overlap_a_message_counts_in_exactly_one_of_the_two(
-        self, cut: int, publish_time: int, log_times: tuple[int, int]
-    ) -> None:
-        old = Handover(next="b", counts_until=cut, end=Overlap(0, 101, ("a_9.mcap",)))
-        new = Handover(previous="a", counts_from=cut, begin=Overlap(0, 101, ("b_0.mcap",)))
-        in_old = not excluded(old, "a_9.mcap", publish_time, log_times[0])
-        in_new = not excluded(new, "b_0.mcap", publish_time, log_times[1])
-        assert in_old != in_new
 
 
 class TestFile:
@@ -124,12 +91,3 @@ class TestFile:
         handover, problem = read_handover(tmp_path)
         assert handover == Handover()
         assert problem is not None
-
-    def test_a_pair_is_written_whole_or_not_at_all(self, tmp_path: Path) -> None:
-        old, new = tmp_path / "old", tmp_path / "new"
-        new.mkdir()
-        write_handover(new, Handover(state=Counting.PENDING))
-        # The old one cannot be written: its directory is not there.
-        with pytest.raises(RecorderError):
-            write_handovers({new: Handover(counts_from=5), old: Handover(counts_until=5)})
-        assert read_handover(new).handover == Handover(state=Counting.PENDING)

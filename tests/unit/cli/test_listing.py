@@ -27,6 +27,7 @@ from ros2_memory.cli.output import format_time
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import Msg, log_entry, odom, text, write_mcap
+from tests.support.forked_commands import write_command
 from tests.support.housekeepers import own_all
 
 if TYPE_CHECKING:
@@ -331,8 +332,9 @@ class TestCat:
         times = [json.loads(line)["time_ns"] for line in lines]
         assert times == [T0 + n * NS_PER_S for n in expected]
 
-    def test_a_reader_that_ends_early_is_no_error(self, folder: Path) -> None:
-        program = [sys.executable, "-m", "ros2_memory.cli", "cat", "/odom", str(folder / "a")]
+    def test_a_reader_that_ends_early_is_no_error(self, folder: Path, tmp_path: Path) -> None:
+        write_command(tmp_path)
+        program = [str(tmp_path / "ros2-memory"), "cat", "/odom", str(folder / "a")]
         reading, writing = os.pipe()
         os.close(reading)  # as `head` does once it has its lines
         done = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, check=False)

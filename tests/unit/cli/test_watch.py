@@ -6,7 +6,6 @@ import os
 import pty
 import shutil
 import subprocess
-import sys
 import time
 from typing import TYPE_CHECKING
 
@@ -17,6 +16,7 @@ from ros2_memory.bag_dir.state_files import Loss, append_losses
 from ros2_memory.cli.watch import AS_USUAL, TopicRate
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap
+from tests.support.forked_commands import write_command
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -101,9 +101,10 @@ def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     assert "no data" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
 
 
-def test_a_terminal_gets_a_table() -> None:
+def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
-    program = [sys.executable, "-m", "ros2_memory.cli", "watch", "--count", "1"]
+    write_command(tmp_path)
+    program = [str(tmp_path / "ros2-memory"), "watch", "--count", "1"]
     env = {**os.environ, "TERM": "xterm", "COLUMNS": "120"}
     with subprocess.Popen(program, stdout=theirs, stderr=subprocess.PIPE, env=env) as process:
         os.close(theirs)
