@@ -31,7 +31,7 @@ from ros2_memory.analysis.sights import (
     Unplaced,
 )
 from ros2_memory.columns.pack import byte_planes, compressed, decompressed
-from ros2_memory.core.arrays import Columns, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import Columns, begins_of, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import NS_PER_US
 
 if TYPE_CHECKING:
@@ -175,10 +175,7 @@ def _concatenated(pieces: list[Ints]) -> Ints:
 
 def _number_rows(columns: Sequence[list[Ints] | Ints], part: Sequence[Ints], parts: int) -> None:
     """Numbers the spots and looks that tables name through all parts, no more for each of these."""
-    spots, looks = (
-        np.append(0, np.cumsum(np.bincount(part[at], minlength=parts))).astype(np.int64)
-        for at in (_SPOTS, _LOOKS)
-    )
+    spots, looks = (begins_of(part[at], parts) for at in (_SPOTS, _LOOKS))
     for at in (_HITS, _SCORES, _BESIDE):
         columns[at][0] = columns[at][0] + spots[part[at]]
     look = columns[_HITS][Hit.LOOK]

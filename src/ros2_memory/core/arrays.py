@@ -72,6 +72,13 @@ def in_ranges(starts: Ints, sizes: Ints) -> Ints:
     return numbers
 
 
+def begins_of(group: Ints, groups: int) -> Ints:
+    """Returns where each of so many groups begins in rows that are in their order, and the end."""
+    begins = np.zeros(groups + 1, np.int64)
+    np.cumsum(np.bincount(group, minlength=groups), out=begins[1:])
+    return begins
+
+
 def rows_of(table: T, which: Ints | NDArray[np.bool_] | slice[int | None, int | None]) -> T:
     """Returns some rows of a table, which is a dataclass with a column in each field."""
     names = [column.name for column in fields(table)]

@@ -29,7 +29,7 @@ from ros2_memory.analysis.sights import (
     Spot,
     Unplaced,
 )
-from ros2_memory.core.arrays import Columns, Groups, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import Columns, Groups, begins_of, distinct_rows, in_ranges, narrowed
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
@@ -167,8 +167,7 @@ class Tally(NamedTuple):
     @classmethod
     def of(cls, spots: int, spot: Ints, what: Ints, n: Ints) -> Tally:
         """Returns rows of so many spots: which of these, in order, what, and how often."""
-        starts = np.append(0, np.cumsum(np.bincount(spot, minlength=spots)))
-        return cls(*map(narrowed, (starts, what, n)))
+        return cls(*map(narrowed, (begins_of(spot, spots), what, n)))
 
     def rows_of(self, spots: Ints) -> tuple[Ints, Ints, Ints]:
         """Returns how many rows each of some spots has, and what and how often in these."""

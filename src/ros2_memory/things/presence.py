@@ -29,7 +29,7 @@ from ros2_memory.analysis.sights import (
     Look,
     Unplaced,
 )
-from ros2_memory.core.arrays import Groups, distinct_rows, in_ranges, narrowed
+from ros2_memory.core.arrays import Groups, begins_of, distinct_rows, in_ranges, narrowed
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -91,8 +91,7 @@ class Cells:
         self.cell = narrowed(_joined(cells, cell, poses, self.n)[cell])
         order = np.argsort(self.cell, kind="stable")  # of 16 bits it is much faster
         self._by_cell = narrowed(order)
-        starts = np.arange(len(sights.epochs) + 1)
-        self._slice_starts = np.searchsorted(self.slice, starts.astype(self.slice.dtype))
+        self._slice_starts = begins_of(self.slice, len(sights.epochs))
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in

@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from ros2_memory.analysis.sights import Sights
+from ros2_memory.analysis.sights import SLICE_NS, Sights
 from ros2_memory.things.instances import estimate
 from ros2_memory.things.labels import Labels
 from tests.support.sights import (
@@ -46,6 +46,13 @@ def test_a_thing_is_missed_once_chance_alone_is_below_one_in_a_hundred() -> None
     assert mug.looks == 2
     [mug] = estimate(whole([*there, twice, often]), LABELS).instances
     assert mug.missed_by == 117 * 10**9
+
+
+@pytest.mark.parametrize("slices", [255, 256, 257])
+def test_slices_are_told_apart_where_their_number_just_fits_into_a_byte(slices: int) -> None:
+    messages = [Message("/d", nth * SLICE_NS, HERE, seen_at(2, 0)) for nth in range(slices)]
+    [mug] = estimate(whole([sights_of_messages(messages)]), LABELS).instances
+    assert [stay.count for stay in mug.stays] == [slices]
 
 
 def test_a_thing_seen_once_in_ten_messages_is_missed_later_than_one_that_is_always_seen() -> None:
