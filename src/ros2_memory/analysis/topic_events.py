@@ -31,7 +31,7 @@ MAX_SEEN: Final = 100_000
 REPEATED_NS: Final = 2 * NS_PER_S
 """A log entry that follows its like sooner is the same report."""
 
-_BYTES: Final = 250
+_BYTES: Final = 190
 """About how much memory a change, an error or a state takes, and what each topic's events do."""
 _NOTHING_VISIBLE: Final = IntervalTable()
 _DIGITS: Final = re.compile(r"\d+")

@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from dataclasses import fields, is_dataclass
 from io import BytesIO
+from itertools import pairwise, starmap
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -23,7 +24,7 @@ from ros2_memory.columns.steps import EXACT, METRES
 from ros2_memory.core.logging_setup import get_logger
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -40,7 +41,7 @@ _KEY_BYTES: Final = 400
 """About how much memory it takes to remember a fragment, besides its own."""
 _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
-_TUPLE, _BYTES, _ARRAY = -1, -2, -3
+_TUPLE, _BYTES, _ARRAY, _ROWS = -1, -2, -3, -4
 _NUMBERS: Final = frozenset({int, float})
 
 log = get_logger(__name__)
@@ -76,7 +77,8 @@ class FragmentKind(NamedTuple, Generic[T]):
 def to_bytes(fragment: object, classes: Sequence[type]) -> bytes:
     """Returns a fragment as it is stored: a line of JSON, and the bytes of arrays one by one.
 
-    Each list in it begins with what it is: the number of a class, or a number below 0.
+    Each list in it begins with what it is: the number of a class, or a number below 0. Values that
+    are alike are there column by column: to make each of its own takes longer.
     """
     numbers = {cls: number for number, cls in enumerate(classes)}
     data: list[bytes] = []
@@ -95,14 +97,37 @@ def _plain(value: object, numbers: Mapping[type, int], data: list[bytes]) -> obj
         return [_ARRAY, len(packed), codec, least, value.dtype.str, *value.shape]
     if isinstance(value, dict):
         return {key: _plain(entry, numbers, data) for key, entry in value.items()}
-    number, parts = numbers.get(type(value)), value
-    if number is None:
-        if not isinstance(value, tuple | list):
-            return value
-        number = _TUPLE
-    elif is_dataclass(value):
-        parts = [getattr(value, field.name) for field in fields(value)]
-    return [number, *(_plain(part, numbers, data) for part in cast("Iterable[object]", parts))]
+    number = numbers.get(type(value))
+    if number is not None:
+        return [number, *(_plain(part, numbers, data) for part in _parts(value))]
+    return _plain_rows(value, numbers, data) if isinstance(value, tuple | list) else value
+
+
+def _plain_rows(
+    values: Sequence[object], numbers: Mapping[type, int], data: list[bytes]
+) -> list[object]:
+    """Returns several values: column by column, with the places of None, where others are alike."""
+    there = [value for value in values if value is not None]
+    none = [_TUPLE, *(nth for nth, value in enumerate(values) if value is None)]
+    kinds = {type(value) for value in there} if len(there) > 1 else set()
+    kind = kinds.pop() if len(kinds) == 1 else object
+    if kind is np.ndarray:
+        arrays = cast("list[Array]", there)
+        if len({(array.dtype, array.shape[1:]) for array in arrays}) == 1:
+            sizes = [_TUPLE, *map(len, arrays)]
+            return [_ROWS, none, sizes, _plain(np.concatenate(arrays), numbers, data)]
+    elif kind is tuple or kind in numbers:
+        rows = [*map(_parts, there)]
+        if {*map(len, rows)} == {len(rows[0]) or None}:
+            columns = (_plain_rows(column, numbers, data) for column in zip(*rows, strict=True))
+            return [_ROWS, none, numbers.get(kind, _TUPLE), *columns]
+    return [_TUPLE, *(_plain(value, numbers, data) for value in values)]
+
+
+def _parts(value: object) -> Sequence[object]:
+    if is_dataclass(value):
+        return [getattr(value, field.name) for field in fields(value)]
+    return cast("Sequence[object]", value)
 
 
 def from_bytes(data: bytes, classes: Sequence[type]) -> object:
@@ -125,7 +150,7 @@ def _restored(
     if not isinstance(value, list):
         return value
     number, *rest = value
-    if number < _TUPLE:
+    if number in {_BYTES, _ARRAY}:
         size, *array = rest
         packed = tail.read(size)
         return packed if number == _BYTES else _unpacked(packed, *array)
@@ -133,7 +158,25 @@ def _restored(
     parts = [
         part if type(part) in _NUMBERS else _restored(part, classes, tail, words) for part in rest
     ]
+    if number == _ROWS:
+        none, kind, *columns = cast("list[Sequence[object]]", parts)
+        return _rows(cast("Sequence[int]", none), kind, columns, classes)
     return tuple(parts) if number == _TUPLE else classes[number](*parts)
+
+
+def _rows(
+    none: Sequence[int], kind: object, columns: Sequence[Sequence[object]], classes: Sequence[type]
+) -> tuple[object, ...]:
+    """Returns the values that `_plain_rows` was given; of arrays `kind` is their lengths."""
+    if isinstance(kind, tuple):
+        ends = np.cumsum([0, *kind]).tolist()
+        rows: list[object] = [columns[0][start:stop] for start, stop in pairwise(ends)]
+    else:
+        values = zip(*columns, strict=True)
+        rows = [*(values if kind == _TUPLE else starmap(classes[cast("int", kind)], values))]
+    for nth in none:
+        rows.insert(nth, None)
+    return tuple(rows)
 
 
 def _packed(array: Array) -> tuple[str, float | None, bytes]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 from ros2_memory.analysis.intervals import IntervalTable
 from ros2_memory.analysis.motion.odometry import Leg, MotionTotals, NearbyMotion, TimedPosition
 from ros2_memory.analysis.motion.path_length import Creep, End
-from ros2_memory.analysis.motion.robot_track import PartialTrack, end_to_end
+from ros2_memory.analysis.motion.robot_track import PartialTrack, settled_tracks
 from ros2_memory.analysis.motion.standstills import Blocks, SpeedDrop, Stands
 from ros2_memory.analysis.motion.trajectory import Line, PathSlice
 from ros2_memory.analysis.poses import FrameCodes, Poses
@@ -37,13 +37,6 @@ def _joined_events(parts: Sequence[TopicEvents]) -> Sequence[TopicEvents]:
     return [] if whole is None else [whole]
 
 
-def _joined_tracks(parts: Sequence[PartialTrack]) -> Sequence[PartialTrack]:
-    by_recording: dict[str, list[PartialTrack]] = {}
-    for part in parts:
-        by_recording.setdefault(part.recording, []).append(part)
-    return [*map(end_to_end, by_recording.values())]
-
-
 _MOTION: Final = (PathSlice, Line, MotionTotals, Leg, TimedPosition, NearbyMotion, End, Creep)
 PATHS: Final[FragmentKind[PathSlice]] = FragmentKind("path", (*_MOTION, Poses, FrameCodes))
 """The path of the poses of a topic in a slice of the clock."""
@@ -53,5 +46,5 @@ EVENTS: Final = FragmentKind(
     "events", (TopicEvents, IntervalTable, KnownState, Change, Report), _joined_events
 )
 """What came into view, changed or failed on a topic in a part."""
-TRACKS: Final = FragmentKind("track", (PartialTrack,), _joined_tracks)
+TRACKS: Final = FragmentKind("track", (PartialTrack,), settled_tracks)
 """Where the poses of a part have the robot in a frame; joined, those of a recording."""

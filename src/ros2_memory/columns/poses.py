@@ -69,17 +69,9 @@ class PoseColumns:
         if not columns.axes:
             raise NoPoseError
         try:
-            if index is not None:
-                return _read(_RoundedRows(table, index), columns, times)
-            return table.remember(
-                "poses", lambda: _read(_RoundedRows(table, None), columns, times), _bytes_of
-            )
+            return _read(_RoundedRows(table, index), columns, times)
         except UnknownShapeError:
             return None
-
-
-def _bytes_of(poses: Poses) -> int:
-    return 1000 + 80 * len(poses)
 
 
 class NoPoseError(Exception):

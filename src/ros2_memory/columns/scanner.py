@@ -62,9 +62,10 @@ _MOST_DAMAGED: Final = 10_000
 
 
 class _Heads(NamedTuple):
-    """The parts of a topic, in order of their first log times.
+    """The parts of a topic in a span, in order of their first log times.
 
     Attributes:
+        span: of log time.
         coverage: of the timeline that they were compared with.
         heads: the parts.
         firsts: their first log times.
@@ -72,6 +73,7 @@ class _Heads(NamedTuple):
         live: of how many of its bags the rows of each count.
     """
 
+    span: TimeWindow
     coverage: Coverage
     heads: Sequence[PartHead]
     firsts: IntArray
@@ -79,9 +81,10 @@ class _Heads(NamedTuple):
     live: IntArray
 
     @classmethod
-    def of(cls, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
+    def of(cls, span: TimeWindow, heads: Sequence[PartHead], coverage: Coverage) -> _Heads:
         """Returns the parts as of a coverage."""
         return cls(
+            span,
             coverage,
             heads,
             np.array([head.first for head in heads], np.int64),
@@ -112,11 +115,11 @@ class Caches:
         packed: by part and path, what is known of a column.
         fetched: by part and path, compressed columns that are wanted next, until they are.
         zones: by topic and path, the zones of its parts.
-        heads: by topic and days, its parts.
+        heads: by topic, its parts in the days that were asked for last.
         decoded: by file, topic and window, the tables of bags that are not stored, in groups.
         pairs: by part, the parents and children of its transforms.
         clock_steps: by pause and the bags beside it, the steps of the clock in it.
-        statics: by session and topics, the static transforms of a timeline.
+        statics: by topics, the static transforms of sessions of a timeline.
         sights: by ten minutes and all that they follow from, what detectors saw.
         things: by settings, what was estimated of all bags of a timeline.
     """
@@ -129,7 +132,7 @@ class Caches:
     decoded: ByteLru[list[list[Table]]]
     pairs: ByteLru[frozenset[Pair]]
     clock_steps: ByteLru[tuple[ClockStep, ...]]
-    statics: ByteLru[tuple[Timeline, Sequence[StampedTransform]]]
+    statics: ByteLru[tuple[Timeline, Mapping[frozenset[str], Sequence[StampedTransform]]]]
     sights: ByteLru[object]
     things: ByteLru[tuple[Timeline, object]]
 
@@ -241,11 +244,14 @@ class Scanner:
         if self.store is None:
             return []
         state = coverage.state
-        span = TimeWindow.everything()
-        cached = self.caches.heads.get((topic, span))
-        if cached is None and (days := _whole_days(window)).stop - days.start <= _FEW_DAYS_NS:
-            span = days
-            cached = self.caches.heads.get((topic, span))
+        cached = self.caches.heads.get(topic)
+        if cached is None or window.intersect(cached.span) != window:
+            span = _whole_days(window)
+            if span.stop - span.start > _FEW_DAYS_NS:
+                span = TimeWindow.everything()
+            cached = None
+        else:
+            span = cached.span
         if cached is None or cached.coverage is not coverage:
             failures = self.store.failures
             heads: list[PartHead] = []
@@ -255,10 +261,10 @@ class Scanner:
                 newest = max((head.number for head in heads), default=0)
                 heads += self.store.parts(topic, span, newest)
                 heads.sort(key=lambda head: (head.first, head.number))
-            cached = _Heads.of(heads, coverage)
+            cached = _Heads.of(span, heads, coverage)
             if self.store.failures == failures:
                 size = sum(_HEAD_BYTES + head.bags.nbytes for head in heads)
-                self.caches.heads.put((topic, span), cached, 1000 + size)
+                self.caches.heads.put(topic, cached, 1000 + size)
         return cached.within(window)
 
     def matching(

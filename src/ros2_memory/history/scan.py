@@ -138,8 +138,9 @@ def joined_back(
         view.bags.check_deadline()
         results: list[tuple[Ns, T]] = []
         join = partial(_joined, kind, make(stretch), results)
+        before = key.start - opened.window.start  # they are wanted next
         try:
-            joined = remembered(view, joining(kind), key, join)
+            joined = remembered(view, joining(kind), key, join, also_before=before)
         except QueryTimeoutError:
             # What there was time for is an answer, too, with a note.
             yield from results

@@ -335,40 +335,44 @@ class Sessions:
         """
         view, caches = self._view, self._view.memory.scanner.caches
         if session not in self._static:
-            key = (session, view.static_topics)
-            timeline, static = caches.statics.get(key) or (None, ())
-            if timeline is view.timeline:
-                self._static[session] = static
-            elif len(self._static) == _FEW_SESSIONS:
-                # Who has asked for so many asks for more.
-                self._find_all_static()
-        if session not in self._static:
-            before = view.notes.added
-            static = _without_repeats(
-                transform
-                for topic in view.static_topics
-                for transform in self._static_received(topic, session)
-            )
-            self._static[session] = static
-            # What was noted must be noted in each answer.
-            if view.notes.added == before and not view.call.used_active:
-                caches.statics.put(key, (view.timeline, static), 1000 + 600 * len(static))
+            timeline, known = caches.statics.get(view.static_topics) or (None, {})
+            if timeline is not view.timeline:
+                known = {}
+            if session not in known:
+                known = self._with_static(session, known)
+            self._static[session] = known[session]
         return self._static[session]
 
-    def _find_all_static(self) -> None:
-        """Finds the static transforms of all sessions that are stored, unless some are carried."""
+    def _with_static(
+        self, session: Session, known: Mapping[Session, Sequence[StampedTransform]]
+    ) -> Mapping[Session, Sequence[StampedTransform]]:
+        """Returns the static transforms of one more session; for many, of all."""
+        view, before = self._view, self._view.notes.added
+        if len(self._static) == _FEW_SESSIONS:
+            # Who has asked for so many asks for more.
+            known = {**self._all_static(), **known}
+        if session not in known:
+            received = (self._static_received(topic, session) for topic in view.static_topics)
+            known = {**known, session: _without_repeats(chain.from_iterable(received))}
+        # What was noted must be noted in each answer.
+        if view.notes.added == before and not view.call.used_active:
+            size = sum(300 + 500 * len(static) for static in known.values())
+            view.memory.scanner.caches.statics.put(view.static_topics, (view.timeline, known), size)
+        return known
+
+    def _all_static(self) -> dict[Session, Sequence[StampedTransform]]:
+        """Returns those of all sessions that are stored, unless some are carried."""
         view = self._view
         coverage = view.memory.scanner.coverage(view.timeline)
         recordings = chain.from_iterable(map(view.timeline.recordings, view.static_topics))
         if coverage is None or any(map(self.holds_carried, recordings)):
-            return
+            return {}
         received: dict[Session, list[StampedTransform]] = defaultdict(list)
         for statics in self.static_back(TimeWindow.everything()):
             received[self.of(view.bag_dir / statics.recording)] += statics.transforms
         for session in {self.of(bag.recording) for bag in coverage.missing}:
             received.pop(session, None)
-        for session, transforms in received.items():
-            self._static[session] = _without_repeats(transforms)
+        return {session: _without_repeats(found) for session, found in received.items()}
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
         """Yields the static transforms of the parts in a window, of bags that are stored."""

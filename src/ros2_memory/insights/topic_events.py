@@ -27,6 +27,7 @@ from ros2_memory.analysis.topic_events import (
 )
 from ros2_memory.columns.fragments import FragmentKey
 from ros2_memory.columns.kinds import EVENTS
+from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.stated import StatedColumns
 from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import InvalidArgumentsError
@@ -93,9 +94,11 @@ def events_back(view: View, topic: str, window: TimeWindow) -> Iterator[tuple[Ns
             is_whole = all(rows.part is not None for rows in overlapping)
             is_wanted = is_whole or stretch.parts is not None or not view.call.stored
             if stretch.window.contains(first) and is_wanted:
-                yield first, _events_of_tables(view, columns, overlapping)
+                # Those before it in the stretch are wanted next.
+                before = min(first - stretch.window.start, STRETCH_NS)
+                yield first, _events_of_tables(view, columns, overlapping, before)
 
-    return joined_back(view, opened, EVENTS, make)
+    return joined_back(view, opened, EVENTS, make, lambda stretch: stretch.key(topic))
 
 
 def events_made(view: View, window: TimeWindow, topics: Iterable[str]) -> Iterator[Ns]:
@@ -142,7 +145,9 @@ def events_by_bag(
     }
 
 
-def _events_of_tables(view: View, columns: StatedColumns, together: list[Rows]) -> TopicEvents:
+def _events_of_tables(
+    view: View, columns: StatedColumns, together: list[Rows], also_before: Ns
+) -> TopicEvents:
     """Returns the events of tables that overlap in time; those of whole parts are remembered."""
 
     def make() -> TopicEvents:
@@ -150,8 +155,9 @@ def _events_of_tables(view: View, columns: StatedColumns, together: list[Rows]) 
         return events_of(stated) or TopicEvents(1, 0)
 
     parts = tuple(rows.part for rows in together if rows.part is not None)
-    key = FragmentKey(together[0].first, "", parts) if len(parts) == len(together) else None
-    return remembered(view, EVENTS, key, make)
+    topic = together[0].table.channel.topic
+    key = FragmentKey(together[0].first, topic, parts) if len(parts) == len(together) else None
+    return remembered(view, EVENTS, key, make, also_before=also_before)
 
 
 def _stated_in_rows(view: View, columns: StatedColumns, rows: Rows) -> Stated:

@@ -82,7 +82,7 @@ class Whole:
 
     words: Words | None
     data: bytes
-    numbers: tuple[object, ...]
+    rows: tuple[object, ...]
     arrays: dict[str, NDArray[Any]]
 
 
@@ -94,11 +94,19 @@ arrays = st.sampled_from(["int64", "uint64", "uint32", "float64", "float32", "bo
         fill=st.sampled_from([0, 1]) if name != "bool" else st.booleans(),
     )
 )
+values = st.integers() | st.floats(allow_nan=False) | st.text() | st.none()
+words = st.none() | st.builds(Words, st.text())
+rows = st.one_of(
+    [
+        st.lists(row).map(tuple)
+        for row in (values, words, words | values, st.tuples(words, values), st.just(()))
+    ]
+)
 wholes = st.builds(
     Whole,
-    st.none() | st.builds(Words, st.text()),
+    words,
     st.binary(),
-    st.lists(st.integers() | st.floats(allow_nan=False) | st.text() | st.none()).map(tuple),
+    rows,
     st.dictionaries(st.text(), arrays | st.just(np.arange(1000) / 10_000), max_size=3),
 )
 
@@ -117,6 +125,15 @@ def test_a_fragment_is_the_same_once_it_was_stored(whole: Whole) -> None:
         np.testing.assert_array_equal(back, array)
         if array.dtype.kind == "f":
             assert np.array_equal(np.signbit(back[array == 0]), np.signbit(array[array == 0]))
+
+
+@given(st.lists(st.none() | st.integers(0, 400), min_size=1))
+def test_arrays_in_rows_are_the_same_once_they_were_stored(sizes: list[int | None]) -> None:
+    stored = tuple(None if size is None else np.ones((size, 2)) * size for size in sizes)
+    found = from_bytes(to_bytes(stored, ()), ())
+    assert isinstance(found, tuple)
+    for array, back in zip(stored, found, strict=True):
+        np.testing.assert_array_equal(array, back)
 
 
 def test_a_robot_that_stands_takes_few_bytes() -> None:

@@ -13,13 +13,15 @@ other tables may share are all kept there until the tables are joined.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.intervals import SILENCE_NS
-from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -126,7 +128,26 @@ class PartialTrack(NamedTuple):
         return PartialTrack._make((*columns, self.left_out, self.recording))
 
 
-def end_to_end(parts: Sequence[PartialTrack]) -> PartialTrack:
+def settled_tracks(parts: Sequence[PartialTrack]) -> list[PartialTrack]:
+    """Returns one track for each recording that parts are of, which no other part overlaps.
+
+    Only in the first and in the last slice of all there may be other poses.
+    """
+    by_recording: dict[str, list[PartialTrack]] = defaultdict(list)
+    for part in parts:
+        by_recording[part.recording].append(part)
+    recordings = [*by_recording.values()]
+    whole, numbers = joined_tracks(recordings, keeps_ends=True)
+    bounds = np.searchsorted(numbers, np.arange(len(recordings) + 1)).tolist()
+    return [
+        whole.some(np.arange(*span))._replace(
+            left_out=sum(part.left_out for part in own), recording=own[0].recording
+        )
+        for own, span in zip(recordings, pairwise(bounds), strict=True)
+    ]
+
+
+def _end_to_end(parts: Sequence[PartialTrack]) -> PartialTrack:
     """Returns the vertices of parts, one at least, in their order, under the first's recording."""
     columns = map(np.concatenate, zip(*(part.columns for part in parts), strict=True))
     left_out = sum(part.left_out for part in parts)
@@ -196,24 +217,33 @@ def track_by(whole: PartialTrack, recordings: Times, fastest_mps: float = math.i
     return RobotTrack(whole.times, whole.x, whole.y, heading, begins, fastest_mps)
 
 
-def joined_tracks(recordings: Sequence[Sequence[PartialTrack]]) -> tuple[PartialTrack, Times]:
+def joined_tracks(
+    recordings: Sequence[Sequence[PartialTrack]], *, keeps_ends: bool = False
+) -> tuple[PartialTrack, Times]:
     """Returns the tracks by the poses of all tables of recordings, one track after the other.
 
-    With the number of the recording of each vertex. All at once: a week has thousands of them.
+    With the number of the recording of each vertex. All at once: a week has thousands of them. If
+    it `keeps_ends`, the first and the last slice of all are not settled.
     """
     parts_in_order = [part for parts in recordings for part in parts]
     if not parts_in_order:
         times, none = np.zeros(0, np.int64), np.zeros(0)
         return partial_track(times, none, none, none), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
-    whole, numbers = end_to_end(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
+    whole, numbers = _end_to_end(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
     are_known = whole.settled & ~_is_new(numbers)
     are_known[1:] &= whole.settled[:-1]
     whole = whole._replace(turns=_continuous(whole.turns, are_known))
-    vertices = _vertices(whole, whole.settled, numbers)
+    keeps = whole.settled
+    if keeps_ends:
+        slices = whole.times // TRACK_SLICE_NS
+        first, last = slices.min(initial=MAX_NS), slices.max(initial=MIN_NS)
+        settled = (slices > first) & (slices < last)
+        keeps, whole = keeps | ~settled, whole._replace(settled=settled)
+    vertices = _vertices(whole, keeps, numbers)
     return whole.some(vertices), numbers[vertices]
 
 

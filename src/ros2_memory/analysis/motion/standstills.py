@@ -38,13 +38,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import numpy as np
 
 from ros2_memory.analysis.motion.odometry import are_places
 from ros2_memory.analysis.poses import headings
-from ros2_memory.core.arrays import row_sums, rows_of, stacked
+from ros2_memory.core.arrays import narrowed, row_sums, rows_of, stacked
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns, unix_from_ns
 
 if TYPE_CHECKING:
@@ -55,8 +55,6 @@ if TYPE_CHECKING:
     from ros2_memory.analysis.poses import Poses
     from ros2_memory.core.arrays import Flags, Floats, Ints, Vectors
     from ros2_memory.core.model import Vector3
-
-    Corners: TypeAlias = NDArray[np.int32] | Ints
 
 SHORTEST_NS: Final[Ns] = 3 * NS_PER_S
 """A robot that is still for less is turning, or driving with care."""
@@ -150,7 +148,7 @@ class Blocks:
         noises: the highest standard deviation (m) of a slot's mean that noise of poses explains.
         lows: x, y, z of the lower corner of the box around the slots' means, as rows, in
             1 / `PER_METRE`.
-        highs: of the upper corner.
+        sizes: of the box, likewise.
         starts: of the first of still blocks in a row, the log time of the first pose at that place;
             else `MIN_NS`.
         ends: of the last of them, of the last pose there; else `MIN_NS`.
@@ -160,8 +158,8 @@ class Blocks:
     firsts: NDArray[np.uint32]
     lasts: NDArray[np.uint32]
     noises: NDArray[np.float32]
-    lows: Corners
-    highs: Corners
+    lows: Ints
+    sizes: Ints
     starts: Ints
     ends: Ints
 
@@ -171,12 +169,13 @@ class Blocks:
 
     def span(self) -> tuple[Ints, Ints]:
         """Returns the log times (ns) of the first and of the last pose of each."""
-        begins = self.numbers * BLOCK_NS
+        begins = self.numbers.astype(np.int64) * BLOCK_NS
         return begins + self.firsts, begins + self.lasts
 
     def corners(self) -> tuple[Vectors, Vectors]:
         """Returns the lower and the upper corners (m)."""
-        return self.lows / PER_METRE, self.highs / PER_METRE
+        lows = self.lows.astype(np.int64)
+        return lows / PER_METRE, (lows + self.sizes) / PER_METRE
 
     def are_still(self) -> Flags:
         """Returns whether drift and noise explain the boxes."""
@@ -190,18 +189,11 @@ class Blocks:
         return sum(getattr(self, column.name).nbytes for column in fields(self))
 
 
-def _in_units(corners: Vectors) -> Corners:
-    units = np.rint(corners * PER_METRE).astype(np.int64)
-    # Within 214 km of the origin, which a position in UTM is not.
-    is_small = bool((np.abs(units) < 2**31).all())
-    return units.astype(np.int32) if is_small else units
-
-
 _NONE: Final = np.empty(0, np.int64)
-_NOWHERE: Final = np.empty((0, 3), np.int32)
+_NOWHERE: Final = narrowed(np.empty((0, 3), np.int64))
 _OFFSETS: Final = np.empty(0, np.uint32)
 NO_BLOCKS: Final = Blocks(
-    _NONE, _OFFSETS, _OFFSETS, np.empty(0, np.float32), _NOWHERE, _NOWHERE, _NONE, _NONE
+    narrowed(_NONE), _OFFSETS, _OFFSETS, np.empty(0, np.float32), _NOWHERE, _NOWHERE, _NONE, _NONE
 )
 
 
@@ -273,13 +265,17 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     starts_ns = numbers[begins] * BLOCK_NS
     means = slots.means[inner]
     noises = slots.noises[inner] / np.sqrt(slots.counts[inner])
+    lows, highs = (
+        np.rint(extreme.reduceat(means, begins) * PER_METRE).astype(np.int64)
+        for extreme in (np.minimum, np.maximum)
+    )
     blocks = Blocks(
-        numbers[begins],
+        narrowed(numbers[begins]),
         (first_times - starts_ns).astype(np.uint32),
         (last_times - starts_ns).astype(np.uint32),
         np.maximum.reduceat(noises, begins).astype(np.float32),
-        _in_units(np.minimum.reduceat(means, begins)),
-        _in_units(np.maximum.reduceat(means, begins)),
+        narrowed(lows),
+        narrowed(highs - lows),
         np.full(begins.size, MIN_NS),
         np.full(begins.size, MIN_NS),
     )
@@ -500,9 +496,9 @@ def _creeping(blocks: Blocks, chain: Ints, still: Flags) -> Flags:
         there = int(left[here])
         if chain[here] != newest:
             newest, since = chain[here], MIN_NS
-        if blocks.numbers[there] > since:
+        if (begin := int(blocks.numbers[there])) > since:
             creeping[there : here + 1] = True
-            since = int(blocks.numbers[there])
+            since = begin
     return creeping
 
 
@@ -517,12 +513,12 @@ def _left_blocks(blocks: Blocks, chain: Ints, still: Flags) -> Ints:
     lows[1:], highs[1:] = np.minimum(lows[1:], lows[:-1]), np.maximum(highs[1:], highs[:-1])
     has_moved = _lengths(highs - lows) > LARGEST_M
     moved = np.flatnonzero(np.repeat(has_moved, _CREEP_BLOCKS)[: len(blocks)])
-    left = np.full(len(blocks), -1)
+    left, numbers = np.full(len(blocks), -1), blocks.numbers.astype(np.int64)
     for lag in range(1, _CREEP_BLOCKS):
         waiting = moved[(moved >= lag) & (left[moved] < 0)]
         waiting = waiting[run[waiting] == run[waiting - lag]]
         before = waiting - lag
-        near = blocks.numbers[waiting] - blocks.numbers[before] < _CREEP_BLOCKS
+        near = numbers[waiting] - numbers[before] < _CREEP_BLOCKS
         apart_m = _lengths(centres[waiting] - centres[before])
         far = near & (apart_m > LARGEST_M + 2 * (noises[waiting] + noises[before]))
         left[waiting[far]] = before[far]

@@ -18,6 +18,7 @@ from ros2_memory.analysis.motion.robot_track import (
     RobotTrack,
     joined_tracks,
     partial_track,
+    settled_tracks,
     thinned,
     track_by,
     track_of,
@@ -98,6 +99,21 @@ def test_a_track_does_not_depend_on_how_its_poses_are_cut(
     parts = [part(*ends) for ends in pairwise([0, *sorted({*cuts}), 1500])]
     assert same(track_by(*joined_tracks([parts])), whole)
     assert same(track_by(*joined_tracks([parts[::-1]])), whole)
+    middle = len(parts) // 2
+    stretches = [*settled_tracks(parts[:middle]), *settled_tracks(parts[middle:])]
+    assert same(track_by(*joined_tracks([stretches])), whole)
+
+
+def test_recordings_of_some_hours_keep_few_vertices_once_they_are_settled() -> None:
+    times = np.arange(0, 3600 * S, S // 5) + START
+    level = np.zeros(300)
+    parts = [
+        partial_track(some, level, level, level)._replace(recording=f"run {nth // 3}")
+        for nth, some in enumerate(np.split(times, len(times) // 300))
+    ]
+    tracks = settled_tracks(parts)
+    assert len(tracks) == len(parts) // 3
+    assert sum(len(track.times) for track in tracks) < sum(len(part.times) for part in parts) / 5
 
 
 def test_turns_on_the_spot_add_up() -> None:
