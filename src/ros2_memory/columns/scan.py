@@ -8,11 +8,11 @@ columns are unpacked when they are first used.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections import OrderedDict, defaultdict
 from dataclasses import dataclass
 from functools import cached_property, partial
-from itertools import pairwise
+from operator import itemgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -29,6 +29,7 @@ from ros2_memory.columns.units import (
     repeated_among,
 )
 from ros2_memory.columns.writing import DELAY, PUBLISH_TIME
+from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlaps_any
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
@@ -147,9 +148,9 @@ class Scan:
         self._scanner = scanner
         self._request = request
         self._coverage: Coverage | None = None
-        self._shared = [
-            span for span in request.shared if request.window.overlaps(span[0], span[1] - 1)
-        ]
+        since = bisect_right(request.shared, request.window.start, key=itemgetter(1))
+        until = bisect_left(request.shared, request.window.stop, since, key=itemgetter(0))
+        self._shared = [*request.shared[since:until]]
         self._decoded: OrderedDict[str, list[BagUnit]] = OrderedDict()
         self._copies: dict[object, list[IntArray]] = defaultdict(list)
         self._compared: set[Ns] = set()
@@ -283,7 +284,8 @@ class Scan:
 
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
-        bag = self._first_bag(self._head_of[part])
+        assert self._coverage is not None  # noqa: S101 - there are no parts without one
+        bag = self._coverage.bag(int(self._head_of[part].bags[0]))
         if bag is None:
             raise GoneError
         return bag.recording
@@ -445,15 +447,17 @@ class Scan:
 
     def _holding_copies(self) -> list[tuple[Ns, Ns]]:
         """Returns the shared spans in which two sources may have messages of one publish time."""
-        spans: list[tuple[Ns, Ns]] = []
-        for start, stop in self._shared:
-            published = sorted(
-                self._published.get(source.number, (-math.inf, math.inf))
-                for source in self._sources_in(TimeWindow(start, stop))
-            )
-            if any(latest >= earliest for (_, latest), (earliest, _) in pairwise(published)):
-                spans.append((start, stop))
-        return spans
+        starts, stops = np.array(self._shared, np.int64).T
+        begins, ends = np.searchsorted(self._latest, starts), np.searchsorted(self._firsts, stops)
+        counts = np.maximum(ends - begins, 0)
+        source, span = in_ranges(begins, counts), np.repeat(np.arange(counts.size), counts)
+        published = [self._published.get(s.number, (-math.inf, math.inf)) for s in self._sources]
+        earliest, latest = np.array(published).reshape(-1, 2)[source].T
+        order = np.lexsort((latest, earliest, span))
+        order = order[(self._lasts[source] >= starts[span])[order]]
+        before, after = order[:-1], order[1:]
+        may_repeat = (span[before] == span[after]) & (latest[before] >= earliest[after])
+        return [self._shared[nth] for nth in np.unique(span[before][may_repeat]).tolist()]
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""

@@ -29,7 +29,7 @@ from ros2_memory.index.recordings import (
     overlapping_recordings,
     recordings_of,
 )
-from ros2_memory.index.segment import TopicExtent
+from ros2_memory.index.segment import Span, TopicExtent
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
@@ -56,6 +56,8 @@ _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
+_PIECES: Final[Key[dict[str, Mapping[Path, Sequence[Span]]]]] = Key()
+"""Of a timeline: by topic, when some bags at a time of each recording have it."""
 _MADE: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that this bag directory's recorder made, one after the other."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
@@ -423,7 +425,7 @@ def note_robots_near(view: View, stored: StoredMessage) -> None:
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
-    steps = _steps_back(view)
+    steps, pieces = _steps_back(view), _pieces(view, topic)
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
@@ -432,7 +434,10 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
         open_spans = [(since, until, other) for since, until, other in open_spans if until >= first]
         for since, until, other in open_spans:
             span = TimeWindow(first, min(last, until) + 1)
-            if window.overlaps(span.start, span.stop - 1):
+            # One that a wrong clock dated spans years, mostly without a bag.
+            near = span.widened(COPY_HORIZON_NS)
+            is_there = until <= last or any(near.overlaps(*piece) for piece in pieces[other])
+            if is_there and window.overlaps(span.start, span.stop - 1):
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
                 is_step = span.stop - 1 - span.start <= max(steps[path], steps[other])
@@ -440,6 +445,17 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
                 by_clock = is_edge or is_step or own.issuperset((other, path))
                 yield ParallelRecordings(other, path, span, by_clock)
         open_spans.append((first, last, path))
+
+
+def _pieces(view: View, topic: str) -> Mapping[Path, Sequence[Span]]:
+    """Returns when some bags at a time of each recording have the topic."""
+    by_topic = view.timeline.memo.of(_PIECES, dict)
+    if topic not in by_topic:
+        by_topic[topic] = pieces = defaultdict[Path, list[Span]](list)
+        for segment in view.timeline.segments:
+            for path, totals in segment.recordings(topic).items():
+                pieces[path].append((totals.first, totals.last))
+    return by_topic[topic]
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:
@@ -488,7 +504,6 @@ def _differ(view: View, topic: str, pair: tuple[Path, Path], both: TimeWindow) -
     noted = view.notes.added
     near = view.stream.overlapping_bags([topic], both.widened(COPY_HORIZON_NS))
     bags = [[span for span in near if span.bag.recording == path] for path in pair]
-    # One that a wrong clock dated spans years, mostly without a bag.
     are_two = all(bags) and not view.sessions.are_joined(*pair)
     differ = are_two and _bags_differ(view, topic, bags, both)
     if view.notes.added == noted:  # else something could not be read, and may be next time

@@ -137,6 +137,9 @@ class KnownTrack:
         return sorted(chain(*(stays_within(track, region, window) for track in self.tracks)))
 
 
+_MOST_SETTINGS: Final = 256
+_SETTINGS: Final[Key[dict[tuple[object, ...], str]]] = Key()
+"""Of a timeline: what places the poses of a stretch, as a hash, by the parts that they are of."""
 _KNOWN: Final[Key[dict[tuple[str, TimeWindow], KnownTrack]]] = Key()
 """Of a call: its tracks, by frame and window."""
 
@@ -264,24 +267,44 @@ class TrackReader:
         start, last = stretch.window.start, stretch.last
         if stretch.parts is None or not window.covers(start, last):
             return None
-        sessions, span = self._view.sessions, TimeWindow(start, last + 1)
+        span = TimeWindow(start, last + 1)
+        moving = self._moving_parts(scans, span)
+        if moving is None:
+            return None
+        known = self._view.timeline.memo.of(_SETTINGS, dict)
+        asked, noted = (self._settings_hash(()), stretch.parts, *moving), self._view.notes.added
+        settings = known.get(asked)
+        if settings is None:
+            recordings = [] if self._is_own else [*map(opened.recording_of, stretch.parts)]
+            settings = self._stretch_settings(recordings, moving.values(), span)
+            if settings is None:
+                return None
+            if self._view.notes.added == noted and not self._view.call.used_active:
+                if len(known) >= _MOST_SETTINGS:
+                    known.clear()
+                known[asked] = settings
+        others = (part for part in moving if part not in stretch.parts)
+        return FragmentKey(start, settings, (*stretch.parts, *others))
+
+    def _stretch_settings(
+        self, recordings: Sequence[Path], moving: Collection[Path], span: TimeWindow
+    ) -> str | None:
+        """Returns the hash of what places the poses of some recordings; None of what may change.
+
+        `moving`: the recordings of the transforms around that time.
+        """
+        sessions = self._view.sessions
         numbers: dict[Session, int] = {}
         placed_by: list[object] = []
-        parts = [*stretch.parts]
-        recordings = () if self._is_own else map(opened.recording_of, stretch.parts)
         for recording in recordings:
             session = sessions.of(recording)
             if not sessions.has_all_kinds(session):
                 return None
             if session not in numbers:
-                placed_by.append(static_in(self._view.sessions.static(session), span))
+                placed_by.append(static_in(sessions.static(session), span))
             placed_by.append(numbers.setdefault(session, len(numbers)))
-        moving = self._moving_parts(scans, span)
-        if moving is None:
-            return None
-        placed_by += [numbers.get(sessions.of(recording)) for recording in moving.values()]
-        parts += [part for part in moving if part not in parts]
-        return FragmentKey(start, self._settings_hash(placed_by), tuple(parts))
+        placed_by += [numbers.get(sessions.of(recording)) for recording in moving]
+        return self._settings_hash(placed_by)
 
     def _moving_parts(self, scans: Sequence[Scan], span: TimeWindow) -> dict[int, Path] | None:
         """Returns the whole parts that all moving transforms around a time are of.
