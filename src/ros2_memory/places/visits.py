@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.analysis.intervals import FLICKER_NS
-from ros2_memory.analysis.motion.robot_track import TRACK_SLICE_NS, RobotTrack
+from ros2_memory.analysis.motion.robot_track import TOLERANCE_M, TRACK_SLICE_NS, RobotTrack
 from ros2_memory.core.errors import InvalidArgumentsError, NoDataError, QueryTimeoutError
 from ros2_memory.core.model import JsonValue, TimeWindow
 from ros2_memory.core.regions import Circle, Region, Steps
@@ -54,6 +54,7 @@ _SPLITS: Final = 3
 """A pose no older than so many splits is current: a split answers only when it is closed."""
 _CLOSE_NS: Final[Ns] = 60 * NS_PER_S
 _MOST_TRIED: Final = 50
+_CLEARLY_M: Final = 5 * TOLERANCE_M
 
 
 def visits(
@@ -279,7 +280,7 @@ class ConfirmedStays:
         by_track = [
             TrackedStay(stay.within(window), stay, track)
             for track in self.known.tracks
-            for stay in self._continued(stays(track, region))
+            for stay in self._continued(stays(track, region), track)
             if window.overlaps(stay.start, stay.stop)
         ]
         by_track.sort(key=lambda visit: visit.whole, reverse=True)
@@ -318,23 +319,39 @@ class ConfirmedStays:
             still_inside=not ends.left and not is_there,
         )
 
-    def _continued(self, visits: list[Stay]) -> list[Stay]:
+    def _continued(self, visits: list[Stay], track: RobotTrack) -> list[Stay]:
         """Returns visits; those as one between which the robot's poses did not leave.
 
         Along the edge of a region its track may be outside where it was inside. The newest
-        `_MOST_TRIED` of such visits are looked at.
+        `_MOST_TRIED` of those where it stays near the edge are looked at.
         """
         joined_visits = visits[-1:]
         looked_at = 0
         for older in visits[-2::-1]:
             newer = joined_visits[-1]
-            if newer.entered and older.left and newer.start - older.stop < _CLOSE_NS:
+            is_close = newer.start - older.stop < _CLOSE_NS
+            if newer.entered and older.left and is_close and not self._left(older, newer, track):
                 looked_at += 1
                 if looked_at <= _MOST_TRIED and self._stays(older, newer):
                     joined_visits[-1] = newer._replace(start=older.start, entered=older.entered)
                     continue
             joined_visits.append(older)
         return joined_visits
+
+    def _left(self, older: Stay, newer: Stay, track: RobotTrack) -> bool:
+        """Returns whether a track is clearly outside for as long as leaving takes between visits.
+
+        So far beyond one side of the region that no pose near it is inside.
+        """
+        between = slice(*np.searchsorted(track.times, (older.stop, newer.start)))
+        times, x, y = track.times[between], track.x[between], track.y[between]
+        low_x, high_x, low_y, high_y = self._region.bounds
+        for beyond_m in (low_x - x, x - high_x, low_y - y, y - high_y):
+            is_out = np.diff(beyond_m > _CLEARLY_M, prepend=False, append=False)
+            begins, stops = np.flatnonzero(is_out).reshape(-1, 2).T
+            if (times[stops - 1] - times[begins] >= FLICKER_NS).any():
+                return True
+        return False
 
     def _stays(self, older: Stay, newer: Stay) -> bool:
         """Returns whether poses between two visits were never outside for as long as leaving takes.
