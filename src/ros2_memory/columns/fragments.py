@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import struct
+import sys
 import threading
 from collections import deque
 from dataclasses import fields, is_dataclass
@@ -137,16 +138,14 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
         ValueError, TypeError, LookupError, struct.error: the bytes are none.
     """
     head, tail = decompressed(data).split(b"\n", 1)
-    return _restored(json.loads(head), classes, BytesIO(tail), {})
+    return _restored(json.loads(head), classes, BytesIO(tail))
 
 
-def _restored(
-    value: object, classes: Sequence[type], tail: BytesIO, words: dict[str, str]
-) -> object:
+def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
     if isinstance(value, str):
-        return words.setdefault(value, value)  # equal ones are one object: there are thousands
+        return sys.intern(value)  # names of columns and labels are in thousands of fragments
     if isinstance(value, dict):
-        return {key: _restored(entry, classes, tail, words) for key, entry in value.items()}
+        return {sys.intern(key): _restored(entry, classes, tail) for key, entry in value.items()}
     if not isinstance(value, list):
         return value
     number, *rest = value
@@ -155,9 +154,7 @@ def _restored(
         packed = tail.read(size)
         return packed if number == _BYTES else _unpacked(packed, *array)
     # Most are numbers: to call for each would take half of the time.
-    parts = [
-        part if type(part) in _NUMBERS else _restored(part, classes, tail, words) for part in rest
-    ]
+    parts = [part if type(part) in _NUMBERS else _restored(part, classes, tail) for part in rest]
     if number == _ROWS:
         none, kind, *columns = cast("list[Sequence[object]]", parts)
         return _rows(cast("Sequence[int]", none), kind, columns, classes)

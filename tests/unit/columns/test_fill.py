@@ -561,3 +561,15 @@ def test_a_handover_has_only_those_bags_stored_again_that_it_changes(
         assert len(world.stored()) == 4
         assert check_all(world) > 0
         world.store.close()
+
+
+def test_a_bag_is_known_as_stored_at_once_by_whichever_program(tmp_path: Path) -> None:
+    for number in range(4):
+        write_mcap(tmp_path / "rec" / f"{number}.mcap", [odom(T0 + number * 10 * S, 0.0, 0.0)])
+    worlds = World.of(tmp_path), World.of(tmp_path)
+    bags = worlds[0].memory.index.snapshot().timeline.bags
+    known: set[str] = set()
+    for nth in (2, 0, 3, 1):
+        worlds[nth % 2].fill_alone([bags[nth]])
+        known.add(f"rec/{bags[nth].path.name}")
+        assert [world.stored() for world in worlds] == [known, known]
