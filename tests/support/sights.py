@@ -74,4 +74,5 @@ def rows_of_tables(sights: JoinedSights) -> list[list[list[int]]]:
 
 def whole(parts: Sequence[Sights]) -> JoinedSights:
     """The sights of all parts, which are in one coordinate system."""
-    return joined([packed(part) for part in parts])
+    zeros = [0] * len(parts)
+    return joined([packed(part) for part in parts], zeros, zeros)

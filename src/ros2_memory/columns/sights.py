@@ -122,15 +122,14 @@ class JoinedSights:
 
 def joined(
     parts: Sequence[bytes],
-    epochs: Sequence[int] | None = None,
-    sessions: Sequence[int] | None = None,
+    epochs: Sequence[int],
+    sessions: Sequence[int],
 ) -> JoinedSights:
     """Returns the sights of packed parts, which are of some epochs and sessions.
 
     Fixes are in order of time for each session: at one time there may be several robots.
     """
-    epoch = np.zeros(len(parts), np.int64) if epochs is None else np.array(epochs, np.int64)
-    session = np.zeros(len(parts), np.int64) if sessions is None else np.array(sessions, np.int64)
+    epoch, session = np.array(epochs, np.int64), np.array(sessions, np.int64)
     names: Names = {}, {}
     # Of each table and column, those of the parts that are unpacked together, in few bytes.
     pieces: list[list[list[Ints]]] = [[[] for _ in range(size + 1)] for size in _COLUMNS]
@@ -147,19 +146,14 @@ def joined(
         for at, column in places:
             columns[at][column] = narrowed(rank[columns[at][column]])
     epoch_of_slice = _number_slices(columns, part, epoch)
-    spot_order = _order(columns[_SPOTS][:3])
+    keys = {_SPOTS: 3, _LOOKS: 2, _UNPLACED: 3}
+    orders = {at: _order(columns[at][:size]) for at, size in keys.items()}
+    orders[_FIXES] = _distinct_fixes(columns[_FIXES], session[part[_FIXES]])
+    spots, looks = (_places(orders[at]) for at in (_SPOTS, _LOOKS))
+    columns[_HITS][Hit.LOOK] = looks[columns[_HITS][Hit.LOOK]]
     for at in (_HITS, _SCORES, _BESIDE):
-        columns[at] = _by_spot(columns[at], spot_order)
-    look_order = _order(columns[_LOOKS][:2])
-    place = np.full(len(look_order) + 1, -1, np.int64)
-    place[look_order] = np.arange(len(look_order))
-    columns[_HITS][Hit.LOOK] = narrowed(place[columns[_HITS][Hit.LOOK]])
-    orders = {
-        _SPOTS: spot_order,
-        _LOOKS: look_order,
-        _UNPLACED: _order(columns[_UNPLACED][:3]),
-        _FIXES: _distinct_fixes(columns[_FIXES], session[part[_FIXES]]),
-    }
+        columns[at][0] = spots[columns[at][0]]
+        orders[at] = _order(columns[at][:1])
     for at, order in orders.items():
         columns[at] = [column[order] for column in columns[at]]
     topics, labels = (tuple(sorted(names_of_kind)) for names_of_kind in names)
@@ -208,13 +202,11 @@ def _order(keys: Sequence[Ints]) -> Ints:
     return in_ranges(begins[order], np.diff(begins, append=len(keys[0]))[order])
 
 
-def _by_spot(columns: Sequence[Ints], order: Ints) -> list[Ints]:
-    """Returns the rows of a table that is ordered by spots, where these come in another order."""
-    spot, *others = columns
-    sizes = np.bincount(spot, minlength=len(order)).astype(np.int64)
-    rows = in_ranges((np.cumsum(sizes) - sizes)[order], sizes[order])
-    spots = np.repeat(narrowed(np.arange(len(order))), sizes[order])
-    return [spots, *(column[rows] for column in others)]
+def _places(order: Ints) -> Ints:
+    """Returns where each row comes in an order, in few bytes; at the end, so for row -1, -1."""
+    places = np.full(len(order) + 1, -1, np.int64)
+    places[order] = np.arange(len(order))
+    return narrowed(places)
 
 
 def united(parts: Sequence[bytes]) -> bytes:

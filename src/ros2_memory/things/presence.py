@@ -80,7 +80,7 @@ class Cells:
         poor: which looks are not where they seem to be; those say nothing of others.
     """
 
-    def __init__(self, sights: JoinedSights, poor: Flags | bool = False) -> None:
+    def __init__(self, sights: JoinedSights, poor: Flags) -> None:
         looks = sights.looks
         names = (Look.SLICE, Look.TOPIC, Look.X, Look.Y, Look.YAW, Look.PAN, Look.N)
         columns = (looks.columns[name] for name in names)
@@ -102,7 +102,7 @@ class Cells:
         previous[after] = np.where(is_next, before, -1)
         self._previous = narrowed(previous)
 
-    def _grid(self, sights: JoinedSights, poor: Flags | bool) -> Iterator[Ints]:
+    def _grid(self, sights: JoinedSights, poor: Flags) -> Iterator[Ints]:
         """Yields yaw, x and y of looks in the grid of cells, and what else tells cells apart."""
         looks = sights.looks
         for name, size in ((Look.YAW, CELL_DECIDEG), (Look.X, CELL_MM), (Look.Y, CELL_MM)):

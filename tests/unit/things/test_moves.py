@@ -257,7 +257,7 @@ def test_fixes_of_two_robots_in_turn_are_no_jumps_of_the_map() -> None:
     fixes = [fixes_of(times + off * S // 2, poses + off, NOT_SAID) for off in (0, 1)]
     bags = [packed(part) for part in (sights_of_messages(seen), *fixes)]
     for sessions, is_poor in (([0, 0, 0], True), ([0, 0, 1], False)):
-        sights = joined(bags, sessions=sessions)
+        sights = joined(bags, [0] * len(bags), sessions)
         assert poorly_localised(sights)[1].any() == is_poor
 
 
@@ -270,7 +270,7 @@ def test_a_slice_in_which_localisation_was_poor_is_poor_as_a_whole() -> None:
     places = {0: (0, 0, 0), 4: (3, 0, 0), 8: (0, 3, 0), 12: (3, 3, 0)}
     seen = [Message("/detections", (begin + at) * S, place, []) for at, place in places.items()]
     said = fixes_of(np.array([begin - 1, begin + 1]) * S, np.zeros((2, 3)), np.array([2.0, 0.05]))
-    sights = joined([packed(sights_of_messages(seen)), packed(said)])
+    sights = joined([packed(sights_of_messages(seen)), packed(said)], [0, 0], [0, 0])
     _, looks = poorly_localised(sights)
     slices = sights.looks[:, Look.SLICE]
     assert len(looks) == 4

@@ -106,7 +106,7 @@ def _seen(
         if seen > 0:  # few looks see it
             rows.append((bag, len(looks) - 1, seen))
     rows += [(each, -1, n) for each, n in unplaced.items() if each <= bag]
-    cells = Cells(_sights(looks, bag + 1))
+    cells = Cells(_sights(looks, bag + 1), np.zeros(len(looks), np.bool_))
     return cells, np.array(rows, np.int64).reshape(-1, len(Hit))
 
 

@@ -41,7 +41,8 @@ def day() -> list[Msg]:
 
 def sights_in(memory: Memory) -> JoinedSights:
     stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
-    return joined([part.packed for stretch in stretches for part in stretch.sights])
+    parts = [part.packed for stretch in stretches for part in stretch.sights]
+    return joined(parts, [0] * len(parts), [0] * len(parts))
 
 
 def things_in(memory: Memory) -> tuple[Thing, ...]:
