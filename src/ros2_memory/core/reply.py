@@ -53,9 +53,6 @@ T = TypeVar("T")
 JsonObject: TypeAlias = "dict[str, JsonValue]"
 Source: TypeAlias = "str | Callable[[Never], object]"
 """What a key is made of: the attribute of a dot-path, None where a part of it is; or a function."""
-"""How a key of several robots' replies becomes one: numbers are added up, or those of an object;
-the smallest or the largest counts; each row takes it over; the robots of which it is true are
-named. Else it is kept once where all agree."""
 
 LOCAL_BEYOND_NS: Final[Ns] = 12 * 3600 * NS_PER_S
 """Shorter spans have no local times."""

@@ -71,8 +71,7 @@ def compact(lake: LakeTables, now: Ns, alive: Callable[[], object] = lambda: Non
     for name in TABLES:
         for day, robots in _to_compact(lake.days(name), closed):
             alive()
-            condition = of_robots(robots, day)
-            lake.replace(name, condition, lake.rows(name, condition))
+            lake.replace(name, of_robots(robots, day))
             done += len(robots)
     if done:
         log.info("days_compacted", days=done)

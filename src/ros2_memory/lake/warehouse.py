@@ -23,12 +23,7 @@ import socket
 import sys
 import uuid
 import warnings
-from contextlib import (
-    ExitStack,
-    closing,
-    contextmanager,
-    suppress,
-)
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import date, timedelta
 from itertools import chain
@@ -37,6 +32,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TypeAlias
 
 from pyiceberg.catalog.rest import RestCatalog
 from pyiceberg.catalog.sql import SqlCatalog
+from pyiceberg.exceptions import CommitFailedException, ValidationException
 from pyiceberg.io import FileIO, load_file_io
 from pyiceberg.io.pyarrow import PyArrowFile, PyArrowFileIO
 from pyiceberg.manifest import ManifestContent, ManifestFile
@@ -50,7 +46,7 @@ from ros2_memory.core.timebase import NS_PER_MS, Ns, WallClock
 from ros2_memory.lake.tables import NAMESPACE, TABLES, open_tables
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping, Sequence
 
     import pyarrow as pa
     from pyiceberg.catalog import Catalog as IcebergCatalog
@@ -67,6 +63,8 @@ WRITTEN_FILE: Final = "written.jsonl"
 RECORD: Final = "ros2-memory.written"
 """The setting of a `RecordingFileIO` that names the folder of its record."""
 _MOST_CHARS: Final = 500
+_ATTEMPTS: Final = 5
+"""Of a commit that fails although nothing is wrong; pyiceberg tries some of these again itself."""
 _MASK: Final = "********"
 _EPOCH: Final = date(1970, 1, 1)
 _LAST: Final = "\U0010ffff"
@@ -222,7 +220,8 @@ class LakeLocation:
 class LakeTables:
     """The tables of an open lake: all of `TABLES`. Each call takes their newest versions.
 
-    A commit is pyiceberg's: it compares and swaps, and what it replaces is one transaction.
+    A commit is pyiceberg's: it compares and swaps, and what it replaces is one transaction. What it
+    refuses is done again from the newest version.
     """
 
     location: LakeLocation
@@ -256,20 +255,42 @@ class LakeTables:
         with self.location.translated(f"reading the lake's {name}"):
             return table.scan(condition, selected_fields=columns).to_arrow()
 
-    def replace(self, name: str, condition: BooleanExpression, rows: pa.Table) -> None:
-        """Replaces rows by others, in one transaction."""
-        table = self.current(name)
-        with self.location.translated(f"writing the lake's {name}"):
-            table.overwrite(TABLES[name].sorted(rows), overwrite_filter=condition)
+    def replace(
+        self, name: str, condition: BooleanExpression, rows: pa.Table | None = None
+    ) -> None:
+        """Replaces rows by others, or by the same in few files, in one transaction."""
+
+        def write(table: IcebergTable) -> None:
+            # Those of the version that is replaced: no row that came since is lost.
+            whole = table.scan(condition).to_arrow() if rows is None else rows
+            table.overwrite(TABLES[name].sorted(whole), overwrite_filter=condition)
+
+        self._commit(name, "writing", write)
 
     def delete(self, name: str, condition: BooleanExpression) -> None:
         """Deletes rows from the newest version; `expire` deletes those before."""
-        table = self.current(name)
-        with self.location.translated(f"deleting from the lake's {name}"):
+
+        def write(table: IcebergTable) -> None:
             table.delete(condition)
             # The list of what a version deleted has the bounds of its columns, which are texts of
             # rows; the next version does not refer to it.
             table.append(table.schema().as_arrow().empty_table())
+
+        self._commit(name, "deleting from", write)
+
+    def _commit(self, name: str, doing: str, write: Callable[[IcebergTable], object]) -> None:
+        for attempt in range(_ATTEMPTS):
+            table = self.current(name)
+            with self.location.translated(f"{doing} the lake's {name}"):
+                try:
+                    write(table)
+                except (CommitFailedException, ValidationException):
+                    # Nothing was committed. Another program did; or threads of pyiceberg, which
+                    # share what says where a manifest's rows are, took one's for another's.
+                    if attempt == _ATTEMPTS - 1:
+                        raise
+                else:
+                    return
 
 
 def location_of(warehouse: str, state_dir: Path | None) -> tuple[str, Path]:

@@ -4,12 +4,15 @@ import os
 import shutil
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from pyiceberg.avro.file import AvroFile
 from pyiceberg.catalog.sql import SqlCatalog
 from pyiceberg.io.pyarrow import PyArrowFileIO
+from pyiceberg.table import Table as IcebergTable
 from pyiceberg.typedef import Record
 
 from ros2_memory import cli
@@ -332,6 +335,33 @@ def test_a_closed_day_is_put_into_one_file_with_the_same_rows(
         assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
     assert {name: lake_column(lake, name, "bag_id") for name in TABLES} == before
     assert lake_column(lake, "messages", "texts") == values
+
+
+def test_what_another_program_writes_while_a_day_is_put_together_stays(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lake, overwrite = tmp_path / "lake", IcebergTable.overwrite
+    monkeypatch.setattr("ros2_memory.lake.upkeep.FEW_FILES", 1)
+    for number in range(2):
+        write_bag(tmp_path / "hall", number)
+        ship_from(tmp_path)
+    others: list[str] = []
+
+    def overtaken(table: IcebergTable, rows: pa.Table, **how: Any) -> None:
+        name = table.name()[-1]
+        if name not in others:
+            others.append(name)
+            with location(lake).writable() as other:
+                other.tables[name].append(rows.slice(0, 1))
+        overwrite(table, rows, **how)
+
+    before = {name: len(lake_column(lake, name, "bag_id")) for name in TABLES}
+    monkeypatch.setattr(IcebergTable, "overwrite", overtaken)
+    with location(lake).writable() as tables:
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == len(others) > 1
+        assert compact(tables, (START_S + 3 * 86_400) * NS_PER_S) == 0
+    after = {name: len(lake_column(lake, name, "bag_id")) for name in TABLES}
+    assert after == {name: rows + (name in others) for name, rows in before.items()}
 
 
 def test_a_damaged_tombstone_keeps_everything_from_being_shipped(tmp_path: Path) -> None:

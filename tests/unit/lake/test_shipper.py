@@ -13,6 +13,8 @@ from typing import Any
 
 import pytest
 from pyiceberg.catalog.sql import SqlCatalog
+from pyiceberg.manifest import ManifestEntry
+from pyiceberg.table.update.snapshot import _OverwriteFiles
 
 from ros2_memory.bag_dir.state_files import append_receipts, read_receipts
 from ros2_memory.columns.fill import StoreLimits
@@ -273,6 +275,42 @@ def test_a_store_that_fails_loses_nothing(
         with pytest.raises(LakeError, match="No space left on device"):
             shipper.run()
         assert shipper.run().bags == 2 * BAGS
+    assert values(tmp_path) == EXPECTED
+
+
+def test_what_pyiceberg_refuses_is_committed_from_a_fresh_look(
+    fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its threads share what evaluates manifests, and may miss the files that they are to delete.
+
+    The rows of bags are there already, since a process was killed before their row in `bags`.
+    """
+    robots = [robot_bags(name, fleet / name) for name in ROBOTS]
+    entries, commit = _OverwriteFiles._deleted_entries, SqlCatalog.commit_table
+    refused: list[str] = []
+
+    def missing(files: _OverwriteFiles) -> list[ManifestEntry]:
+        found = entries(files)
+        location = files._transaction._table.location()
+        if found and location not in refused:
+            refused.append(location)
+            files._validate_required_deletes([])
+        return found
+
+    def kill(*given: Any) -> object:
+        if given[1].name()[-1] == "bags":
+            raise _Killed
+        return commit(*given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SqlCatalog, "commit_table", kill)
+        with pytest.raises(_Killed):
+            ship(tmp_path, robots, most_bags=200)
+    monkeypatch.setattr(_OverwriteFiles, "_deleted_entries", missing)
+    for robot in robots:
+        robot.look_again()
+    assert ship(tmp_path, robots, most_bags=200).bags == 2 * BAGS
+    assert len(refused) > 1
     assert values(tmp_path) == EXPECTED
 
 
