@@ -7,7 +7,7 @@ from itertools import islice
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final, TypeAlias
 
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -75,7 +75,8 @@ def overlap_spans(held: Iterable[tuple[Ns, Ns, object]]) -> list[tuple[Ns, Ns]]:
     for first, last, recording in sorted(held, key=itemgetter(0)):
         reach, holder = another if recording == farthest[1] else farthest
         if holder is not None and reach + COPY_HORIZON_NS >= first:
-            spans.append((first - COPY_HORIZON_NS, min(reach, last) + COPY_HORIZON_NS + 1))
+            until = min(reach, last, MAX_NS - COPY_HORIZON_NS - 1) + COPY_HORIZON_NS + 1
+            spans.append((first - COPY_HORIZON_NS, until))
         if recording == farthest[1]:
             farthest = max(farthest[0], last), recording
         elif last >= farthest[0]:

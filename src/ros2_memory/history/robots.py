@@ -451,10 +451,11 @@ def _pieces(view: View, topic: str) -> Mapping[Path, Sequence[Span]]:
     """Returns when some bags at a time of each recording have the topic."""
     by_topic = view.timeline.memo.of(_PIECES, dict)
     if topic not in by_topic:
-        by_topic[topic] = pieces = defaultdict[Path, list[Span]](list)
+        pieces = defaultdict[Path, list[Span]](list)
         for segment in view.timeline.segments:
             for path, totals in segment.recordings(topic).items():
                 pieces[path].append((totals.first, totals.last))
+        by_topic[topic] = pieces  # which other threads read from now on
     return by_topic[topic]
 
 

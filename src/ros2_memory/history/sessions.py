@@ -338,9 +338,9 @@ class Sessions:
             timeline, known = caches.statics.get(view.static_topics) or (None, {})
             if timeline is not view.timeline:
                 known = {}
+            self._static |= known
             if session not in known:
-                known = self._with_static(session, known)
-            self._static[session] = known[session]
+                self._static |= self._with_static(session, known)
         return self._static[session]
 
     def _with_static(

@@ -7,6 +7,7 @@ splits lie on both sides of one that cannot be read.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from itertools import chain, pairwise
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -76,7 +77,7 @@ class SplitNames(NamedTuple):
     Attributes:
         series: the different ones, in order of the bags; of a name without a number the path.
         positions: for each bag, where its series is among these.
-        numbers: of the bags in their series; -1 where the name has none.
+        numbers: of the bags in their series, or their ranks; -1 where the name has none.
     """
 
     series: Sequence[Series]
@@ -94,14 +95,10 @@ def stem_of(file: str) -> str:
 
 
 def split_of(file: str) -> SplitName | None:
-    """Returns the series of a bag file and its number there; None where its name has no number.
-
-    One of more than 64 bits is none.
-    """
+    """Returns the series of a bag file and its number there; None where its name has no number."""
     stem = stem_of(file)
     series = stem.rstrip("0123456789")
-    number = int(stem[len(series) :] or -1)
-    return SplitName(series, number) if 0 <= number <= MAX_NS else None
+    return None if series == stem else SplitName(series, int(stem[len(series) :]))
 
 
 def split_names_of(bags: Iterable[BagFile]) -> SplitNames:
@@ -111,7 +108,7 @@ def split_names_of(bags: Iterable[BagFile]) -> SplitNames:
     following, position, series, number, suffix = "", 0, "", 0, ""
     for bag in bags:
         # Mostly the bag after one is the next split.
-        if bag.file == following and number < MAX_NS:
+        if bag.file == following:
             number += 1
         else:
             series, number = split_of(bag.file) or (bag.file, -1)
@@ -119,6 +116,10 @@ def split_names_of(bags: Iterable[BagFile]) -> SplitNames:
             position = position_of.setdefault(series, len(position_of))
         rows.append((position, number))
         following = f"{series}{number + 1}{suffix}"
+    if max([number for _, number in rows], default=0) > MAX_NS:
+        # A date with microseconds has 20 digits.
+        known = sorted({-1, *(number for _, number in rows)})
+        rows = [(position, bisect_left(known, number) - 1) for position, number in rows]
     positions, numbers = np.array(rows, np.int64).reshape(-1, 2).T
     return SplitNames([*position_of], positions, numbers)
 
@@ -139,8 +140,9 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
     edges = np.searchsorted(positions[order], np.arange(len(all_series) + 1))
     late_edges = np.searchsorted(late, edges).tolist()
 
-    def split(at: int) -> Split:
-        return Split(int(numbers[order[at]]), bags[order[at]])
+    def split(series: Series, at: int) -> Split:
+        bag = bags[order[at]]
+        return Split(int(stem_of(bag.file).removeprefix(series)), bag)
 
     ranges: dict[Series, SplitRange] = {}
     for series, (begin, end), among in zip(
@@ -148,8 +150,9 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
     ):
         if begin < end:
             lates = late[slice(*among)].tolist() if is_recording(series) else ()
-            pairs = ((split(at), split(at + 1)) for at in lates if at + 1 < end)
-            ranges[series] = SplitRange(split(begin), split(end - 1), tuple(_steps_of(pairs)))
+            pairs = [(split(series, at), split(series, at + 1)) for at in lates if at + 1 < end]
+            first, last = split(series, begin), split(series, end - 1)
+            ranges[series] = SplitRange(first, last, tuple(_steps_of(pairs)))
     return ranges
 
 

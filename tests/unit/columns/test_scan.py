@@ -18,8 +18,10 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.history.context import Call
 from ros2_memory.history.scan import open_scan, scan
 from ros2_memory.history.view import View
+from ros2_memory.queries import find_last_match
 from tests.support.bags import odom, text, write_mcap
 from tests.support.column_worlds import EVERYTHING, World, check_rows, store_file
+from tests.support.memories import memory_of
 
 if TYPE_CHECKING:
     from ros2_memory.columns.store import PartHead
@@ -66,6 +68,21 @@ def test_bags_that_are_not_stored_are_left_out_where_that_is_asked(tmp_path: Pat
     assert sum(map(len, found)) == expected
     without = replace(world.memory, scanner=Scanner(None, tmp_path))
     assert [*scan(View(without, Call()), "/odom", EVERYTHING, stored=True)] == []
+
+
+def test_columns_of_a_bag_that_take_too_much_are_not_held_and_it_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    most = 50_000
+    monkeypatch.setattr("ros2_memory.columns.scan._MOST_BYTES", most)
+    said = [text(T0 + nth * S, f"{nth:02d}" + "a" * 10_000) for nth in range(20)]
+    write_mcap(tmp_path / "rec" / "rec_0.mcap", said)
+    memory = memory_of(tmp_path)
+    tables = [rows.table for rows in scan(View(memory, Call()), "/chatter", EVERYTHING)]
+    assert sum(map(len, tables)) == len(said)
+    assert sum(table.memory_bytes for table in tables) < most
+    found = find_last_match(memory, Call(), "/chatter", "contains", "07a")
+    assert (found.found and found.found.sample.time) == said[7].log_time
 
 
 def test_windows_of_hours_and_of_all_time_have_the_same_rows(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from functools import partial
 from itertools import chain, groupby, pairwise, repeat
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -23,7 +23,9 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import AT_OR_BEFORE_SLACK_NS, Deadline, unix_from_ns
+from ros2_memory.history import sessions
 from ros2_memory.history.context import Call, Memory
+from ros2_memory.history.scan import scan
 from ros2_memory.history.transforms import frames_over
 from ros2_memory.history.view import AtTime, TimeRange, View
 from ros2_memory.insights.recap import recap
@@ -181,6 +183,27 @@ def test_static_transforms_are_read_once_until_a_bag_is_added(tmp_path: Path) ->
     assert asked(reader, "/tf_static") == set()
     bag(tmp_path, 3, [static(2, "eye", 2.0)])
     assert place() == 2.0
+
+
+def test_static_transforms_of_many_recordings_are_read_together_beside_one_being_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    places = [float(nth) for nth in range(9)]
+    for nth, x in enumerate(places):
+        at = T0 + 900 * S * nth
+        mount = tf(at, transform(at, "base_link", "eye", (x, 0.0, 0.0)), topic="/tf_static")
+        write_mcap(tmp_path / f"rec_{nth}" / f"rec_{nth}_0.mcap", [mount, odom(at + S, 0.0, 0.0)])
+    view = View(memory_of(tmp_path, recalls=True), Call(used_active=True))
+    scanned: list[str] = []
+
+    def noted(view: View, topic: str, *given: Any, **named: Any) -> Any:
+        scanned.append(topic)
+        return scan(view, topic, *given, **named)
+
+    monkeypatch.setattr(sessions, "scan", noted)
+    of_each = [view.sessions.static(view.sessions.of(path)) for path in tmp_path.glob("rec_*")]
+    assert sorted(one.transform.translation[0] for [one] in of_each) == places
+    assert len(scanned) < 6
 
 
 @each_way

@@ -13,11 +13,12 @@ from ros2_memory.bag_dir.handover_file import Handover, write_handover
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.spans import overlap_spans
-from ros2_memory.core.timebase import MIN_NS, NS_PER_S
-from ros2_memory.history.context import Memory
+from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.history.context import Call, Memory
 from ros2_memory.index import timeline
 from ros2_memory.index.recordings import Overlapping, overlapping_recordings
-from tests.support.bags import odom, write_mcap
+from ros2_memory.queries import list_recorded_topics
+from tests.support.bags import odom, text, write_mcap
 from tests.support.memories import memory_of
 
 T0 = 1_700_000_000
@@ -102,3 +103,11 @@ def test_times_that_recordings_share_are_those_of_all_their_bags(
         patch.setattr(timeline, "SEGMENT_BAGS", size)
         shared = timeline.Timeline.of(bags).shared_times
     assert shared == overlap_spans((bag.start, bag.end, bag.recording) for bag in bags)
+
+
+def test_recordings_may_overlap_where_the_range_of_times_ends(tmp_path: Path) -> None:
+    for name, before in (("a", NS_PER_S), ("b", NS_PER_S // 2)):
+        said = [text(MAX_NS - 1 - before, name), text(MAX_NS - 1, name)]
+        write_mcap(tmp_path / name / f"{name}_0.mcap", said)
+    [topic] = list_recorded_topics(memory_of(tmp_path), Call())
+    assert topic.count == 4
