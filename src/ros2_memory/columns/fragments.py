@@ -15,7 +15,7 @@ import threading
 from collections import deque
 from dataclasses import fields, is_dataclass
 from io import BytesIO
-from itertools import pairwise, starmap
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
@@ -110,8 +110,8 @@ def _plain_rows(
     """Returns several values: column by column, with the places of None, where others are alike."""
     there = [value for value in values if value is not None]
     none = [_TUPLE, *(nth for nth, value in enumerate(values) if value is None)]
-    kinds = {type(value) for value in there} if len(there) > 1 else set()
-    kind = kinds.pop() if len(kinds) == 1 else object
+    kinds = {*map(type, there)}
+    kind = kinds.pop() if len(kinds) == 1 < len(there) else object
     if kind is np.ndarray:
         arrays = cast("list[Array]", there)
         if len({(array.dtype, array.shape[1:]) for array in arrays}) == 1:
@@ -119,7 +119,7 @@ def _plain_rows(
             return [_ROWS, none, sizes, _plain(np.concatenate(arrays), numbers, data)]
     elif kind is tuple or kind in numbers:
         rows = [*map(_parts, there)]
-        if {*map(len, rows)} == {len(rows[0]) or None}:
+        if rows[0] and len({*map(len, rows)}) == 1:
             columns = (_plain_rows(column, numbers, data) for column in zip(*rows, strict=True))
             return [_ROWS, none, numbers.get(kind, _TUPLE), *columns]
     return [_TUPLE, *(_plain(value, numbers, data) for value in values)]
@@ -165,12 +165,14 @@ def _rows(
     none: Sequence[int], kind: object, columns: Sequence[Sequence[object]], classes: Sequence[type]
 ) -> tuple[object, ...]:
     """Returns the values that `_plain_rows` was given; of arrays `kind` is their lengths."""
+    rows: list[object]
     if isinstance(kind, tuple):
         ends = np.cumsum([0, *kind]).tolist()
-        rows: list[object] = [columns[0][start:stop] for start, stop in pairwise(ends)]
+        rows = [columns[0][start:stop] for start, stop in pairwise(ends)]
+    elif kind == _TUPLE:
+        rows = [*zip(*columns, strict=True)]
     else:
-        values = zip(*columns, strict=True)
-        rows = [*(values if kind == _TUPLE else starmap(classes[cast("int", kind)], values))]
+        rows = [*map(classes[cast("int", kind)], *columns)]
     for nth in none:
         rows.insert(nth, None)
     return tuple(rows)

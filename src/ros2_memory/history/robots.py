@@ -29,7 +29,7 @@ from ros2_memory.index.recordings import (
     overlapping_recordings,
     recordings_of,
 )
-from ros2_memory.index.segment import Span, TopicExtent
+from ros2_memory.index.segment import TopicExtent
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
@@ -56,8 +56,6 @@ _MAX_STATIC: Final = 50
 """Messages of static transforms that are read of one recording."""
 _DIFFERING: Final[Key[dict[tuple[str, tuple[Path, Path], TimeWindow], bool]]] = Key()
 """Of a timeline: whether two recordings hold messages of their own on a topic, in a window."""
-_PIECES: Final[Key[dict[str, Mapping[Path, Sequence[Span]]]]] = Key()
-"""Of a timeline: by topic, when some bags at a time of each recording have it."""
 _MADE: Final[Key[frozenset[Path]]] = Key()
 """Of a call: the recordings that this bag directory's recorder made, one after the other."""
 _PARENTS: Final[Key[dict[str, Mapping[str, str]]]] = Key()
@@ -425,7 +423,7 @@ def note_robots_near(view: View, stored: StoredMessage) -> None:
 def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[ParallelRecordings]:
     """Yields pairs of recordings that hold a topic at the same time in a window."""
     open_spans: list[tuple[Ns, Ns, Path]] = []
-    steps, pieces = _steps_back(view), _pieces(view, topic)
+    steps = _steps_back(view)
     recordings = dict(view.timeline.recordings(topic))
     # A thinned day lies around what moments and rules have of it.
     recordings.pop(view.bag_dir / MEMORY_FOLDER, None)
@@ -435,8 +433,8 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
         for since, until, other in open_spans:
             span = TimeWindow(first, min(last, until) + 1)
             # One that a wrong clock dated spans years, mostly without a bag.
-            near = span.widened(COPY_HORIZON_NS)
-            is_there = until <= last or any(near.overlaps(*piece) for piece in pieces[other])
+            near = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
+            is_there = until <= last or any(other in some.recordings(topic) for some in near)
             if is_there and window.overlaps(span.start, span.stop - 1):
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest
@@ -445,18 +443,6 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
                 by_clock = is_edge or is_step or own.issuperset((other, path))
                 yield ParallelRecordings(other, path, span, by_clock)
         open_spans.append((first, last, path))
-
-
-def _pieces(view: View, topic: str) -> Mapping[Path, Sequence[Span]]:
-    """Returns when some bags at a time of each recording have the topic."""
-    by_topic = view.timeline.memo.of(_PIECES, dict)
-    if topic not in by_topic:
-        pieces = defaultdict[Path, list[Span]](list)
-        for segment in view.timeline.segments:
-            for path, totals in segment.recordings(topic).items():
-                pieces[path].append((totals.first, totals.last))
-        by_topic[topic] = pieces  # which other threads read from now on
-    return by_topic[topic]
 
 
 def _times_recorded_twice(view: View, window: TimeWindow) -> Iterator[ParallelRecordings]:

@@ -349,14 +349,15 @@ class Sessions:
         """Returns the static transforms of one more session; for many, of all."""
         view, before = self._view, self._view.notes.added
         if len(self._static) == _FEW_SESSIONS:
-            # Who has asked for so many asks for more.
+            # Who has asked for so many asks for more, also where nothing of it is remembered.
             known = {**self._all_static(), **known}
+            self._static.update(known)
         if session not in known:
             received = (self._static_received(topic, session) for topic in view.static_topics)
             known = {**known, session: _without_repeats(chain.from_iterable(received))}
         # What was noted must be noted in each answer.
         if view.notes.added == before and not view.call.used_active:
-            size = sum(300 + 500 * len(static) for static in known.values())
+            size = 300 * len(known) + 500 * sum(map(len, known.values()))
             view.memory.scanner.caches.statics.put(view.static_topics, (view.timeline, known), size)
         return known
 

@@ -147,13 +147,6 @@ def settled_tracks(parts: Sequence[PartialTrack]) -> list[PartialTrack]:
     ]
 
 
-def _end_to_end(parts: Sequence[PartialTrack]) -> PartialTrack:
-    """Returns the vertices of parts, one at least, in their order, under the first's recording."""
-    columns = map(np.concatenate, zip(*(part.columns for part in parts), strict=True))
-    left_out = sum(part.left_out for part in parts)
-    return PartialTrack._make((*columns, left_out, parts[0].recording))
-
-
 def empty_track() -> RobotTrack:
     """Returns a track without a vertex."""
     return track_by(*joined_tracks([]))
@@ -230,7 +223,9 @@ def joined_tracks(
         times, none = np.zeros(0, np.int64), np.zeros(0)
         return partial_track(times, none, none, none), times
     sizes = [sum(len(part.times) for part in parts) for parts in recordings]
-    whole, numbers = _end_to_end(parts_in_order), np.repeat(np.arange(len(recordings)), sizes)
+    columns = map(np.concatenate, zip(*(part.columns for part in parts_in_order), strict=True))
+    whole = PartialTrack._make((*columns, 0, ""))
+    numbers = np.repeat(np.arange(len(recordings)), sizes)
     order = _in_time(whole.times, numbers)
     order = order[thinned(whole.times[order], numbers[order])]
     whole, numbers = whole.some(order), numbers[order]
@@ -240,8 +235,7 @@ def joined_tracks(
     keeps = whole.settled
     if keeps_ends:
         slices = whole.times // TRACK_SLICE_NS
-        first, last = slices.min(initial=MAX_NS), slices.max(initial=MIN_NS)
-        settled = (slices > first) & (slices < last)
+        settled = (slices > slices.min(initial=MAX_NS)) & (slices < slices.max(initial=MIN_NS))
         keeps, whole = keeps | ~settled, whole._replace(settled=settled)
     vertices = _vertices(whole, keeps, numbers)
     return whole.some(vertices), numbers[vertices]
