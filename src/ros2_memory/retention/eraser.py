@@ -13,9 +13,9 @@ import stat
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
@@ -54,7 +54,6 @@ from ros2_memory.index.file_state import reason_unread
 from ros2_memory.retention.delete import beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
-    left_in,
     metadata_corrected,
     open_files,
     opened_folder,
@@ -70,7 +69,6 @@ if TYPE_CHECKING:
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
 
-NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
 _Window = tuple[str, int, int]
@@ -133,8 +131,8 @@ class Eraser:
         writer: BagWriter,
         own: OwnRecordings | None,
         *,
-        written: Mapping[Path, TimeWindow | None] = NOTHING_WRITTEN,
-        recorder: str | None = None,
+        written: Mapping[Path, TimeWindow | None],
+        recorder: str | None,
     ) -> None:
         self._bag_dir = bag_dir
         self._reader = reader
@@ -215,28 +213,26 @@ class Eraser:
         Raises:
             OSError: what goes cannot be written down; nothing is changed then.
         """
-        taken = {path: holder.counts for holder in survey.holders for path in holder.paths}
         if not erasure.files:
             windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
             counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
-            erasure = replace(erasure, files=tuple(map(self._relative, taken)), counts=counts)
+            paths = chain.from_iterable(holder.paths for holder in survey.holders)
+            erasure = replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
         ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
         linked: list[str] = []
-        recordings = {holder.paths[0].parent for holder in survey.holders}
-        left = {recording: left_in(recording, self._reader, taken) for recording in recordings}
         for holder in survey.holders:
             try:
-                if line := self._erase_in(holder, erasure, left[holder.paths[0].parent]):
+                if line := self._erase_in(holder, erasure):
                     again = any(map(self._may_change, self._paths_by_inode().get(holder.inode, ())))
                     (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
-        files = [self._bag_dir / name for name in erasure.files]
-        recordings = {path.parent for path in files}
+        bags = [self._bag_dir / name for name in erasure.files]
+        recordings = {path.parent for path in bags}
         notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
         try:
-            self._delete_left_over(files)
+            self._delete_left_over(bags)
             self._forget_silences(erasure)
             forgotten(erasure)
             self._add_losses(erasure)
@@ -358,12 +354,7 @@ class Eraser:
         lists = (handover.also_counts, handover.counts_elsewhere)
         return {topic for message_list in lists for topic in message_list.get(path.name, ())}
 
-    def _erase_in(
-        self,
-        holder: Holder,
-        erasure: Erasure,
-        left_of: Mapping[str, Counter[str]],
-    ) -> str | None:
+    def _erase_in(self, holder: Holder, erasure: Erasure) -> str | None:
         """Rewrites one file, under all its names; returns a line where other names are left.
 
         Raises:
@@ -384,7 +375,6 @@ class Eraser:
                 self._writer,
                 takes=erasure.takes,
                 expected=holder.counts,
-                left_of=left_of,
             ) as new:
                 for other in holder.paths[1:]:
                     self._replace_link(new, other, holder.inode)

@@ -12,7 +12,6 @@ kill in between does no harm: what is not released yet is cut again, to the same
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import Counter
@@ -49,7 +48,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import left_in, reason_of, rewritten
+from ros2_memory.retention.repair import reason_of, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
@@ -436,18 +435,9 @@ class Screening:
         """Rewrites a split without so many messages of each topic; raises as `_cut_split` does."""
         if split_number(path.parent.name, path.name) is None:
             raise BagError(str(path), "it is not named as a split of its recording")
-        with path.open("rb") as old:
-            left = left_in(path.parent, self._reader, {path: gone})
-            with rewritten(
-                self._bag_dir,
-                path,
-                os.fstat(old.fileno()),
-                self._writer,
-                takes=cut.takes,
-                expected=gone,
-                left_of=left,
-            ):
-                pass
+        status = path.lstat()
+        with rewritten(self._bag_dir, path, status, self._writer, takes=cut.takes, expected=gone):
+            pass
         _log.info(
             "messages_excluded",
             recording=path.parent.name,
