@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.recorder.base import Housekeeper
+    from ros2_memory.recorder.housekeeping import Housekeeping
 
 HEARTBEAT_S: Final = 5.0
 """How often `recorder.json` is written."""
@@ -78,7 +78,7 @@ class Supervisor:
     def __init__(
         self,
         orders: Orders,
-        housekeeper: Housekeeper,
+        housekeeper: Housekeeping,
         *,
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,

@@ -8,7 +8,6 @@ bag. Meanwhile the next oldest bag is deleted instead; if there is none, the lim
 from __future__ import annotations
 
 import os
-import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of,
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.retention.delete import remove_bag, remove_emptied
-from ros2_memory.retention.disk import RETRIED_S, free_bytes
+from ros2_memory.retention.disk import RETRIED_S
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
     DeletionPlan,
@@ -175,13 +174,13 @@ class GarbageCollector:
         *,
         recorded: RecordedTime,
         is_synchronised: Callable[[], bool],
-        static_topics: Collection[str] = (),
-        grace_s: float = 0.0,
-        needed: Callable[[Snapshot], frozenset[str]] = lambda _: frozenset(),
-        measure_free: Callable[[Path], int] = free_bytes,
-        monotonic: Callable[[], float] = time.monotonic,
-        memory: Outliving | None = None,
-        cutter: TopicCutter | None = None,
+        static_topics: Collection[str],
+        grace_s: float,
+        needed: Callable[[Snapshot], frozenset[str]],
+        measure_free: Callable[[Path], int],
+        monotonic: Callable[[], float],
+        memory: Outliving | None,
+        cutter: TopicCutter | None,
     ) -> None:
         self._bag_dir = bag_dir
         self._cutter = cutter

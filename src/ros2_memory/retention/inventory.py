@@ -150,8 +150,8 @@ class Inventory:
     def __init__(
         self,
         root: Path,
-        static_topics: Collection[str] = (),
-        own: OwnRecordings | None = None,
+        static_topics: Collection[str],
+        own: OwnRecordings | None,
     ) -> None:
         self._root = root
         self._own = own
@@ -160,7 +160,7 @@ class Inventory:
         self._folders: dict[str, _Folder] = {}
 
     def contents(
-        self, known: KnownBags, *, deleted: Collection[str] = (), remaining: Collection[str] = ()
+        self, known: KnownBags, *, deleted: Collection[str], remaining: Collection[str]
     ) -> DirContents:
         """Returns the bags that may be deleted, and the size of everything else.
 

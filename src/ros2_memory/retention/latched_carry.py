@@ -210,7 +210,7 @@ class Carrier:
         )
 
     def carry(
-        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path] = ()
+        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path]
     ) -> int | None:
         """Writes the messages that must outlive these bags, durably.
 

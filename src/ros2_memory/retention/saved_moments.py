@@ -15,7 +15,6 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
@@ -163,7 +162,7 @@ class MomentKeeper:
         share_bytes: int,
         clock: Clock,
         own: OwnRecordings,
-        rule_bytes: Mapping[str, int] = MappingProxyType({}),
+        rule_bytes: Mapping[str, int],
     ) -> None:
         self._bag_dir = bag_dir
         self._share = share_bytes
