@@ -57,6 +57,7 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.days import MemoryDays
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.retention.repair import Repairer
@@ -165,7 +166,11 @@ def retention_limits(settings: Settings) -> RetentionLimits:
 
 
 def build_housekeeper(
-    settings: Settings, bag_dir: Path, reader: BagReader, own: OwnRecordings
+    settings: Settings,
+    bag_dir: Path,
+    reader: BagReader,
+    own: OwnRecordings,
+    background: Background,
 ) -> Housekeeping:
     """Returns what repairs and deletes bags for the recorder; no other program may delete.
 
@@ -190,6 +195,7 @@ def build_housekeeper(
         is_synchronised=is_synchronised,
         split_duration_s=settings.recording.split_duration_s,
         own=own,
+        background=background,
         moments_bytes=moments_bytes,
         rule_bytes={rule.name: rule.max_bytes for rule in rules},
         watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,

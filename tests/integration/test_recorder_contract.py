@@ -11,6 +11,7 @@ import pytest
 
 from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import ConfigError, RecorderError
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
@@ -46,6 +47,7 @@ def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
         own=OwnRecordings(folder / "bags"),
         keep_open=(),
         excluding={},
+        background=Background(),
     )
 
 

@@ -309,7 +309,6 @@ class PlayedHousekeeper(Housekeeping):
         self.frees_to = 0
         self.making = False
         self.moments_kept = 0
-        self.failed: dict[str, str] = {}
         self.recorded: list[tuple[tuple[str, ...], int, float]] = []
         self.held: str | None = None
         self.restarts: list[tuple[int, str]] = []
@@ -338,9 +337,6 @@ class PlayedHousekeeper(Housekeeping):
 
     def status(self) -> HouseStatus:
         return HouseStatus(age_held=self.held)
-
-    def faults(self) -> dict[str, str]:
-        return self.failed
 
     def announce(self, recording: str) -> None:
         """Nothing is excluded."""

@@ -461,8 +461,8 @@ class _Side(NamedTuple):
         """Yields between which log times the cut may hide messages, both included."""
         for name, bag in self.bags.items():
             rule = self.cut.rule(name)
-            for _, _, log_from, log_until in () if rule is None else rule.exclusions:
-                span = max(bag.start, log_from), min(bag.end, log_until)
+            for _, logged in () if rule is None else rule.exclusions:
+                span = max(bag.start, logged.start), min(bag.end, logged.stop)
                 if span[0] <= span[1]:
                     yield span
 

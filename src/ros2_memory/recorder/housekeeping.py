@@ -23,7 +23,6 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.recorder.background import Background
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -107,7 +107,7 @@ class Housekeeping:
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
-        background: runs what takes a while.
+        background: runs what takes a while, of the recorder, too.
     """
 
     def __init__(
@@ -131,10 +131,10 @@ class Housekeeping:
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
         cutter: TopicCutter | None = None,
-        background: Background | None = None,
+        background: Background,
     ) -> None:
         self._bag_dir = bag_dir
-        self._background = background or Background()
+        self._background = background
         self._recorded = RecordedTime(bag_dir)
         self._own = own
         self._limits = limits
@@ -224,10 +224,6 @@ class Housekeeping:
     def keep_moments(self) -> None:
         """Begins to save the moments that were asked for, or wait for bags; about once a second."""
         self._add_unless_under_way("keep_moments", self._save_moments)
-
-    def faults(self) -> Mapping[str, str]:
-        """Maps each task whose last run failed to the reason."""
-        return self._background.faults()
 
     def wait(self) -> None:
         """Waits until nothing is under way."""

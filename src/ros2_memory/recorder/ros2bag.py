@@ -15,7 +15,6 @@ from ros2_memory.bag_dir.layout import (
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
-from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.base import Recorder
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader
 
@@ -70,6 +70,7 @@ class Ros2BagRecorder(Recorder):
         own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
         excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
+        background: does what takes a while, of the housekeeper, too.
     """
 
     def __init__(
@@ -92,6 +93,7 @@ class Ros2BagRecorder(Recorder):
         own: OwnRecordings,
         keep_open: Collection[int],
         excluding: Mapping[str, str],
+        background: Background,
     ) -> None:
         self._bag_dir = bag_dir.absolute()
         self._split_duration_s = split_duration_s
@@ -108,7 +110,6 @@ class Ros2BagRecorder(Recorder):
         self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
         self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
-        background = Background()
         self._reception = Reception(
             reader,
             self._queue_bytes,

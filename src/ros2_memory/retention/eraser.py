@@ -64,7 +64,7 @@ from ros2_memory.retention.repair import (
 from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
@@ -332,7 +332,11 @@ class Eraser:
     ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
-        listed = {topic for path in holder.paths for topic in self._topics_in_sidecar(path)}
+        listed = set[str]()  # the topics of which a sidecar lists messages
+        for path in holder.paths:
+            handover = read_handover(path.parent).handover
+            for message_list in (handover.also_counts, handover.counts_elsewhere):
+                listed.update(message_list.get(path.name, ()))
         for topic in topics:
             first, last = erasure.windows[0][0], erasure.windows[-1][1]
             span = (
@@ -347,12 +351,6 @@ class Eraser:
                         identity = message_id(record.publish_time, record.payload)
                         holder.ids.setdefault(topic, set()).add(identity)
         return holder
-
-    def _topics_in_sidecar(self, path: Path) -> Collection[str]:
-        """Returns the topics of which a sidecar lists messages of a file."""
-        handover = read_handover(path.parent).handover
-        lists = (handover.also_counts, handover.counts_elsewhere)
-        return {topic for message_list in lists for topic in message_list.get(path.name, ())}
 
     def _erase_in(self, holder: Holder, erasure: Erasure) -> str | None:
         """Rewrites one file, under all its names; returns a line where other names are left.

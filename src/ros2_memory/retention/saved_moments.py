@@ -194,7 +194,7 @@ class MomentKeeper:
             if moment.moment.pending:
                 stored[name] = self._continue_moment(moment, stored, snapshot)
         for request in self._queue.take(now) if self._queue.has_requests() else ():
-            self._queue.answer(request, self._answer_to(request, stored, snapshot))
+            self._queue.answer(request.number, self._answer_to(request, stored, snapshot))
         self._waiting = any(moment.moment.pending for moment in stored.values())
 
     def _answer_to(
@@ -394,7 +394,7 @@ class MomentKeeper:
 
 def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
     """Whether what was recorded in one window may lie in the other; yes if unknown."""
-    return recorded is None or (recorded.start < window.stop and window.start < recorded.stop)
+    return recorded is None or not recorded.intersect(window).empty
 
 
 class _BagInode(NamedTuple):

@@ -14,7 +14,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
 from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import (
-    PlayedHousekeeper,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -603,14 +602,13 @@ def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path
 
 
 def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
-    housekeeper = PlayedHousekeeper()
-    world = World(tmp_path, housekeeper=housekeeper).started()
-    housekeeper.failed = {"apply": "the list cannot be read"}
+    world = World(tmp_path).started()
+    world.background.failed("apply", "the list cannot be read")
     world.run(30)
     assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (
         "the list cannot be read",
         False,
     )
-    housekeeper.failed = {}
+    world.background.run("apply", bool)
     world.run(10)
     assert world.heartbeat()["recovered"] is True
