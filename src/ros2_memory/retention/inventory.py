@@ -178,8 +178,7 @@ class Inventory:
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
-        occupied: set[str] = set()
-        mixed: set[str] = set()
+        recordings: set[str] = set()
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
@@ -197,27 +196,19 @@ class Inventory:
             is_new = is_named and split_number(recording, name) is not None
             may_go = _may_be_deleted(state, path, is_named=is_named)
             if not (is_own or is_saved or is_new):
-                mixed.add(recording)
                 foreign_bytes += sum(file.size for file in bag.files)
-            elif is_own and may_go and not is_saved and path not in remaining:
+                continue
+            recordings.add(recording)
+            if is_own and may_go and not is_saved and path not in remaining:
                 bags.append(bag)
-            else:
-                occupied.add(recording)
-                if self._counts(state, bag) and not is_saved:
-                    other_bytes += sum(file.size for file in bag.files)
+            elif self._counts(state, bag) and not is_saved:
+                other_bytes += sum(file.size for file in bag.files)
         self._drop_gone(known)
-        occupied |= mixed & {bag.recording for bag in bags}
-        emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
-        sidecars = {recording: self._folder_at(recording, known.now).size for recording in emptied}
-        occupied.update(bag.recording for bag in bags)
-        other_bytes += sum(
-            self._folder_at(recording, known.now).size for recording in occupied - emptied
-        )
+        other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
         saved = self._moment_files(known)
         return DirContents(
             bags,
             known.now,
-            sidecars,
             other_bytes,
             saved=saved,
             foreign_bytes=foreign_bytes,
