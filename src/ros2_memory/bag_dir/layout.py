@@ -107,6 +107,11 @@ def is_thinned(bag: Path | str) -> bool:
     return folder.endswith(f"/{MEMORY_FOLDER}") and _DAY_FILE.fullmatch(name) is not None
 
 
+def is_derived(bag: Path | str) -> bool:
+    """Returns whether a bag holds messages of other bags: carried ones, or what stays of a day."""
+    return is_carried(bag) or is_thinned(bag)
+
+
 def utc_day(at: Ns) -> str:
     """Returns the day of a time, as names have it: `20261120`."""
     return utc_stamp(at).partition("T")[0]

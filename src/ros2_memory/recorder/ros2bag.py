@@ -102,11 +102,9 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._checked = False
-        by_setting = {
-            str(entry["topic"]): "recording.required"
-            for entry in required
-            if "*" not in str(entry["topic"])
-        }
+        wanted = [Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required]
+        topics = (entry.topic for entry in wanted if "*" not in entry.topic)
+        by_setting = dict.fromkeys(topics, "recording.required")
         self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
         self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
@@ -131,7 +129,7 @@ class Ros2BagRecorder(Recorder):
             own=own,
             reception=self._reception,
             background=background,
-            required=[Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required],
+            required=wanted,
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )

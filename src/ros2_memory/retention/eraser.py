@@ -32,8 +32,8 @@ from ros2_memory.bag_dir.layout import (
     THINNED_FILE,
     bag_kind,
     is_carried,
+    is_derived,
     is_kept_apart,
-    is_thinned,
 )
 from ros2_memory.bag_dir.state_files import (
     ERASING,
@@ -320,7 +320,7 @@ class Eraser:
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
-        elif (is_carried(path) or is_thinned(path)) and self._recorder is not None:
+        elif is_derived(path) and self._recorder is not None:
             reason = _recorder_refuses(self._recorder)
         return reason
 

@@ -21,8 +21,7 @@ from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     MOMENTS_FOLDER,
-    is_carried,
-    is_thinned,
+    is_derived,
 )
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
@@ -79,8 +78,7 @@ def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
     waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
     ready = []
     for bag in snapshot.timeline.overlapping(window):
-        is_derived = is_carried(bag.file) or is_thinned(bag.file)
-        if not bag.reaches_into(window) or is_derived:
+        if not bag.reaches_into(window) or is_derived(bag.file):
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
         if unfinished and now - moment.asked < REPAIRED_WITHIN_NS:
@@ -419,8 +417,8 @@ def _missing_sentence(name: str) -> str:
 
 def _moment_of(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    by_number = {moment.moment.request.number: moment for moment in stored.values()}
-    return by_number.get(request.number)
+    moments = stored.values()
+    return next((kept for kept in moments if kept.moment.request.number == request.number), None)
 
 
 def _with_links(

@@ -78,7 +78,7 @@ class Triggers:
         *,
         clock: Clock,
         split_duration_s: float,
-        is_recorded: Callable[[str], bool] = bool,
+        is_recorded: Callable[[str], bool],
     ) -> None:
         self._bag_dir = bag_dir
         self._rules = {rule.name: rule for rule in rules}
