@@ -219,7 +219,7 @@ class HandoverTransfer:
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
-        if self.missing and age_s < self._orders.subscribe_timeout_s:
+        if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
             self._both_since = None

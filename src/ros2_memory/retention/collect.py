@@ -226,7 +226,7 @@ class GarbageCollector:
                 contents = replace(contents, free_bytes=self._measure_free(self._bag_dir))
             plan = plan_deletions(contents, limits)
             result.foreign_bytes, result.state_bytes = contents.foreign_bytes, contents.state_bytes
-            result.saved_bytes = sum(file.size for file in contents.saved)
+            result.saved_bytes = sum(contents.saved.values())
             result.total_bytes, result.fits = plan.total_bytes, plan.fits
             result.most_free = plan.most_free
             going = plan.to_delete if self._memory is None else by_hours(plan, contents)
@@ -314,9 +314,8 @@ class GarbageCollector:
         run: _Pass,
         plan: DeletionPlan,
     ) -> None:
-        saved = {file.inode for file in contents.saved}
         run.saved |= {
-            bag.path for bag in to_delete if any(file.inode in saved for file in bag.files)
+            bag.path for bag in to_delete if any(file.inode in contents.saved for file in bag.files)
         }
         self._carry(to_delete, snapshot, run)
         going = [bag for bag in to_delete if bag.path not in run.remaining]

@@ -9,7 +9,6 @@ hard link in a moment has it. It is done when no name of the old one is left.
 from __future__ import annotations
 
 import os
-import stat
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -296,11 +295,10 @@ class Eraser:
         by_inode: defaultdict[Identity, list[Path]] = defaultdict(list)
         for folder, entries in directories.walk(self._bag_dir):
             for entry in entries:
-                if bag_kind(entry.name) and not entry.is_symlink():
-                    with suppress(OSError):
+                with suppress(OSError):
+                    if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
                         status = entry.stat(follow_symlinks=False)
-                        if stat.S_ISREG(status.st_mode):
-                            by_inode[status.st_dev, status.st_ino].append(Path(folder, entry.name))
+                        by_inode[status.st_dev, status.st_ino].append(Path(folder, entry.name))
         for paths in by_inode.values():
             paths.sort(key=lambda path: (is_kept_apart(self._relative(path)), path))
         return dict(by_inode)

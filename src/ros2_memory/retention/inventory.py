@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
-    from ros2_memory.index.scan import Stamp
     from ros2_memory.index.snapshot import Snapshot
 
 
@@ -222,7 +221,8 @@ class Inventory:
             file = (stamp.inode, stamp.size)
             bag = self._stored(path, classification.bag, stamp.mtime_ns, file, known.now)
             if other in known.hidden:
-                bag = bag._replace(second=_stored_file(bag.device, known.files[other].stamp))
+                stamp = known.files[other].stamp
+                bag = bag._replace(second=StoredFile((bag.device, stamp.inode), stamp.size))
             yield classification.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
@@ -251,16 +251,13 @@ class Inventory:
             return self._own is not None or has_own_name(Path(bag.recording).name)
         return state is not FileState.UNREAD
 
-    def _moment_files(self, known: KnownBags) -> tuple[StoredFile, ...]:
-        """Returns the files of moments, each once."""
-        if not known.saved:
-            return ()
+    def _moment_files(self, known: KnownBags) -> dict[tuple[int, int], int]:
+        """Returns the sizes of the files of moments, by inode."""
         try:
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         except OSError:
             device = -1
-        stamps = {stamp.inode: stamp for stamp in known.saved.values()}
-        return tuple(_stored_file(device, stamp) for stamp in stamps.values())
+        return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
 
     def _dating_span(self, bag: BagFile) -> tuple[Ns, Ns]:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
@@ -318,7 +315,3 @@ def _may_be_deleted(state: FileState, path: str, *, is_named: bool) -> bool:
     if state in _CLOSED:
         return not is_carried(path)
     return state in _LEFT_OPEN and not is_named
-
-
-def _stored_file(device: int, stamp: Stamp) -> StoredFile:
-    return StoredFile((device, stamp.inode), stamp.size)

@@ -131,7 +131,8 @@ class DirContents:
         now: the wall clock.
         other_bytes: all else that counts: open bags, and what goes with a recording's last bag.
         free_bytes: free disk space; None if that does not count.
-        saved: the files of moments, which are never deleted; bags may be other names of them.
+        saved: the sizes of the files of moments, by inode (device and number), which are never
+            deleted; bags may be other names of them.
         recorded_since: how long was recorded after each recording, by the monotonic clock; a
             recording that is missing counts as new.
         doubtful: the recordings whose dates are not known to be right.
@@ -148,7 +149,7 @@ class DirContents:
     now: Ns
     other_bytes: int = 0
     free_bytes: int | None = None
-    saved: Sequence[StoredFile] = ()
+    saved: Mapping[tuple[int, int], int] = field(default_factory=dict)
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     doubtful: frozenset[str] = frozenset()
     synchronised: bool = False
@@ -270,9 +271,9 @@ class _Remaining:
 
     def __init__(self, contents: DirContents) -> None:
         # A file of a moment counts once, and stays when its other name is deleted.
-        self._saved = {file.inode for file in contents.saved}
-        saved = sum(file.size for file in contents.saved)
-        self.total = contents.other_bytes + saved + sum(map(self.freed_by, contents.bags))
+        self._saved = contents.saved
+        bags = sum(map(self.freed_by, contents.bags))
+        self.total = contents.other_bytes + sum(contents.saved.values()) + bags
         self.free = contents.free_bytes
 
     def freed_by(self, bag: StoredBag) -> int:

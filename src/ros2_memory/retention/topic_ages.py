@@ -73,9 +73,10 @@ def plan_cuts(
     index shows it.
     """
     timeline = snapshot.timeline
-    saved = {file.inode for file in contents.saved}
     alone = {
-        bag.path for bag in contents.bags if saved.isdisjoint(file.inode for file in bag.files)
+        bag.path
+        for bag in contents.bags
+        if contents.saved.keys().isdisjoint(file.inode for file in bag.files)
     }
     going: defaultdict[str, set[str]] = defaultdict(set)
     for topic_age in topic_ages:

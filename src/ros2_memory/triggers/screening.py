@@ -15,6 +15,7 @@ from __future__ import annotations
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -23,7 +24,7 @@ from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
     SCREENED_FILE,
-    bag_kind,
+    bags_in,
     split_number,
 )
 from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
@@ -283,11 +284,10 @@ class Screening:
 
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
-        try:
-            paths = [path for path in (self._bag_dir / name).iterdir() if bag_kind(path.name)]
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
+        with suppress(FileNotFoundError, NotADirectoryError):
+            paths = bags_in(self._bag_dir / name)
+            return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
+        return []
 
     def _add_conditions(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
         """Adds what a file shows to the state.
