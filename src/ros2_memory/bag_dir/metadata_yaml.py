@@ -219,10 +219,10 @@ def _set_topics(
     version: int,
 ) -> None:
     """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
-    topics = _mappings(info, "topics_with_message_count")
+    topics = [_mapping(item, "topics") for item in _list(info, "topics_with_message_count")]
     listed = set()
     for topic in topics:
-        topic_metadata = _described(topic)
+        topic_metadata = _mapping(topic.get("topic_metadata"), "topic_metadata")
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
         topic["message_count"] = counts[key]
@@ -235,7 +235,15 @@ def _set_topics(
         key = channel.topic, channel.type
         if key not in listed:
             listed.add(key)
-            new = _topic_metadata(channel, version)
+            new: dict[object, object] = {
+                "name": channel.topic,
+                "type": channel.type,
+                "serialization_format": channel.encoding,
+                "offered_qos_profiles": _offered(channel, version),
+            }
+            if version >= _FIRST_OF_TYPE_HASHES:
+                type_hash = dict(channel.metadata).get("topic_type_hash", "")
+                new["type_description_hash"] = type_hash
             topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
 
@@ -260,19 +268,6 @@ def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
         "files": [],
         **({"custom_data": None, "ros_distro": ""} if is_named else {}),
     }
-
-
-def _topic_metadata(channel: Channel, version: int) -> dict[str, object]:
-    topic_metadata: dict[str, object] = {
-        "name": channel.topic,
-        "type": channel.type,
-        "serialization_format": channel.encoding,
-        "offered_qos_profiles": _offered(channel, version),
-    }
-    if version >= _FIRST_OF_TYPE_HASHES:
-        type_hash = dict(channel.metadata).get("topic_type_hash", "")
-        topic_metadata["type_description_hash"] = type_hash
-    return topic_metadata
 
 
 def _offered(channel: Channel, version: int) -> object:
@@ -321,12 +316,3 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
     if not isinstance(value, list):
         raise ValueError(f"it has no list {key}")  # noqa: TRY004 - a value in a text
     return value
-
-
-def _mappings(fields: dict[object, object], key: str) -> list[dict[object, object]]:
-    """Returns the items of the list under a key, each of which must hold keys."""
-    return [_mapping(item, key.partition("_")[0]) for item in _list(fields, key)]
-
-
-def _described(topic: dict[object, object]) -> dict[object, object]:
-    return _mapping(topic.get("topic_metadata"), "topic_metadata")

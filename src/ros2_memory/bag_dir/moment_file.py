@@ -308,11 +308,10 @@ class PendingRequest:
 
     def withdraw(self) -> bool:
         """Withdraws the request; False where the recorder has begun with it, or answered."""
-        try:
+        with suppress(OSError):
             self._path("json").unlink()
-        except OSError:
-            return False
-        return True
+            return True
+        return False
 
     def close(self) -> None:
         """Deletes the answer."""
