@@ -30,7 +30,6 @@ from ros2_memory.retention.policy import (
     plan_deletions,
     too_old,
 )
-from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
+    from ros2_memory.retention.recorded_time import RecordedTime
     from ros2_memory.retention.topic_ages import TopicCutter
 
 MOST_AT_ONCE: Final = 2000
@@ -246,9 +246,7 @@ class GarbageCollector:
             self._cut_topics(contents, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
-            relative_recording(path, self._bag_dir)
-            for path in run.unshipped
-            if path not in run.saved
+            self._own.name_of(path) for path in run.unshipped if path not in run.saved
         )
         return result
 
@@ -266,9 +264,7 @@ class GarbageCollector:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
         contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self._bag_dir}{os.sep}"
-        names = {
-            bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in contents.bags
-        }
+        names = {bag.recording: self._own.name_of(bag.recording) for bag in contents.bags}
         since = self._recorded.since(names.values())
         doubtful = self._recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self._own.in_order())}
@@ -388,7 +384,7 @@ class GarbageCollector:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
-            name = relative_recording(bag.recording, self._bag_dir)
+            name = self._own.name_of(bag.recording)
             splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         if not self._unwritten:

@@ -112,14 +112,10 @@ class StoredBag(NamedTuple):
         return self._replace(start=at, end=at) if self.has_dates else self._replace(written=at)
 
     @property
-    def file(self) -> StoredFile:
-        """Its file."""
-        return StoredFile((self.device, self.inode), self.size)
-
-    @property
     def files(self) -> tuple[StoredFile, ...]:
         """All forms of it."""
-        return (self.file,) if self.second is None else (self.file, self.second)
+        first = StoredFile((self.device, self.inode), self.size)
+        return (first,) if self.second is None else (first, self.second)
 
 
 @dataclass(frozen=True, slots=True)
