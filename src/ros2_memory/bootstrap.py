@@ -40,7 +40,7 @@ from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, Observer, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
-from ros2_memory.recorder.base import Housekeeper, Recorder
+from ros2_memory.recorder.base import Recorder
 from ros2_memory.retention.policy import GB, RetentionLimits
 from ros2_memory.storage.base import BagReader
 
@@ -57,7 +57,9 @@ if TYPE_CHECKING:
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
+    from ros2_memory.recorder.background import Background
     from ros2_memory.recorder.days import MemoryDays
+    from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.retention.repair import Repairer
     from ros2_memory.retention.saved_moments import MomentKeeper
     from ros2_memory.retention.topic_ages import TopicCutter
@@ -164,14 +166,17 @@ def retention_limits(settings: Settings) -> RetentionLimits:
 
 
 def build_housekeeper(
-    settings: Settings, bag_dir: Path, reader: BagReader, own: OwnRecordings | None = None
-) -> Housekeeper:
+    settings: Settings,
+    bag_dir: Path,
+    reader: BagReader,
+    own: OwnRecordings,
+    background: Background,
+) -> Housekeeping:
     """Returns what repairs and deletes bags for the recorder; no other program may delete.
 
     `own` lists the recordings that were made in the bag directory.
     """
     from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
-    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.recorder.time_sync import is_synchronised
     from ros2_memory.storage.mcap.writer import McapWriter
@@ -181,7 +186,6 @@ def build_housekeeper(
     moments_bytes = round(min(retention.max_moments_gb, retention.max_total_gb / 2) * GB)
     rules = rules_of(settings, moments_bytes)
     bags, writer = BagDirReader(reader), McapWriter(settings.reader.max_chunk_mb)
-    own = own or OwnRecordings(bag_dir)
     return Housekeeping(
         bag_dir,
         bags,
@@ -191,6 +195,7 @@ def build_housekeeper(
         is_synchronised=is_synchronised,
         split_duration_s=settings.recording.split_duration_s,
         own=own,
+        background=background,
         moments_bytes=moments_bytes,
         rule_bytes={rule.name: rule.max_bytes for rule in rules},
         watch=_watch_of(settings, bag_dir, bags, own, rules) if rules else None,

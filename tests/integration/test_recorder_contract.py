@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import ConfigError, RecorderError
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.null import NullRecorder
 from ros2_memory.recorder.ros2bag import Ros2BagRecorder
 from ros2_memory.storage.mcap_reader import McapReader
 from tests.support import stub_ros2
 from tests.support.processes import until
+from tests.support.simulated_recorders import PlayedHousekeeper
 
 if TYPE_CHECKING:
     from ros2_memory.recorder.base import Recorder
@@ -39,6 +42,12 @@ def ros2bag(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Ros2BagRecorder:
         latched_topics=("/tf_static",),
         repeat_latched=(),
         chunk_bytes=16384,
+        required=(),
+        housekeeper=PlayedHousekeeper(),
+        own=OwnRecordings(folder / "bags"),
+        keep_open=(),
+        excluding={},
+        background=Background(),
     )
 
 

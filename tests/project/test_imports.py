@@ -107,7 +107,11 @@ def test_the_recorder_imports_nothing_that_answers(env: dict[str, str]) -> None:
         "from ros2_memory import bootstrap, config\n"
         "settings = config.load_settings()\n"
         "reader = bootstrap.build_reader(settings)\n"
-        "bootstrap.build_housekeeper(settings, settings.recording.bag_dir, reader)\n"
+        "from ros2_memory.bag_dir.own_recordings import OwnRecordings\n"
+        "bag_dir = settings.recording.bag_dir\n"
+        "from ros2_memory.recorder.background import Background\n"
+        "own = OwnRecordings(bag_dir)\n"
+        "bootstrap.build_housekeeper(settings, bag_dir, reader, own, Background())\n"
         "seen()\n"
     )
     ((*there,),) = imported(program, env)

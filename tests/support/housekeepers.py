@@ -89,6 +89,7 @@ def keeper_of(
         ),
         is_synchronised=is_synchronised,
         split_duration_s=10.0,
+        own=OwnRecordings(bag_dir),
         moments_bytes=moments_bytes,
         screening=screening,
         static_topics=("/tf_static",),

@@ -22,7 +22,7 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import NS_PER_S, Clock
 from ros2_memory.recorder.background import Background
-from ros2_memory.recorder.base import Housekeeper, HouseStatus
+from ros2_memory.recorder.housekeeping import Housekeeping, HouseStatus
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.topics import TopicsFile
 from ros2_memory.recorder.reception import Reception
@@ -159,7 +159,7 @@ class World:
         self,
         bag_dir: Path,
         *,
-        housekeeper: Housekeeper | None = None,
+        housekeeper: Housekeeping | None = None,
         expected: Sequence[str] = (),
         required: Sequence[Required] = (),
         keep_alive: Callable[[], None] | None = None,
@@ -207,7 +207,7 @@ class World:
         )
         self.supervisor = Supervisor(
             self.orders,
-            housekeeper or Housekeeper(),
+            housekeeper or PlayedHousekeeper(),
             monotonic=lambda: self.mono,
             free_bytes_of=self._free_bytes,
             device=lambda _directory: self.device,
@@ -300,7 +300,7 @@ def assert_each_counts_once(world: World) -> None:
     assert len(stands) == (max(stands) - min(stands)) // PERIOD + 1
 
 
-class PlayedHousekeeper(Housekeeper):
+class PlayedHousekeeper(Housekeeping):
     """Records what it is asked for, and frees what the test sets."""
 
     def __init__(self) -> None:
@@ -309,7 +309,6 @@ class PlayedHousekeeper(Housekeeper):
         self.frees_to = 0
         self.making = False
         self.moments_kept = 0
-        self.failed: dict[str, str] = {}
         self.recorded: list[tuple[tuple[str, ...], int, float]] = []
         self.held: str | None = None
         self.restarts: list[tuple[int, str]] = []
@@ -339,5 +338,14 @@ class PlayedHousekeeper(Housekeeper):
     def status(self) -> HouseStatus:
         return HouseStatus(age_held=self.held)
 
-    def faults(self) -> dict[str, str]:
-        return self.failed
+    def announce(self, recording: str) -> None:
+        """Nothing is excluded."""
+
+    def screen(self, live: Collection[str]) -> None:
+        """Nothing is excluded."""
+
+    def finish(self) -> None:
+        """Nothing is under way."""
+
+    def excluded_latched(self) -> frozenset[str]:
+        return frozenset()

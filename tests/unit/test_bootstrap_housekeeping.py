@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader
 from ros2_memory.config import load_settings
 from ros2_memory.core.timebase import NS_PER_S, WallClock
-from ros2_memory.recorder.housekeeping import Housekeeping
+from ros2_memory.recorder.background import Background
 from tests.support.bags import odom, write_mcap
 from tests.support.housekeepers import files_in
 
@@ -23,8 +24,9 @@ def kept(bag_dir: Path, *overrides: str) -> list[str]:
         at = now - ago * 3600 * NS_PER_S - NS_PER_S
         write_mcap(bag_dir / "rec" / f"h{ago}.mcap", [odom(at - n, 1.0, 2.0) for n in range(9)])
     settings = load_settings(overrides, {"MEMORY_BAG_DIR": str(bag_dir)})
-    keeper = build_housekeeper(settings, bag_dir, build_reader(settings))
-    assert isinstance(keeper, Housekeeping)
+    keeper = build_housekeeper(
+        settings, bag_dir, build_reader(settings), OwnRecordings(bag_dir), Background()
+    )
     keeper.apply()
     keeper.wait()
     return files_in(bag_dir)

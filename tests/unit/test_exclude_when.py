@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Final
 
 import pytest
 
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bootstrap import build_housekeeper, build_reader, exclusions_of, query_settings_of
 from ros2_memory.config import load_settings
 from ros2_memory.core.errors import ConfigError
+from ros2_memory.recorder.background import Background
 
 if TYPE_CHECKING:
     from ros2_memory.triggers.exclusion import ExclusionRule
@@ -97,7 +99,9 @@ def test_a_recording_of_too_many_splits_is_refused(tmp_path: Path) -> None:
 
 def test_without_rules_nothing_is_announced(tmp_path: Path) -> None:
     settings = load_settings([f"recording.bag_dir={tmp_path}"])
-    house = build_housekeeper(settings, tmp_path, build_reader(settings))
+    house = build_housekeeper(
+        settings, tmp_path, build_reader(settings), OwnRecordings(tmp_path), Background()
+    )
     house.announce("rec_20261120T080000Z")
     house.screen(())
     house.finish()

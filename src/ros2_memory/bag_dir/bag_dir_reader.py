@@ -248,10 +248,7 @@ class BagDirReader(BagReader):
         # Excluded messages lie in few chunks: only these are read, but for listed ones.
         windows = [span]
         if topic.topic not in rule.elsewhere:
-            excluded = [
-                span.intersect(TimeWindow(exclusion.log_from, exclusion.log_until))
-                for exclusion in rule.exclusions
-            ]
+            excluded = (span.intersect(exclusion.logged) for exclusion in rule.exclusions)
             spans = united((window.start, window.stop) for window in excluded)
             windows = [TimeWindow(start, stop) for start, stop in spans]
         lost = sum(

@@ -41,13 +41,13 @@ from ros2_memory.bag_dir.durable_write import read_small_file, write_all_durably
 from ros2_memory.bag_dir.json_files import Int64, parsed
 from ros2_memory.bag_dir.layout import HANDOVER_FILE
 from ros2_memory.core.errors import RecorderError
+from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping
     from pathlib import Path
 
-    from ros2_memory.core.model import TimeWindow
     from ros2_memory.storage.base import Record
 
 FORMAT: Final = 1
@@ -142,10 +142,11 @@ class Handover:
         )
         return tuple(
             Exclusion(
-                start,
-                stop,
-                MIN_NS if overlap.log_from is None else overlap.log_from,
-                MAX_NS if overlap.log_until is None else overlap.log_until,
+                TimeWindow(start, stop),
+                TimeWindow(
+                    MIN_NS if overlap.log_from is None else overlap.log_from,
+                    MAX_NS if overlap.log_until is None else overlap.log_until,
+                ),
             )
             for overlap, start, stop in sides
             if overlap and start is not None and stop is not None and file_name in overlap.files
@@ -165,25 +166,21 @@ _HANDOVER: Final = TypeAdapter(Handover)
 
 
 class Exclusion(NamedTuple):
-    """Messages of one file that count in another recording; both windows are half-open."""
+    """Messages of one file that count in another recording, by both of their times."""
 
-    publish_from: Ns
-    publish_until: Ns
-    log_from: Ns
-    log_until: Ns
+    published: TimeWindow
+    logged: TimeWindow
 
     def excludes(self, publish_time: Ns, log_time: Ns) -> bool:
         """Returns whether a message with these times counts in another recording.
 
         A publish time of 0 means none: then the cut is by log time.
         """
-        return (
-            self.publish_from <= (publish_time or log_time) < self.publish_until
-            and self.log_from <= log_time < self.log_until
-        )
+        is_published = self.published.contains(publish_time or log_time)
+        return is_published and self.logged.contains(log_time)
 
 
-_EVERYTHING: Final = Exclusion(MIN_NS, MAX_NS, MIN_NS, MAX_NS)
+_EVERYTHING: Final = Exclusion(TimeWindow.everything(), TimeWindow.everything())
 
 
 def message_id(publish_time: Ns, payload: bytes) -> str:
@@ -224,8 +221,7 @@ class FileRule(NamedTuple):
     def touches(self, window: TimeWindow, topics: Collection[str]) -> bool:
         """Returns whether some message of the topics with log time in a window may not count."""
         return any(topic in self.elsewhere for topic in topics) or any(
-            exclusion.log_from < window.stop and window.start < exclusion.log_until
-            for exclusion in self.exclusions
+            not window.intersect(exclusion.logged).empty for exclusion in self.exclusions
         )
 
 

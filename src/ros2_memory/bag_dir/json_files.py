@@ -24,7 +24,6 @@ from typing import (
     Generic,
     NamedTuple,
     TypeAlias,
-    TypeGuard,
     TypeVar,
 )
 from zlib import crc32
@@ -43,7 +42,7 @@ from ros2_memory.core import directories
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Iterable, Iterator
     from pathlib import Path
 
 _T = TypeVar("_T")
@@ -334,20 +333,3 @@ def _require_check(line: bytes) -> None:
     """Raises ValueError where a line has no check, or that fails."""
     if line != _with_check(line.rpartition(_CHECK)[0]):
         raise ValueError("its check (crc32) is missing or fails: it is damaged, or was edited")
-
-
-def is_integer(value: object) -> TypeGuard[int]:
-    """Returns whether a value is an integer of 64 bits; a boolean is not one."""
-    return isinstance(value, int) and not isinstance(value, bool) and MIN_NS <= value <= MAX_NS
-
-
-def integer(fields: Mapping[object, object], key: str) -> int:
-    """Returns the integer under a key.
-
-    Raises:
-        ValueError: the value is not an integer of 64 bits.
-    """
-    value = fields.get(key)
-    if not is_integer(value):
-        raise ValueError(f"{key} must be an integer of 64 bits")
-    return value

@@ -29,10 +29,12 @@ from __future__ import annotations
 
 import re
 import stat
+from contextlib import suppress
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.heartbeat import HEARTBEAT_FILE
+from ros2_memory.bag_dir.json_files import state_path
 from ros2_memory.core.directories import mode_of
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.model import BAG_KINDS, COMPRESSED
@@ -87,15 +89,11 @@ def has_recorded(bag_dir: Path) -> bool:
 
     Only there is anything written beside bags. Nothing behind a link counts.
     """
-    return any(_is_file(bag_dir / name) for name in (HEARTBEAT_FILE, LIST_FILE))
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        here = stat.S_ISREG(path.lstat().st_mode)
-        return here and not path.parent.is_symlink() if path.parent.name == OWN_FOLDER else here
-    except OSError:
-        return False
+    for name in (HEARTBEAT_FILE, LIST_FILE):
+        with suppress(OSError):
+            if stat.S_ISREG(state_path(bag_dir, name).lstat().st_mode):
+                return True
+    return False
 
 
 def is_carried(bag: Path | str) -> bool:
@@ -107,6 +105,11 @@ def is_thinned(bag: Path | str) -> bool:
     """Returns whether a bag is a day of `memory/`: what stays of others that were deleted."""
     folder, _, name = f"/{bag}".rpartition("/")
     return folder.endswith(f"/{MEMORY_FOLDER}") and _DAY_FILE.fullmatch(name) is not None
+
+
+def is_derived(bag: Path | str) -> bool:
+    """Returns whether a bag holds messages of other bags: carried ones, or what stays of a day."""
+    return is_carried(bag) or is_thinned(bag)
 
 
 def utc_day(at: Ns) -> str:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.bag_dir.durable_write import is_open_file
 from ros2_memory.bag_dir.heartbeat import runs
-from ros2_memory.bag_dir.json_files import is_integer
 from ros2_memory.bag_dir.layout import LOCK_FILE
 from ros2_memory.core.errors import RecorderError
 
@@ -145,4 +144,4 @@ def read_holder(descriptor: int) -> tuple[int | None, str | None]:
         return None, None
     fields: dict[object, object] = value if isinstance(value, dict) else {}
     pid, host = fields.get("pid"), fields.get("host")
-    return (pid, host) if is_integer(pid) and isinstance(host, str) else (None, None)
+    return (pid, host) if isinstance(pid, int) and isinstance(host, str) else (None, None)

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import yaml
 
 from ros2_memory.bag_dir.durable_write import open_plain, read_small_file, write_durably
-from ros2_memory.bag_dir.json_files import integer
 from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind, bags_in, split_number
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.model import COMPRESSED
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.bag_summary import BagSummary
     from ros2_memory.storage.base import BagReader, Channel
-
-    Counts = Mapping[str, int]
 
 _MAX_BYTES: Final = 64 << 20
 _STORAGES: Final = {"mcap": ".mcap", "sqlite3": ".db3"}
@@ -179,8 +176,8 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     kind += COMPRESSED if info.get("compression_mode") == "FILE" else ""
     if any(bag_kind(name) != kind for name in files):
         raise ValueError("the files are not of the storage and compression that it states")
-    version = integer(info, "version")
-    if version < _FIRST_OF_FILES:
+    version = info.get("version")
+    if not isinstance(version, int) or version < _FIRST_OF_FILES:
         raise ValueError(f"it is of version {version}, which lists no messages of files")
     counts = Counter[tuple[str, str]]()
     for summary, _ in files.values():
@@ -189,7 +186,7 @@ def describing(text: str, files: Mapping[str, Contents]) -> str:
     info["message_count"] = counts.total()
     _set_files(info, files)
     _set_topics(info, channels, counts, version)
-    return _dumped(content)
+    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
 
 
 def _set_files(info: dict[object, object], files: Mapping[str, Contents]) -> None:
@@ -222,10 +219,10 @@ def _set_topics(
     version: int,
 ) -> None:
     """Sets the count of each topic, by name and type, and its QoS where no channel has that."""
-    topics = _mappings(info, "topics_with_message_count")
+    topics = [_mapping(item, "topics") for item in _list(info, "topics_with_message_count")]
     listed = set()
     for topic in topics:
-        topic_metadata = _described(topic)
+        topic_metadata = _mapping(topic.get("topic_metadata"), "topic_metadata")
         key = str(topic_metadata.get("name")), str(topic_metadata.get("type"))
         listed.add(key)
         topic["message_count"] = counts[key]
@@ -238,7 +235,15 @@ def _set_topics(
         key = channel.topic, channel.type
         if key not in listed:
             listed.add(key)
-            new = _topic_metadata(channel, version)
+            new: dict[object, object] = {
+                "name": channel.topic,
+                "type": channel.type,
+                "serialization_format": channel.encoding,
+                "offered_qos_profiles": _offered(channel, version),
+            }
+            if version >= _FIRST_OF_TYPE_HASHES:
+                type_hash = dict(channel.metadata).get("topic_type_hash", "")
+                new["type_description_hash"] = type_hash
             topics.append({"topic_metadata": new, "message_count": counts[key]})
     info["topics_with_message_count"] = topics
 
@@ -265,19 +270,6 @@ def _new_information(channels: Sequence[Channel]) -> dict[str, object]:
     }
 
 
-def _topic_metadata(channel: Channel, version: int) -> dict[str, object]:
-    topic_metadata: dict[str, object] = {
-        "name": channel.topic,
-        "type": channel.type,
-        "serialization_format": channel.encoding,
-        "offered_qos_profiles": _offered(channel, version),
-    }
-    if version >= _FIRST_OF_TYPE_HASHES:
-        type_hash = dict(channel.metadata).get("topic_type_hash", "")
-        topic_metadata["type_description_hash"] = type_hash
-    return topic_metadata
-
-
 def _offered(channel: Channel, version: int) -> object:
     """Returns the QoS profiles as this version has them: as a list, before version 9 as text."""
     text = _qos(channel)
@@ -286,41 +278,6 @@ def _offered(channel: Channel, version: int) -> object:
 
 def _qos(channel: Channel) -> str:
     return dict(channel.metadata).get("offered_qos_profiles", "")
-
-
-def recounted(text: str, left: Mapping[str, Counts]) -> str:
-    """Returns the text of a metadata.yaml, as rosbag2 embeds it in a file, with other counts.
-
-    Times stay as they are. Files that retention deleted are listed, and their messages are counted
-    by topic with all others: then no topic has more than it is known to have had.
-
-    Args:
-        text: the old one; returned as it is where it is of no known form.
-        left: by name, the messages of each topic that each file of the recording holds now.
-    """
-    try:
-        content = _parse(text)
-        info = _mapping(content, "it")
-        info = _mapping(info.get(_ROOT, info), _ROOT)
-        files = _mappings(info, "files")
-        topics = _mappings(info, "topics_with_message_count")
-        counts, others = Counter[str](), 0
-        for file in files:
-            count = integer(file, "message_count")
-            # None, where rosbag2 wrote it before the first message.
-            counts_of_file = left.get(bare_name(file.get("path"))) if count else {}
-            if counts_of_file is None:
-                others += count
-            else:
-                counts.update(counts_of_file)
-                file["message_count"] = min(count, sum(counts_of_file.values()))
-        for topic in topics:
-            name = str(_described(topic).get("name"))
-            topic["message_count"] = min(integer(topic, "message_count"), counts[name] + others)
-        info["message_count"] = sum(integer(file, "message_count") for file in files)
-    except ValueError:
-        return text
-    return _dumped(content)
 
 
 def bare_name(path: object) -> str:
@@ -359,16 +316,3 @@ def _list(fields: dict[object, object], key: str) -> list[object]:
     if not isinstance(value, list):
         raise ValueError(f"it has no list {key}")  # noqa: TRY004 - a value in a text
     return value
-
-
-def _mappings(fields: dict[object, object], key: str) -> list[dict[object, object]]:
-    """Returns the items of the list under a key, each of which must hold keys."""
-    return [_mapping(item, key.partition("_")[0]) for item in _list(fields, key)]
-
-
-def _described(topic: dict[object, object]) -> dict[object, object]:
-    return _mapping(topic.get("topic_metadata"), "topic_metadata")
-
-
-def _dumped(content: object) -> str:
-    return yaml.safe_dump(content, sort_keys=False, allow_unicode=True)

@@ -308,11 +308,10 @@ class PendingRequest:
 
     def withdraw(self) -> bool:
         """Withdraws the request; False where the recorder has begun with it, or answered."""
-        try:
+        with suppress(OSError):
             self._path("json").unlink()
-        except OSError:
-            return False
-        return True
+            return True
+        return False
 
     def close(self) -> None:
         """Deletes the answer."""
@@ -362,14 +361,6 @@ class RequestQueue:
                 yield request
         self._delete_left_over(names, now)
 
-    def answer(self, request: SaveRequest, outcome: Outcome) -> None:
-        """Writes the outcome of a request, and removes the request.
-
-        Raises:
-            OSError: it cannot be written.
-        """
-        self._write_outcome(request.number, outcome)
-
     def _claim(self, name: str, now: Ns) -> SaveRequest | None:
         number = name.partition(".")[0]
         path = self._folder / f"{number}.taken"
@@ -384,10 +375,15 @@ class RequestQueue:
             _log.warning("request_ignored", path=str(path), reason=str(error))
             refused = f"the recorder cannot read the request: {error}"
             with suppress(OSError):
-                self._write_outcome(number, Outcome(refused=refused))
+                self.answer(number, Outcome(refused=refused))
             return None
 
-    def _write_outcome(self, number: str, outcome: Outcome) -> None:
+    def answer(self, number: str, outcome: Outcome) -> None:
+        """Writes the outcome of a request, and removes the request.
+
+        Raises:
+            OSError: it cannot be written.
+        """
         text = json.dumps({"format": FORMAT, **asdict(outcome)})
         write_durably(self._folder / f"{number}.answer", text, mode=READABLE)
         with suppress(OSError):

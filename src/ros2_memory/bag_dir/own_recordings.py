@@ -244,7 +244,7 @@ class OwnRecordings:
         return row is not None and row.lists(identity)
 
     def name_of(self, directory: Path | str) -> str:
-        """Returns the name of a directory in the list; empty where it lies elsewhere."""
+        """Returns a path relative to the bag directory; empty where it lies elsewhere."""
         root, path = f"{self._bag_dir}/", str(directory)
         return path.removeprefix(root) if path.startswith(root) else ""
 

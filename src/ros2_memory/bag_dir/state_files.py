@@ -118,18 +118,7 @@ class Loss:
     start: Int64
     stop: Int64
     lost: Count
-    by: Literal[
-        "counter",
-        "stamps",
-        "rosbag2",
-        "refused",
-        "forgotten",
-        "expired",
-        "died",
-        "hung",
-        "unclean",
-        "paused",
-    ]
+    by: Literal["counter", "stamps", "rosbag2", "refused", "forgotten", "expired"] | Interruption
 
 
 LOST: Final = JsonLog(LOST_FILE, Loss, most_bytes=2 * MOST_LOST_BYTES)

@@ -10,7 +10,7 @@ from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import LONGEST_OFF_NS
-from ros2_memory.bag_dir.layout import is_carried, is_thinned
+from ros2_memory.bag_dir.layout import is_derived, is_thinned
 from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import NoDataError, NoDataReason, NotInLakeError, UndecodableError
 from ros2_memory.core.model import TimeWindow
@@ -466,7 +466,7 @@ def _only_elsewhere(view: View, topics: tuple[str, ...], window: TimeWindow) -> 
     names: dict[str, None] = {}
     held: set[str] = set()
     for bag in timeline.overlapping(window):
-        if is_carried(bag.file) or is_thinned(bag.file):
+        if is_derived(bag.file):
             continue
         held.update(bag.summary.schema.positions)
         if is_named_after_folder(bag.file) or str(bag.recording) in whole:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_carried, is_thinned
+from ros2_memory.bag_dir.layout import MEMORY_FOLDER, is_derived, is_thinned
 from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
@@ -163,7 +163,7 @@ class Timeline:
         if not days:
             return days
         around = self.overlapping(TimeWindow(days[0][0], days[-1][1]))
-        whole = [bag for bag in around if not is_thinned(bag.file) and not is_carried(bag.file)]
+        whole = [bag for bag in around if not is_derived(bag.file)]
         # Between the bags of a moment nothing is missing.
         return without(days, united([(bag.start, bag.end + 1) for bag in whole], NS_PER_S))
 

@@ -22,8 +22,7 @@ from ros2_memory.bag_dir.layout import (
     FORGOTTEN_FILE,
     MOMENTS_FOLDER,
     has_recorded,
-    is_carried,
-    is_thinned,
+    is_derived,
 )
 from ros2_memory.bag_dir.state_files import (
     Receipt,
@@ -435,7 +434,7 @@ class RobotBags:
         closed = [
             bag
             for bag in snapshot.bags
-            if bag.state is BagState.CLOSED and not (is_carried(bag.path) or is_thinned(bag.path))
+            if bag.state is BagState.CLOSED and not is_derived(bag.path)
         ]
         bags = [bag for bag in closed if is_settled(bag, self.bag_dir, now)]
         open_bags = [bag for bag in snapshot.bags if bag.state is BagState.INCOMPLETE]

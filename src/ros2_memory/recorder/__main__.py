@@ -34,6 +34,7 @@ from ros2_memory.core.errors import ConfigError, EpisodicError
 from ros2_memory.core.logging_setup import configure_logging, get_logger
 from ros2_memory.core.malloc import return_large_at_once, share_one_arena
 from ros2_memory.core.sd_notify import READY, STOPPING, notify
+from ros2_memory.recorder.background import Background
 from ros2_memory.recorder.process.topics import load_topics
 from ros2_memory.recorder.supervisor import make_bag_dir
 from ros2_memory.retention.clear import clear_bags, refuse_homes
@@ -108,7 +109,8 @@ def _record(settings: Settings) -> None:
     reader = build_reader(settings, cache_mb=CACHE_MB)
     reader = BagDirReader(reader, bag_dir, every_message=True)
     own = OwnRecordings(bag_dir)
-    housekeeper = build_housekeeper(settings, bag_dir, reader, own)
+    background = Background()
+    housekeeper = build_housekeeper(settings, bag_dir, reader, own, background)
     clear = settings.recording.clear_on_startup
     if clear:
         refuse_homes(bag_dir)
@@ -120,6 +122,7 @@ def _record(settings: Settings) -> None:
             reader=reader,
             housekeeper=housekeeper,
             own=own,
+            background=background,
             keep_open=(lock.descriptor,),
             excluding={
                 rule.topic: f"the rule {rule.name!r} of recording.exclude_when"

@@ -402,7 +402,8 @@ class MemoryDays:
         groups = undecoded(self._reader, path, skip_undecodable=True)
         for group in or_errors(groups):
             if isinstance(group, BagError):
-                self._raise_if_transient(path, group)
+                if self._failing.may_recover(path, group):
+                    raise group
                 _log.warning("memory_not_read", path=str(path), reason=group.reason)
             else:
                 yield from group.tables()
@@ -410,15 +411,10 @@ class MemoryDays:
     def _readable_records(self, path: Path, topics: Sequence[str]) -> Iterator[Record]:
         """Yields the messages of a bag that can be read; raises as `_tables` does."""
         for record in or_errors(self._reader.records(path, topics, _EVERYTHING)):
-            if isinstance(record, BagError):
-                self._raise_if_transient(path, record)
-            else:
+            if not isinstance(record, BagError):
                 yield record
-
-    def _raise_if_transient(self, path: Path, error: BagError) -> None:
-        """Raises an error of the disk again while the disk may recover."""
-        if self._failing.may_recover(path, error):
-            raise error
+            elif self._failing.may_recover(path, record):
+                raise record
 
     def _without_people(self, record: Record, *, rounds: bool) -> Record | None:
         """Returns a message without people whose label may not stay, maybe with rounded numbers.

@@ -219,7 +219,7 @@ class HandoverTransfer:
             return Step.ABANDON
         is_ready = self._marked and self.new.is_recording
         age_s = now.monotonic_s - self._began.monotonic_s
-        if self.missing and age_s < self._orders.subscribe_timeout_s:
+        if self.missing and age_s < SUBSCRIBE_TIMEOUT_S:
             # Also if a publisher appears while both run: what it sends before the new recorder has
             # subscribed is in the old recording alone, and must not lie after the cut.
             self._both_since = None
@@ -461,8 +461,8 @@ class _Side(NamedTuple):
         """Yields between which log times the cut may hide messages, both included."""
         for name, bag in self.bags.items():
             rule = self.cut.rule(name)
-            for _, _, log_from, log_until in () if rule is None else rule.exclusions:
-                span = max(bag.start, log_from), min(bag.end, log_until)
+            for _, logged in () if rule is None else rule.exclusions:
+                span = max(bag.start, logged.start), min(bag.end, logged.stop)
                 if span[0] <= span[1]:
                     yield span
 

@@ -10,12 +10,11 @@ import time
 from contextlib import suppress
 from functools import partial
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.heartbeat import RecorderState, read_heartbeat
 from ros2_memory.bag_dir.layout import has_own_name
 from ros2_memory.bag_dir.moment_file import HardLinks
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import EVERY_TOPIC, Interruption, Loss, append_losses
 from ros2_memory.core.directories import is_folder
 from ros2_memory.core.errors import BagError, BagVanishedError, EpisodicError
@@ -24,8 +23,6 @@ from ros2_memory.core.model import BagState
 from ros2_memory.core.text import MAX_NAMED, counted, listed
 from ros2_memory.core.timebase import NS_PER_S, Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.file_state import HELD_BACK
-from ros2_memory.recorder.background import Background
-from ros2_memory.recorder.base import Housekeeper, HouseStatus
 from ros2_memory.recorder.index_manager import SPLITS_OF_PATIENCE, IndexManager
 from ros2_memory.retention.clear import remove_if_empty
 from ros2_memory.retention.collect import Collected, GarbageCollector, Outliving
@@ -41,7 +38,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping
     from pathlib import Path
 
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.index.snapshot import Snapshot
+    from ros2_memory.recorder.background import Background
     from ros2_memory.retention.policy import RetentionLimits
     from ros2_memory.retention.topic_ages import TopicCutter
     from ros2_memory.storage.base import BagReader, BagWriter
@@ -60,12 +59,33 @@ _WRITTEN_AT_ONCE: Final = 2
 _log = get_logger(__name__)
 
 
-class Housekeeping(Housekeeper):
+class HouseStatus(NamedTuple):
+    """What the heartbeat shows of a housekeeper's work, under the same names.
+
+    Attributes:
+        age_held: describes the bags that are kept although their dates make them too old, or None.
+        unshipped: describes the bags that were deleted before they were shipped, as they had to be,
+            or None.
+        counted_bytes: the bytes that the budget counts; None before the first pass.
+        state_bytes: those of them that are no recording.
+        held_back: describes the splits that are not served for a fault, or None.
+        failing_rules: each rule of `recording.exclude_when` that cannot be evaluated.
+    """
+
+    age_held: str | None = None
+    unshipped: str | None = None
+    counted_bytes: int | None = None
+    state_bytes: int = 0
+    held_back: str | None = None
+    failing_rules: tuple[str, ...] = ()
+
+
+class Housekeeping:
     """Repairs and deletes in one bag directory, which its caller has locked.
 
-    What takes a while is done in the background: the first scan of a week of bags takes from
-    seconds to minutes, in which the recorder must continue. What is still under way is not begun
-    again.
+    The recorder calls it between two ticks, so a call returns at once. What takes a while is done
+    in the background: the first scan of a week of bags takes from seconds to minutes. What is still
+    under way is not begun again.
 
     Args:
         bag_dir: the bag directory.
@@ -87,7 +107,7 @@ class Housekeeping(Housekeeper):
         monotonic: a clock that never steps, in seconds.
         memory: what stays of deleted bags, or deletes what stayed; None where there is neither.
         cutter: cuts topics with a shorter life out of bags that stay; None where none has one.
-        background: runs what takes a while.
+        background: runs what takes a while, of the recorder, too.
     """
 
     def __init__(
@@ -100,7 +120,7 @@ class Housekeeping(Housekeeper):
         *,
         is_synchronised: Callable[[], bool],
         split_duration_s: float,
-        own: OwnRecordings | None = None,
+        own: OwnRecordings,
         moments_bytes: int = 0,
         rule_bytes: Mapping[str, int] = MappingProxyType({}),
         watch: Callable[[MomentKeeper], Triggers] | None = None,
@@ -111,12 +131,12 @@ class Housekeeping(Housekeeper):
         monotonic: Callable[[], float] = time.monotonic,
         memory: Outliving | None = None,
         cutter: TopicCutter | None = None,
-        background: Background | None = None,
+        background: Background,
     ) -> None:
         self._bag_dir = bag_dir
-        self._background = background or Background()
+        self._background = background
         self._recorded = RecordedTime(bag_dir)
-        self._own = own or OwnRecordings(bag_dir)
+        self._own = own
         self._limits = limits
         self._collector = GarbageCollector(
             bag_dir,
@@ -202,12 +222,8 @@ class Housekeeping(Housekeeper):
         self._add_unless_under_way("apply", self._collect_and_repair)
 
     def keep_moments(self) -> None:
-        """Begins to save the moments that were asked for, or wait for bags."""
+        """Begins to save the moments that were asked for, or wait for bags; about once a second."""
         self._add_unless_under_way("keep_moments", self._save_moments)
-
-    def faults(self) -> Mapping[str, str]:
-        """Maps each task whose last run failed to the reason."""
-        return self._background.faults()
 
     def wait(self) -> None:
         """Waits until nothing is under way."""
@@ -254,7 +270,10 @@ class Housekeeping(Housekeeper):
                 self._triggers.look(snapshot)
 
     def note_restart(self, first: Ns, how: Interruption) -> None:
-        """Records that a recording ended unexpectedly, and another one begins."""
+        """Records that a recording ended unexpectedly, or was paused until now.
+
+        It last grew at the wall time `first`; `how` is a key of `INTERRUPTIONS`.
+        """
         now = self._clock.now()
         if self._triggers is not None and how != "paused":
             self._triggers.note_restart(now, now)
@@ -285,7 +304,10 @@ class Housekeeping(Housekeeper):
             self._screening.announce(recording)
 
     def screen(self, live: Collection[str]) -> None:
-        """Begins to screen closed splits."""
+        """Begins to screen closed splits; `live` are the recordings that are being written.
+
+        Called about every two seconds, from the thread that begins recordings.
+        """
         if self._screening is None or self._background.is_under_way("screen"):
             return
         # What is live is known now, and not when the thread begins.
@@ -320,7 +342,15 @@ class Housekeeping(Housekeeper):
     def note_recorded(
         self, recordings: Collection[str], bytes_written: int, monotonic_s: float
     ) -> None:
-        """Counts the time for which these recordings are written."""
+        """Counts recorded time, by which recordings age where the wall clock is wrong.
+
+        Called several times a second, with no recordings while nothing is recorded.
+
+        Args:
+            recordings: the directories being written, relative to the bag directory.
+            bytes_written: the bytes that all recordings wrote since the recorder started.
+            monotonic_s: the monotonic clock, in seconds.
+        """
         self._recorded.note(recordings, bytes_written, monotonic_s, self._clock.now())
 
     def _collect_and_report(self, free_bytes_wanted: int | None = None) -> Collected:

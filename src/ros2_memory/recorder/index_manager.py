@@ -16,30 +16,27 @@ from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-import structlog
-
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
+from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.core.timebase import Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.bag_table import BagTable, KnownBags, TableChange
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
-from ros2_memory.index.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
     from pathlib import Path
 
-    from structlog.typing import FilteringBoundLogger
-
+    from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader
-
-__all__ = ["IndexManager", "Snapshot"]
 
 SPLITS_OF_PATIENCE: Final = 3
 """A file unchanged for so many splits is not being written, unless a heartbeat names it."""
+
+_log = get_logger(__name__)
 
 
 class IndexManager:
@@ -91,7 +88,6 @@ class IndexManager:
         self._clock = clock
         self._refresh: Ns = ns_from_unix(refresh_s)
         self._three_splits: Ns = ns_from_unix(SPLITS_OF_PATIENCE * split_duration_s)
-        self._log: FilteringBoundLogger = structlog.get_logger()
         self._lock = threading.Lock()
         self.published: Snapshot | None = None
         self._new_table = partial(
@@ -211,15 +207,15 @@ class IndexManager:
         reported_before = set() if before is None else set(before.damaged)
         for aside in after.damaged:
             if aside not in reported_before:
-                self._log.warning("bag_damaged", path=str(aside.path), reason=aside.reason)
+                _log.warning("bag_damaged", path=str(aside.path), reason=aside.reason)
         # A file that grows and answers is read again with every query: not worth a line each time.
         grew = removed and all(bag.state is BagState.ACTIVE for bag in (*removed, *added))
         changed = before is None or _logged_figures(before) != _logged_figures(after)
         if after.problem is not None and (before is None or before.problem != after.problem):
-            self._log.warning(
+            _log.warning(
                 "bag_directory_not_read", reason=after.problem, bag_dir=str(self.bag_dir.absolute())
             )
-        (self._log.info if changed and not grew else self._log.debug)(
+        (_log.info if changed and not grew else _log.debug)(
             "index_scanned",
             bag_dir=str(self.bag_dir),
             bags=len(after.bags),

@@ -12,12 +12,10 @@ from ros2_memory.bag_dir.layout import (
     STORAGE_FILE,
     node_name,
 )
-from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.timebase import WallClock
-from ros2_memory.recorder.background import Background
-from ros2_memory.recorder.base import Housekeeper, Recorder
+from ros2_memory.recorder.base import Recorder
 from ros2_memory.recorder.process.child import Child
 from ros2_memory.recorder.process.command import SERVICES, record_argv, storage_config
 from ros2_memory.recorder.process.installation import (
@@ -35,6 +33,9 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
     from pathlib import Path
 
+    from ros2_memory.bag_dir.own_recordings import OwnRecordings
+    from ros2_memory.recorder.background import Background
+    from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.storage.base import BagReader
 
 __all__ = ["Ros2BagRecorder", "record_argv"]
@@ -65,10 +66,11 @@ class Ros2BagRecorder(Recorder):
         required: topics without which recording counts as failed: a name or a glob in `topic`, and
             in `min_hz` the least messages a second.
         chunk_bytes: size of an MCAP chunk before compression.
-        housekeeper: repairs and deletes; nothing does where None.
+        housekeeper: repairs and deletes.
         own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
         excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
+        background: does what takes a while, of the housekeeper, too.
     """
 
     def __init__(
@@ -85,12 +87,13 @@ class Ros2BagRecorder(Recorder):
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
         repeat_latched: Sequence[str],
-        required: Sequence[Mapping[str, str | float]] = (),
+        required: Sequence[Mapping[str, str | float]],
         chunk_bytes: int,
-        housekeeper: Housekeeper | None = None,
-        own: OwnRecordings | None = None,
-        keep_open: Collection[int] = (),
-        excluding: Mapping[str, str] | None = None,
+        housekeeper: Housekeeping,
+        own: OwnRecordings,
+        keep_open: Collection[int],
+        excluding: Mapping[str, str],
+        background: Background,
     ) -> None:
         self._bag_dir = bag_dir.absolute()
         self._split_duration_s = split_duration_s
@@ -99,15 +102,12 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._checked = False
-        by_setting = {
-            str(entry["topic"]): "recording.required"
-            for entry in required
-            if "*" not in str(entry["topic"])
-        }
-        self._topics = TopicsFile(topics_file, {**by_setting, **(excluding or {})})
+        wanted = [Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required]
+        topics = (entry.topic for entry in wanted if "*" not in entry.topic)
+        by_setting = dict.fromkeys(topics, "recording.required")
+        self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
         self._ros = Installation("ros2", {}, frozenset())
         self._queue_bytes = queue_mb * 2**20
-        background = Background()
         self._reception = Reception(
             reader,
             self._queue_bytes,
@@ -126,14 +126,14 @@ class Ros2BagRecorder(Recorder):
             reader=reader,
             clock=WallClock(),
             topics=self._topics,
-            own=own or OwnRecordings(self._bag_dir),
+            own=own,
             reception=self._reception,
             background=background,
-            required=[Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required],
+            required=wanted,
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )
-        self._supervisor = Supervisor(self._orders, housekeeper or Housekeeper())
+        self._supervisor = Supervisor(self._orders, housekeeper)
 
     def check(self) -> None:
         """Makes the environment of `ros2` and reads its options from its help."""

@@ -16,7 +16,6 @@ from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.text import counted
 from ros2_memory.recorder.handover import (
     READY_TIMEOUT_S,
-    SUBSCRIBE_TIMEOUT_S,
     HandoverTransfer,
     Step,
     give_up,
@@ -69,7 +68,6 @@ class Orders:
         required: the topics without which recording counts as failed.
         simulated: log times come from a simulated clock.
         advice: says what to do where publishers are subscribed to and not heard.
-        subscribe_timeout_s: how long a handover waits for topics (see `handover`).
     """
 
     bag_dir: Path
@@ -86,7 +84,6 @@ class Orders:
     required: Sequence[Required] = ()
     simulated: bool = False
     advice: Callable[[], str] = str
-    subscribe_timeout_s: float = SUBSCRIBE_TIMEOUT_S
 
 
 SETTLE_S: Final = 5.0

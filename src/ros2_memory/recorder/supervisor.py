@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.bag_dir.state_files import Interruption
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.recorder.base import Housekeeper
+    from ros2_memory.recorder.housekeeping import Housekeeping
 
 HEARTBEAT_S: Final = 5.0
 """How often `recorder.json` is written."""
@@ -78,7 +78,7 @@ class Supervisor:
     def __init__(
         self,
         orders: Orders,
-        housekeeper: Housekeeper,
+        housekeeper: Housekeeping,
         *,
         monotonic: Callable[[], float] = time.monotonic,
         free_bytes_of: Callable[[Path], int] = free_bytes,
@@ -176,6 +176,7 @@ class Supervisor:
         self._write_heartbeat(RecorderState.STOPPED)
 
     def _run_tasks(self, now: ClockReading) -> None:
+        background = self._orders.background
         # The names are those of the documented log event. How often each is due, in seconds, and
         # whether it needs the disk of the bag directory.
         tasks: tuple[tuple[str, float, bool, Callable[[ClockReading], object]], ...] = (
@@ -191,7 +192,7 @@ class Supervisor:
             ("interruptions", 0.0, True, self._report_interruptions),
             ("recorded", 0.0, False, self._note_recorded),
             ("settle", UNSETTLED_S, True, lambda _: self._sessions.recover()),
-            ("faults", 0.0, False, self._report_faults),
+            ("faults", 0.0, False, lambda _: self._events.report_faults(background.faults())),
             ("house", 0.0, True, self._apply_retention),
             ("moments", MOMENTS_S, True, lambda _: self._housekeeper.keep_moments()),
             ("screen", SCREENING_S, True, lambda _: self._housekeeper.screen(self._names())),
@@ -372,10 +373,6 @@ class Supervisor:
         self._housekeeper.note_recorded(
             () if self._disk.away else names, self._sessions.bytes_written, now.monotonic_s
         )
-
-    def _report_faults(self, _: ClockReading) -> None:
-        faults = {**self._housekeeper.faults(), **self._orders.background.faults()}
-        self._events.report_faults(faults)
 
     def _apply_retention(self, now: ClockReading) -> None:
         every_s = RETENTION_S if self._splits_closed else QUIET_RETENTION_S

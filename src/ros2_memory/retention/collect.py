@@ -8,7 +8,6 @@ bag. Meanwhile the next oldest bag is deleted instead; if there is none, the lim
 from __future__ import annotations
 
 import os
-import time
 from collections import defaultdict
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -20,7 +19,7 @@ from ros2_memory.bag_dir.state_files import Deleted, append_deleted, deleted_of,
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.retention.delete import remove_bag, remove_emptied
-from ros2_memory.retention.disk import RETRIED_S, free_bytes
+from ros2_memory.retention.disk import RETRIED_S
 from ros2_memory.retention.inventory import Inventory
 from ros2_memory.retention.policy import (
     DeletionPlan,
@@ -31,7 +30,6 @@ from ros2_memory.retention.policy import (
     plan_deletions,
     too_old,
 )
-from ros2_memory.retention.recorded_time import RecordedTime, relative_recording
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Sequence
@@ -41,6 +39,7 @@ if TYPE_CHECKING:
     from ros2_memory.index.bag_table import KnownBags
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.latched_carry import Carrier
+    from ros2_memory.retention.recorded_time import RecordedTime
     from ros2_memory.retention.topic_ages import TopicCutter
 
 MOST_AT_ONCE: Final = 2000
@@ -175,13 +174,13 @@ class GarbageCollector:
         *,
         recorded: RecordedTime,
         is_synchronised: Callable[[], bool],
-        static_topics: Collection[str] = (),
-        grace_s: float = 0.0,
-        needed: Callable[[Snapshot], frozenset[str]] = lambda _: frozenset(),
-        measure_free: Callable[[Path], int] = free_bytes,
-        monotonic: Callable[[], float] = time.monotonic,
-        memory: Outliving | None = None,
-        cutter: TopicCutter | None = None,
+        static_topics: Collection[str],
+        grace_s: float,
+        needed: Callable[[Snapshot], frozenset[str]],
+        measure_free: Callable[[Path], int],
+        monotonic: Callable[[], float],
+        memory: Outliving | None,
+        cutter: TopicCutter | None,
     ) -> None:
         self._bag_dir = bag_dir
         self._cutter = cutter
@@ -227,7 +226,7 @@ class GarbageCollector:
                 contents = replace(contents, free_bytes=self._measure_free(self._bag_dir))
             plan = plan_deletions(contents, limits)
             result.foreign_bytes, result.state_bytes = contents.foreign_bytes, contents.state_bytes
-            result.saved_bytes = sum(file.size for file in contents.saved)
+            result.saved_bytes = sum(contents.saved.values())
             result.total_bytes, result.fits = plan.total_bytes, plan.fits
             result.most_free = plan.most_free
             going = plan.to_delete if self._memory is None else by_hours(plan, contents)
@@ -247,9 +246,7 @@ class GarbageCollector:
             self._cut_topics(contents, limits, snapshot, run)
         result.needed = len(needed & run.deleted)
         result.unshipped = tuple(
-            relative_recording(path, self._bag_dir)
-            for path in run.unshipped
-            if path not in run.saved
+            self._own.name_of(path) for path in run.unshipped if path not in run.saved
         )
         return result
 
@@ -267,9 +264,7 @@ class GarbageCollector:
         """Returns what is stored, how long was recorded after it, and where the clock was right."""
         contents = self._inventory.contents(known, deleted=run.deleted, remaining=run.remaining)
         root = f"{self._bag_dir}{os.sep}"
-        names = {
-            bag.recording: relative_recording(bag.recording, self._bag_dir) for bag in contents.bags
-        }
+        names = {bag.recording: self._own.name_of(bag.recording) for bag in contents.bags}
         since = self._recorded.since(names.values())
         doubtful = self._recorded.doubtful(names.values())
         order = {name: place for place, name in enumerate(self._own.in_order())}
@@ -315,9 +310,8 @@ class GarbageCollector:
         run: _Pass,
         plan: DeletionPlan,
     ) -> None:
-        saved = {file.inode for file in contents.saved}
         run.saved |= {
-            bag.path for bag in to_delete if any(file.inode in saved for file in bag.files)
+            bag.path for bag in to_delete if any(file.inode in contents.saved for file in bag.files)
         }
         self._carry(to_delete, snapshot, run)
         going = [bag for bag in to_delete if bag.path not in run.remaining]
@@ -390,7 +384,7 @@ class GarbageCollector:
         """Writes down what is about to be deleted, or was. A full disk does not stop deletion."""
         splits: defaultdict[str, list[tuple[str, Ns, Ns]]] = defaultdict(list)
         for bag in going:
-            name = relative_recording(bag.recording, self._bag_dir)
+            name = self._own.name_of(bag.recording)
             splits[name].append((bare_name(bag.path), bag.start, bag.end))
         self._unwritten += [deleted_of(name, named) for name, named in splits.items()]
         if not self._unwritten:

@@ -7,7 +7,6 @@ of the disk below it, mostly the system disk, which recordings would fill.
 from __future__ import annotations
 
 import shutil
-import time
 from typing import TYPE_CHECKING, Final
 
 from ros2_memory.core.errors import BagUnreachableError
@@ -52,7 +51,7 @@ class HomeDisk:
         away: the last answer of `is_away`.
     """
 
-    def __init__(self, bag_dir: Path, device: Callable[[Path], int] = device_of) -> None:
+    def __init__(self, bag_dir: Path, device: Callable[[Path], int]) -> None:
         self._bag_dir = bag_dir
         self._device_of = device
         self._device: int | None = None
@@ -97,7 +96,7 @@ class FailingFiles:
         monotonic: a clock that never steps, in seconds.
     """
 
-    def __init__(self, monotonic: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, monotonic: Callable[[], float]) -> None:
         self._monotonic = monotonic
         self._failed: dict[Path, tuple[float, float]] = {}
 

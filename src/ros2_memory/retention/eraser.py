@@ -9,13 +9,12 @@ hard link in a moment has it. It is done when no name of the old one is left.
 from __future__ import annotations
 
 import os
-import stat
 from collections import Counter, defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
@@ -32,8 +31,8 @@ from ros2_memory.bag_dir.layout import (
     THINNED_FILE,
     bag_kind,
     is_carried,
+    is_derived,
     is_kept_apart,
-    is_thinned,
 )
 from ros2_memory.bag_dir.state_files import (
     ERASING,
@@ -54,7 +53,6 @@ from ros2_memory.index.file_state import reason_unread
 from ros2_memory.retention.delete import beside, repair_name
 from ros2_memory.retention.repair import (
     Identity,
-    left_in,
     metadata_corrected,
     open_files,
     opened_folder,
@@ -65,12 +63,11 @@ from ros2_memory.retention.repair import (
 from ros2_memory.storage.base import BagReader, BagWriter, Closing
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.core.bag_summary import BagSummary
 
-NOTHING_WRITTEN: Final[Mapping[Path, TimeWindow | None]] = MappingProxyType({})
 _FOREIGN: Final = "this recorder did not make it; `ros2-memory adopt` takes its folder"
 Ids = dict[str, set[str]]
 _Window = tuple[str, int, int]
@@ -133,8 +130,8 @@ class Eraser:
         writer: BagWriter,
         own: OwnRecordings | None,
         *,
-        written: Mapping[Path, TimeWindow | None] = NOTHING_WRITTEN,
-        recorder: str | None = None,
+        written: Mapping[Path, TimeWindow | None],
+        recorder: str | None,
     ) -> None:
         self._bag_dir = bag_dir
         self._reader = reader
@@ -215,28 +212,26 @@ class Eraser:
         Raises:
             OSError: what goes cannot be written down; nothing is changed then.
         """
-        taken = {path: holder.counts for holder in survey.holders for path in holder.paths}
         if not erasure.files:
             windows = sum((holder.windows for holder in survey.holders), Counter[_Window]())
             counts = tuple(Erased(*key, count) for key, count in sorted(windows.items()))
-            erasure = replace(erasure, files=tuple(map(self._relative, taken)), counts=counts)
+            paths = chain.from_iterable(holder.paths for holder in survey.holders)
+            erasure = replace(erasure, files=tuple(map(self._relative, paths)), counts=counts)
         ERASING.write(self._bag_dir, erasure)
         kept: list[str] = []
         linked: list[str] = []
-        recordings = {holder.paths[0].parent for holder in survey.holders}
-        left = {recording: left_in(recording, self._reader, taken) for recording in recordings}
         for holder in survey.holders:
             try:
-                if line := self._erase_in(holder, erasure, left[holder.paths[0].parent]):
+                if line := self._erase_in(holder, erasure):
                     again = any(map(self._may_change, self._paths_by_inode().get(holder.inode, ())))
                     (kept if again else linked).append(line)
             except (EpisodicError, OSError) as error:
                 kept.append(f"{self._relative(holder.paths[0])}: {reason_of(error)}")
-        files = [self._bag_dir / name for name in erasure.files]
-        recordings = {path.parent for path in files}
+        bags = [self._bag_dir / name for name in erasure.files]
+        recordings = {path.parent for path in bags}
         notes = [*metadata_corrected(self._bag_dir, recordings, self._reader)]
         try:
-            self._delete_left_over(files)
+            self._delete_left_over(bags)
             self._forget_silences(erasure)
             forgotten(erasure)
             self._add_losses(erasure)
@@ -300,11 +295,10 @@ class Eraser:
         by_inode: defaultdict[Identity, list[Path]] = defaultdict(list)
         for folder, entries in directories.walk(self._bag_dir):
             for entry in entries:
-                if bag_kind(entry.name) and not entry.is_symlink():
-                    with suppress(OSError):
+                with suppress(OSError):
+                    if bag_kind(entry.name) and entry.is_file(follow_symlinks=False):
                         status = entry.stat(follow_symlinks=False)
-                        if stat.S_ISREG(status.st_mode):
-                            by_inode[status.st_dev, status.st_ino].append(Path(folder, entry.name))
+                        by_inode[status.st_dev, status.st_ino].append(Path(folder, entry.name))
         for paths in by_inode.values():
             paths.sort(key=lambda path: (is_kept_apart(self._relative(path)), path))
         return dict(by_inode)
@@ -324,7 +318,7 @@ class Eraser:
             reason = "a program has it open; close that, and forget again"
         elif summary.notes:
             reason = f"it cannot be rewritten completely: {'; '.join(summary.notes)}"
-        elif (is_carried(path) or is_thinned(path)) and self._recorder is not None:
+        elif is_derived(path) and self._recorder is not None:
             reason = _recorder_refuses(self._recorder)
         return reason
 
@@ -336,7 +330,11 @@ class Eraser:
     ) -> Holder:
         """Reads which messages of a file go."""
         holder = Holder(tuple(path for path in paths if self._may_change(path)), inode)
-        listed = {topic for path in holder.paths for topic in self._topics_in_sidecar(path)}
+        listed = set[str]()  # the topics of which a sidecar lists messages
+        for path in holder.paths:
+            handover = read_handover(path.parent).handover
+            for message_list in (handover.also_counts, handover.counts_elsewhere):
+                listed.update(message_list.get(path.name, ()))
         for topic in topics:
             first, last = erasure.windows[0][0], erasure.windows[-1][1]
             span = (
@@ -352,18 +350,7 @@ class Eraser:
                         holder.ids.setdefault(topic, set()).add(identity)
         return holder
 
-    def _topics_in_sidecar(self, path: Path) -> Collection[str]:
-        """Returns the topics of which a sidecar lists messages of a file."""
-        handover = read_handover(path.parent).handover
-        lists = (handover.also_counts, handover.counts_elsewhere)
-        return {topic for message_list in lists for topic in message_list.get(path.name, ())}
-
-    def _erase_in(
-        self,
-        holder: Holder,
-        erasure: Erasure,
-        left_of: Mapping[str, Counter[str]],
-    ) -> str | None:
+    def _erase_in(self, holder: Holder, erasure: Erasure) -> str | None:
         """Rewrites one file, under all its names; returns a line where other names are left.
 
         Raises:
@@ -384,7 +371,6 @@ class Eraser:
                 self._writer,
                 takes=erasure.takes,
                 expected=holder.counts,
-                left_of=left_of,
             ) as new:
                 for other in holder.paths[1:]:
                     self._replace_link(new, other, holder.inode)

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from ros2_memory.core.bag_summary import TopicSummary
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.bag_table import KnownBags
-    from ros2_memory.index.scan import Stamp
     from ros2_memory.index.snapshot import Snapshot
 
 
@@ -150,8 +149,8 @@ class Inventory:
     def __init__(
         self,
         root: Path,
-        static_topics: Collection[str] = (),
-        own: OwnRecordings | None = None,
+        static_topics: Collection[str],
+        own: OwnRecordings | None,
     ) -> None:
         self._root = root
         self._own = own
@@ -160,7 +159,7 @@ class Inventory:
         self._folders: dict[str, _Folder] = {}
 
     def contents(
-        self, known: KnownBags, *, deleted: Collection[str] = (), remaining: Collection[str] = ()
+        self, known: KnownBags, *, deleted: Collection[str], remaining: Collection[str]
     ) -> DirContents:
         """Returns the bags that may be deleted, and the size of everything else.
 
@@ -178,8 +177,7 @@ class Inventory:
         bags: list[StoredBag] = []
         other_bytes = state_bytes = state_bytes_in(self._root)
         foreign_bytes = 0
-        occupied: set[str] = set()
-        mixed: set[str] = set()
+        recordings: set[str] = set()
         named = {str(self._root / name) for name in known.named}
         if self._own is not None:
             self._own.names()
@@ -197,27 +195,19 @@ class Inventory:
             is_new = is_named and split_number(recording, name) is not None
             may_go = _may_be_deleted(state, path, is_named=is_named)
             if not (is_own or is_saved or is_new):
-                mixed.add(recording)
                 foreign_bytes += sum(file.size for file in bag.files)
-            elif is_own and may_go and not is_saved and path not in remaining:
+                continue
+            recordings.add(recording)
+            if is_own and may_go and not is_saved and path not in remaining:
                 bags.append(bag)
-            else:
-                occupied.add(recording)
-                if self._counts(state, bag) and not is_saved:
-                    other_bytes += sum(file.size for file in bag.files)
+            elif self._counts(state, bag) and not is_saved:
+                other_bytes += sum(file.size for file in bag.files)
         self._drop_gone(known)
-        occupied |= mixed & {bag.recording for bag in bags}
-        emptied = {bag.recording for bag in bags} - occupied - named - {str(self._root)}
-        sidecars = {recording: self._folder_at(recording, known.now).size for recording in emptied}
-        occupied.update(bag.recording for bag in bags)
-        other_bytes += sum(
-            self._folder_at(recording, known.now).size for recording in occupied - emptied
-        )
+        other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
         saved = self._moment_files(known)
         return DirContents(
             bags,
             known.now,
-            sidecars,
             other_bytes,
             saved=saved,
             foreign_bytes=foreign_bytes,
@@ -231,7 +221,8 @@ class Inventory:
             file = (stamp.inode, stamp.size)
             bag = self._stored(path, classification.bag, stamp.mtime_ns, file, known.now)
             if other in known.hidden:
-                bag = bag._replace(second=_stored_file(bag.device, known.files[other].stamp))
+                stamp = known.files[other].stamp
+                bag = bag._replace(second=StoredFile((bag.device, stamp.inode), stamp.size))
             yield classification.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
@@ -260,16 +251,13 @@ class Inventory:
             return self._own is not None or has_own_name(Path(bag.recording).name)
         return state is not FileState.UNREAD
 
-    def _moment_files(self, known: KnownBags) -> tuple[StoredFile, ...]:
-        """Returns the files of moments, each once."""
-        if not known.saved:
-            return ()
+    def _moment_files(self, known: KnownBags) -> dict[tuple[int, int], int]:
+        """Returns the sizes of the files of moments, by inode."""
         try:
             device = (self._root / MOMENTS_FOLDER).stat().st_dev
         except OSError:
             device = -1
-        stamps = {stamp.inode: stamp for stamp in known.saved.values()}
-        return tuple(_stored_file(device, stamp) for stamp in stamps.values())
+        return {(device, stamp.inode): stamp.size for stamp in known.saved.values()}
 
     def _dating_span(self, bag: BagFile) -> tuple[Ns, Ns]:
         """Returns the log times of the first and last message that dates a bag (inclusive)."""
@@ -327,7 +315,3 @@ def _may_be_deleted(state: FileState, path: str, *, is_named: bool) -> bool:
     if state in _CLOSED:
         return not is_carried(path)
     return state in _LEFT_OPEN and not is_named
-
-
-def _stored_file(device: int, stamp: Stamp) -> StoredFile:
-    return StoredFile((device, stamp.inode), stamp.size)

@@ -32,7 +32,7 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 from ros2_memory.bag_dir.durable_write import flush
-from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_carried, is_thinned
+from ros2_memory.bag_dir.layout import CARRY_FILE, CARRY_FOLDER, is_derived
 from ros2_memory.bag_dir.moment_file import HardLinks
 from ros2_memory.core.errors import (
     BagError,
@@ -210,7 +210,7 @@ class Carrier:
         )
 
     def carry(
-        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path] = ()
+        self, snapshot: Snapshot, to_delete: Collection[Path], saved: Collection[Path]
     ) -> int | None:
         """Writes the messages that must outlive these bags, durably.
 
@@ -226,7 +226,7 @@ class Carrier:
             return None
         topics = self.topics(snapshot)
         gone = {str(path) for path in {*to_delete} - {*saved}}
-        kept = [bag for bag in snapshot.bags if bag.file not in gone and _is_recorded(bag)]
+        kept = [bag for bag in snapshot.bags if bag.file not in gone and not is_derived(bag.file)]
         carried = {
             latched_message(record, self._frames(record)): origin_of(record.channel)
             for record in self._records(self.path, topics)
@@ -357,7 +357,7 @@ class Carrier:
             for bag in snapshot.bags:
                 if topic not in bag.summary.schema.positions or bag.recording in seen:
                     continue
-                if bag.path in to_delete or not _is_recorded(bag):
+                if bag.path in to_delete or is_derived(bag.file):
                     continue
                 seen.add(bag.recording)
                 key = (bag.path, bag.mtime_ns, topic)
@@ -395,10 +395,6 @@ class Carrier:
         flush(folder)
         flush(folder.parent)
         self._own.hold(folder, [CARRY_FILE])
-
-
-def _is_recorded(bag: BagFile) -> bool:
-    return not (is_carried(bag.file) or is_thinned(bag.file))
 
 
 def _is_tf(type_name: str) -> bool:

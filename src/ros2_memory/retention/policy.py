@@ -28,7 +28,6 @@ stays.
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -39,7 +38,6 @@ from ros2_memory.index.clock_faults import FIRST_BAGS_NS
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-_BLOCK: Final = 4096
 SMALL_BUDGET_GB: Final = 0.1
 """Of a smaller budget, what is stored beside the bags may take a large part."""
 GB: Final = 10**9
@@ -78,11 +76,6 @@ class StoredFile(NamedTuple):
     inode: tuple[int, int]
     size: int
 
-    @property
-    def disk(self) -> int:
-        """What deleting it frees, in bytes."""
-        return -(-self.size // _BLOCK) * _BLOCK
-
 
 class StoredBag(NamedTuple):
     """A bag that may be deleted. One flat tuple, since a week has 60,000, judged every few seconds.
@@ -119,14 +112,10 @@ class StoredBag(NamedTuple):
         return self._replace(start=at, end=at) if self.has_dates else self._replace(written=at)
 
     @property
-    def file(self) -> StoredFile:
-        """Its file."""
-        return StoredFile((self.device, self.inode), self.size)
-
-    @property
     def files(self) -> tuple[StoredFile, ...]:
         """All forms of it."""
-        return (self.file,) if self.second is None else (self.file, self.second)
+        first = StoredFile((self.device, self.inode), self.size)
+        return (first,) if self.second is None else (first, self.second)
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +125,10 @@ class DirContents:
     Attributes:
         bags: those that may be deleted.
         now: the wall clock.
-        sidecars: for each recording that goes with its last bag, the bytes that go with it.
-        other_bytes: what must not be deleted: open bags, and files that are not worth deleting.
+        other_bytes: all else that counts: open bags, and what goes with a recording's last bag.
         free_bytes: free disk space; None if that does not count.
-        saved: the files of moments, which are never deleted; bags may be other names of them.
+        saved: the sizes of the files of moments, by inode (device and number), which are never
+            deleted; bags may be other names of them.
         recorded_since: how long was recorded after each recording, by the monotonic clock; a
             recording that is missing counts as new.
         doubtful: the recordings whose dates are not known to be right.
@@ -154,10 +143,9 @@ class DirContents:
 
     bags: Sequence[StoredBag]
     now: Ns
-    sidecars: Mapping[str, int] = field(default_factory=dict)
     other_bytes: int = 0
     free_bytes: int | None = None
-    saved: Sequence[StoredFile] = ()
+    saved: Mapping[tuple[int, int], int] = field(default_factory=dict)
     recorded_since: Mapping[str, Ns] = field(default_factory=dict)
     doubtful: frozenset[str] = frozenset()
     synchronised: bool = False
@@ -233,7 +221,7 @@ def _plan_and_free_bytes(
     for bag in order:
         if left.fits(limits):
             break
-        if bag.path not in aged and bag is not newest and left.frees(bag):
+        if bag.path not in aged and bag is not newest and left.freed_by(bag):
             going.add(bag.path)
             left.delete(bag)
     deleted = tuple(bag for bag in order if bag.path in going)
@@ -279,32 +267,21 @@ class _Remaining:
 
     def __init__(self, contents: DirContents) -> None:
         # A file of a moment counts once, and stays when its other name is deleted.
-        self._saved = {file.inode for file in contents.saved}
-        self._bags_in = Counter(bag.recording for bag in contents.bags)
-        self._sidecars = contents.sidecars
-        bags = sum(file.size for bag in contents.bags for file in self._freed_by(bag))
-        saved = sum(file.size for file in contents.saved)
-        self.total = contents.other_bytes + saved + bags + sum(contents.sidecars.values())
+        self._saved = contents.saved
+        bags = sum(map(self.freed_by, contents.bags))
+        self.total = contents.other_bytes + sum(contents.saved.values()) + bags
         self.free = contents.free_bytes
 
-    def _freed_by(self, bag: StoredBag) -> list[StoredFile]:
-        return [file for file in bag.files if file.inode not in self._saved]
-
-    def frees(self, bag: StoredBag) -> bool:
-        """Whether deleting a bag frees any of its files."""
-        return bool(self._freed_by(bag))
+    def freed_by(self, bag: StoredBag) -> int:
+        """Returns how many bytes deleting a bag frees."""
+        return sum(file.size for file in bag.files if file.inode not in self._saved)
 
     def delete(self, bag: StoredBag) -> None:
         """Takes one bag away."""
-        freed = [(file.size, file.disk) for file in self._freed_by(bag)]
-        self._bags_in[bag.recording] -= 1
-        if not self._bags_in[bag.recording]:
-            size = self._sidecars.get(bag.recording, 0)
-            freed.append((size, size))
-        for size, disk in freed:
-            self.total -= size
-            if self.free is not None:
-                self.free += disk
+        freed = self.freed_by(bag)
+        self.total -= freed
+        if self.free is not None:
+            self.free += freed
 
     def fits(self, limits: RetentionLimits) -> bool:
         """Whether what is left is within the budget, and leaves enough of the disk."""

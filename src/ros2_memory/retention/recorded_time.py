@@ -15,7 +15,6 @@ there is no file at all, as after a restore: then nothing speaks against any dat
 from __future__ import annotations
 
 import math
-import os
 import threading
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final
@@ -234,8 +233,3 @@ class RecordedTime:
         return [
             Recorded(name, round(self._last_grew_s[name], 3), name in self._right) for name in names
         ]
-
-
-def relative_recording(recording: str, bag_dir: Path) -> str:
-    """Returns a recording's directory relative to the bag directory, as the file names it."""
-    return recording.removeprefix(f"{str(bag_dir).rstrip(os.sep)}{os.sep}")

@@ -10,22 +10,22 @@ from __future__ import annotations
 import fcntl
 import os
 import stat
-from collections import Counter
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.heartbeat import read_heartbeat
-from ros2_memory.bag_dir.layout import METADATA_FILE, bag_kind
-from ros2_memory.bag_dir.metadata_yaml import bare_name, correct, recounted
+from ros2_memory.bag_dir.layout import METADATA_FILE
+from ros2_memory.bag_dir.metadata_yaml import correct
 from ros2_memory.core import directories
 from ros2_memory.core.errors import BagError, BagVanishedError
 from ros2_memory.retention.delete import beside
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Rewritten
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Mapping
+    from collections import Counter
+    from collections.abc import Callable, Collection, Iterator
 
     from ros2_memory.core.timebase import Ns
 
@@ -141,7 +141,6 @@ def rewritten(
     *,
     takes: Callable[[str, Ns, Ns], bool],
     expected: Counter[str],
-    left_of: Mapping[str, Counter[str]],
 ) -> Iterator[Path]:
     """Yields the new file, beside the old one; it takes the name of the old one after the block.
 
@@ -152,14 +151,13 @@ def rewritten(
         writer: rewrites it.
         takes: whether a message goes, by topic, log time and publish time.
         expected: how many messages go, by topic.
-        left_of: what every file of the recording holds afterwards, see `recounted`.
 
     Raises:
         EpisodicError: it cannot be rewritten, or another program rewrites it; nothing is changed.
         OSError: likewise, or it is another file now.
     """
     with opened_folder(bag_dir, path) as here, _rewrite_lock(here), beside(here) as new:
-        taken = writer.cut(here, new, takes, lambda text: recounted(text, left_of))
+        taken = writer.cut(here, new, takes)
         if taken != expected:
             raise BagError(str(path), "its contents changed meanwhile")
         # A nanosecond later: nobody may take the new file for the old one.
@@ -195,20 +193,6 @@ def replace_file(new: Path, path: Path, inode: Identity) -> None:
         raise OSError(f"{path.name} is not the file that was read")
     new.replace(path)
     flush(path.parent)
-
-
-def left_in(
-    recording: Path, reader: BagReader, gone: Mapping[Path, Counter[str]]
-) -> dict[str, Counter[str]]:
-    """Returns how many messages of each topic are left in each file that can be read, by name."""
-    files: dict[str, Counter[str]] = {}
-    for path in filter(lambda path: bag_kind(path.name), recording.iterdir()):
-        with suppress(BagError):
-            counts = Counter[str]()
-            for topic in reader.summarize(path).topics:
-                counts[topic.topic] += topic.count
-            files[bare_name(path.name)] = counts - gone.get(path, Counter())
-    return files
 
 
 def metadata_corrected(

@@ -15,15 +15,13 @@ from collections import defaultdict
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.durable_write import flush
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     MOMENTS_FOLDER,
-    is_carried,
-    is_thinned,
+    is_derived,
 )
 from ros2_memory.bag_dir.moment_file import (
     MAX_MOMENTS,
@@ -80,8 +78,7 @@ def needed_bags(moment: SaveRequest, snapshot: Snapshot, now: Ns) -> NeededBags:
     waits = now < window.stop or any(_may_overlap(recorded, window) for recorded in open_files)
     ready = []
     for bag in snapshot.timeline.overlapping(window):
-        is_derived = is_carried(bag.file) or is_thinned(bag.file)
-        if not bag.reaches_into(window) or is_derived:
+        if not bag.reaches_into(window) or is_derived(bag.file):
             continue
         unfinished = bag.state is BagState.INCOMPLETE and bag.file.endswith(".mcap")
         if unfinished and now - moment.asked < REPAIRED_WITHIN_NS:
@@ -163,7 +160,7 @@ class MomentKeeper:
         share_bytes: int,
         clock: Clock,
         own: OwnRecordings,
-        rule_bytes: Mapping[str, int] = MappingProxyType({}),
+        rule_bytes: Mapping[str, int],
     ) -> None:
         self._bag_dir = bag_dir
         self._share = share_bytes
@@ -195,7 +192,7 @@ class MomentKeeper:
             if moment.moment.pending:
                 stored[name] = self._continue_moment(moment, stored, snapshot)
         for request in self._queue.take(now) if self._queue.has_requests() else ():
-            self._queue.answer(request, self._answer_to(request, stored, snapshot))
+            self._queue.answer(request.number, self._answer_to(request, stored, snapshot))
         self._waiting = any(moment.moment.pending for moment in stored.values())
 
     def _answer_to(
@@ -395,7 +392,7 @@ class MomentKeeper:
 
 def _may_overlap(recorded: TimeWindow | None, window: TimeWindow) -> bool:
     """Whether what was recorded in one window may lie in the other; yes if unknown."""
-    return recorded is None or (recorded.start < window.stop and window.start < recorded.stop)
+    return recorded is None or not recorded.intersect(window).empty
 
 
 class _BagInode(NamedTuple):
@@ -420,8 +417,8 @@ def _missing_sentence(name: str) -> str:
 
 def _moment_of(request: SaveRequest, stored: Mapping[str, StoredMoment]) -> StoredMoment | None:
     """Returns the moment that a request has already."""
-    by_number = {moment.moment.request.number: moment for moment in stored.values()}
-    return by_number.get(request.number)
+    moments = stored.values()
+    return next((kept for kept in moments if kept.moment.request.number == request.number), None)
 
 
 def _with_links(

@@ -20,7 +20,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE, SHIPPED_FILE
-from ros2_memory.bag_dir.metadata_yaml import bare_name, why_not_corrected
+from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
 from ros2_memory.bag_dir.state_files import EXPIRED, SHIPPED, Expired, Loss, Receipt, read_receipts
 from ros2_memory.core.errors import EpisodicError
 from ros2_memory.core.logging_setup import get_logger
@@ -28,7 +28,7 @@ from ros2_memory.core.text import match_topics
 from ros2_memory.core.timebase import Ns, ms_since
 from ros2_memory.retention.disk import free_bytes
 from ros2_memory.retention.policy import DirContents, RetentionLimits, too_old
-from ros2_memory.retention.repair import left_in, rewritten
+from ros2_memory.retention.repair import rewritten
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Mapping, Sequence
@@ -73,9 +73,10 @@ def plan_cuts(
     index shows it.
     """
     timeline = snapshot.timeline
-    saved = {file.inode for file in contents.saved}
     alone = {
-        bag.path for bag in contents.bags if saved.isdisjoint(file.inode for file in bag.files)
+        bag.path
+        for bag in contents.bags
+        if contents.saved.keys().isdisjoint(file.inode for file in bag.files)
     }
     going: defaultdict[str, set[str]] = defaultdict(set)
     for topic_age in topic_ages:
@@ -141,8 +142,7 @@ class TopicCutter:
         stays as it is until it changes.
 
         Raises:
-            OSError: the free space cannot be measured, or a folder or the receipts of `ship` not be
-                read.
+            OSError: the free space cannot be measured, or the receipts of `ship` not be read.
         """
         cuts = plan_cuts(self._topic_ages, contents, limits, snapshot, self._static_topics)
         done = self._done
@@ -155,12 +155,12 @@ class TopicCutter:
         receipts = read_receipts(self._bag_dir) if (self._bag_dir / SHIPPED_FILE).exists() else {}
         gone, bags = Counter[str](), 0
         for recording, of_recording in groupby(waiting, key=lambda cut: cut.bag.recording):
-            left, bags_before = left_in(recording, self._reader, {}), bags
+            bags_before = bags
             for cut in of_recording:
                 free = self._measure_free(self._bag_dir)
                 if self._monotonic() >= until_s or free - cut.bag.size < limits.min_free_bytes:
                     break
-                gone_here = self._cut_if_held(cut, left, receipts)
+                gone_here = self._cut_if_held(cut, receipts)
                 gone += gone_here or Counter()
                 bags += gone_here is not None
             if bags > bags_before and (reason := why_not_corrected(recording, self._reader)):
@@ -184,39 +184,35 @@ class TopicCutter:
             _log.info("topics_wait", reason=reason)
         return now_s - self._waits_since_s >= PATIENCE_S
 
-    def _cut_if_held(
-        self, cut: TopicCut, left: dict[str, Counter[str]], receipts: Mapping[str, Receipt]
-    ) -> Counter[str] | None:
+    def _cut_if_held(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str] | None:
         """Cuts a bag that has messages of the topics; returns what went, by topic.
 
-        `left` has what the bags of the recording hold, by bare name. None where this one has none,
-        or cannot be cut: then it is not looked at again until it changes.
+        None where it has none, or cannot be cut: then it is not looked at again until it changes.
         """
-        if not cut.topics.isdisjoint(left.get(bare_name(cut.bag.path.name), ())):
-            try:
-                return self._cut_bag(cut, left, receipts)
-            except (EpisodicError, OSError) as error:
-                _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
+        try:
+            if gone := self._cut_bag(cut, receipts):
+                return gone
+        except (EpisodicError, OSError) as error:
+            _log.error("topics_not_cut", path=cut.bag.file, reason=str(error))
         self._done[cut.bag.file] = cut.bag.mtime_ns, cut.topics
         return None
 
-    def _cut_bag(
-        self, cut: TopicCut, left: dict[str, Counter[str]], receipts: Mapping[str, Receipt]
-    ) -> Counter[str]:
-        """Cuts one bag; returns the messages that went, by topic, and takes them from `left`.
+    def _cut_bag(self, cut: TopicCut, receipts: Mapping[str, Receipt]) -> Counter[str]:
+        """Cuts one bag; returns the messages that went, by topic.
 
         Raises:
             EpisodicError: it cannot be rewritten; nothing is changed.
             OSError: likewise.
         """
-        path, name = cut.bag.path, bare_name(cut.bag.path.name)
+        path = cut.bag.path
         before = path.lstat()
         summary = self._reader.summarize(path)
         going = [topic for topic in summary.topics if topic.topic in cut.topics]
         gone = Counter[str]()
         for topic in going:
             gone[topic.topic] += topic.count
-        remaining = {**left, name: left[name] - gone}
+        if not gone:
+            return gone
         bag = os.path.relpath(path, self._bag_dir)
         expired = self._expired()
         losses = [
@@ -235,7 +231,6 @@ class TopicCutter:
                 self._writer,
                 takes=lambda name, _logged, _published: name in cut.topics,
                 expected=gone,
-                left_of=remaining,
             ) as new:
                 # Before the bag is smaller: else `ship` would take what went out of the lake, too.
                 if receipt is not None:
@@ -247,7 +242,6 @@ class TopicCutter:
                 with suppress(OSError):
                     SHIPPED.append(self._bag_dir, [receipt])
             raise
-        left.update(remaining)
         return gone
 
     def _expired(self) -> Expired:

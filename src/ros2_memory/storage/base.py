@@ -511,19 +511,17 @@ class BagWriter(ABC):
         source: Path,
         target: Path,
         takes: Callable[[str, Ns, Ns], bool],
-        edit_metadata: Callable[[str], str],
     ) -> Counter[str]:
         """Writes a whole file again, of any kind but compressed ones, without some messages.
 
-        All else is unchanged, as by `rewrite`, except the counts that rosbag2 embeds. The target
-        was read back and compared, and is on the disk, when this returns. There must be no file of
-        its name; the source is only read.
+        All else is unchanged, as by `rewrite`, but for the metadata.yaml that rosbag2 embeds, which
+        counts messages: it is left out. The target was read back and compared, and is on the disk,
+        when this returns. There must be no file of its name; the source is only read.
 
         Args:
             source: a file that its writer finished.
             target: the new one.
             takes: whether a message is left out, by topic, log time and publish time.
-            edit_metadata: returns the corrected text of an embedded metadata.yaml.
 
         Returns:
             How many messages of each topic were left out.

@@ -434,7 +434,6 @@ def cut_sqlite(
     target: Path,
     stream: IO[bytes],
     takes: Callable[[str, Ns, Ns], bool],
-    edit_metadata: Callable[[str], str],
 ) -> Counter[str]:
     """Writes a file again without some messages; returns how many of each topic.
 
@@ -444,7 +443,6 @@ def cut_sqlite(
         stream: into the target, which is empty.
         takes: whether a message is left out, by topic, log time, and log time again: the format
             has no other.
-        edit_metadata: returns the text of an embedded metadata.yaml as it is to be.
 
     Raises:
         UnreadableError: the source has a journal or is no plain bag, or the target is not right.
@@ -477,12 +475,7 @@ def cut_sqlite(
         base.execute("BEGIN")
         base.executemany("DELETE FROM messages WHERE rowid = ?", going)
         if base.execute(_HAS_METADATA).fetchone()[0]:
-            require_short_texts(base, "metadata", ("metadata",))
-            rows = base.execute("SELECT rowid, metadata FROM metadata").fetchall()
-            base.executemany(
-                "UPDATE metadata SET metadata = ? WHERE rowid = ?",
-                [(edit_metadata(str(text)), row) for row, text in rows],
-            )
+            base.execute("DELETE FROM metadata")
         base.execute("COMMIT")
         base.execute("VACUUM")
         if base.execute("PRAGMA integrity_check(1)").fetchone()[0] != "ok":

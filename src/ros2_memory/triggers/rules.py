@@ -39,7 +39,6 @@ if TYPE_CHECKING:
     from collections.abc import (
         Callable,
         Collection,
-        Iterable,
         Iterator,
         Mapping,
         MutableMapping,
@@ -51,8 +50,6 @@ if TYPE_CHECKING:
     from ros2_memory.storage.base import BagReader, Record
 
 
-GLOB_MARKS: Final = "*?["
-"""What makes a topic of a rule a glob."""
 LEAST_NEAR_NS: Final[Ns] = 60 * NS_PER_S
 """Recordings that take over from each other overlap by less."""
 _SPLITS_NEAR: Final = 3
@@ -101,14 +98,6 @@ class Rule:
     def is_of_restarts(self) -> bool:
         """Whether it fires when the recorder restarts (`kind: recorder_restart`)."""
         return self.topic is None
-
-    def selects(self, topics: Iterable[str]) -> list[str]:
-        """Returns those of the topics that the rule watches."""
-        if self.topic is None:
-            return []
-        if any(mark in self.topic for mark in GLOB_MARKS):
-            return match_topics(topics, self.topic)
-        return [topic for topic in topics if topic == self.topic]
 
     def window(self, first: Ns, fired: Ns) -> TimeWindow:
         """Returns what is kept of a match that began at `first` and made the rule fire."""
@@ -378,8 +367,9 @@ class SplitSearch:
 
     def _rules_of(self, topic: str) -> tuple[Rule, ...]:
         if topic not in self._watching:
-            rules = (rule for rule in self._rules if rule.selects([topic]))
-            self._watching[topic] = tuple(rules)
+            self._watching[topic] = tuple(
+                rule for rule in self._rules if match_topics((topic,), rule.topic or "")
+            )
         return self._watching[topic]
 
     def _events(self, bag: BagFile, part: SearchPart, state: TriggerState) -> Iterator[_Event]:

@@ -12,10 +12,10 @@ kill in between does no harm: what is not released yet is cut again, to the same
 
 from __future__ import annotations
 
-import os
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from copy import deepcopy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeAlias
@@ -24,7 +24,7 @@ from ros2_memory.analysis.conditions import Equals, leaves, refusal_for
 from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import (
     SCREENED_FILE,
-    bag_kind,
+    bags_in,
     split_number,
 )
 from ros2_memory.bag_dir.metadata_yaml import why_not_corrected
@@ -49,7 +49,7 @@ from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns, ns_from_unix
 from ros2_memory.index.split_order import split_of
 from ros2_memory.retention.disk import FailingFiles
-from ros2_memory.retention.repair import left_in, reason_of, rewritten
+from ros2_memory.retention.repair import reason_of, rewritten
 from ros2_memory.storage.base import BagReader, BagWriter, Closing, Record
 from ros2_memory.triggers.exclusion import (
     Cut,
@@ -284,11 +284,10 @@ class Screening:
 
     def _files(self, name: str) -> list[Path]:
         """Returns the bags of a recording in the order in which they were written."""
-        try:
-            paths = [path for path in (self._bag_dir / name).iterdir() if bag_kind(path.name)]
-        except (FileNotFoundError, NotADirectoryError):
-            return []
-        return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
+        with suppress(FileNotFoundError, NotADirectoryError):
+            paths = bags_in(self._bag_dir / name)
+            return sorted(paths, key=lambda path: (split_of(path.name) or ("", 0), path.name))
+        return []
 
     def _add_conditions(self, path: Path, summary: BagSummary, screen: RecordingScreen) -> None:
         """Adds what a file shows to the state.
@@ -436,18 +435,9 @@ class Screening:
         """Rewrites a split without so many messages of each topic; raises as `_cut_split` does."""
         if split_number(path.parent.name, path.name) is None:
             raise BagError(str(path), "it is not named as a split of its recording")
-        with path.open("rb") as old:
-            left = left_in(path.parent, self._reader, {path: gone})
-            with rewritten(
-                self._bag_dir,
-                path,
-                os.fstat(old.fileno()),
-                self._writer,
-                takes=cut.takes,
-                expected=gone,
-                left_of=left,
-            ):
-                pass
+        status = path.lstat()
+        with rewritten(self._bag_dir, path, status, self._writer, takes=cut.takes, expected=gone):
+            pass
         _log.info(
             "messages_excluded",
             recording=path.parent.name,

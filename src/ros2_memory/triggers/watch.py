@@ -28,7 +28,7 @@ from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Clock, Ns, ns_from_unix
-from ros2_memory.triggers.rules import GLOB_MARKS, Firing, Rule, SplitSearch, chains_to_search
+from ros2_memory.triggers.rules import Firing, Rule, SplitSearch, chains_to_search
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.retention.saved_moments import MomentKeeper
 
+GLOB_MARKS: Final = "*?["
+"""What makes a topic of a rule a glob."""
 LOOK_S: Final = 2.0
 """How long one look searches: meanwhile nothing is deleted, and no other moment is saved."""
 HOUR_NS: Final[Ns] = 3600 * NS_PER_S
@@ -78,7 +80,7 @@ class Triggers:
         *,
         clock: Clock,
         split_duration_s: float,
-        is_recorded: Callable[[str], bool] = bool,
+        is_recorded: Callable[[str], bool],
     ) -> None:
         self._bag_dir = bag_dir
         self._rules = {rule.name: rule for rule in rules}

@@ -139,7 +139,7 @@ def test_a_request_is_taken_and_answered_and_nothing_is_left(tmp_path: Path) -> 
     assert request == posted.request
     assert posted.outcome() is None
     outcome = Outcome("20261120T050000Z-here", 3, pending=True)
-    queue.answer(request, outcome)
+    queue.answer(request.number, outcome)
     assert posted.outcome() == outcome
     posted.close()
     assert names(tmp_path) == []
@@ -176,7 +176,7 @@ def test_only_so_many_are_taken_at_once(tmp_path: Path) -> None:
     first = list(queue.take(T0))
     assert len(first) == MAX_AT_ONCE
     for request in first:
-        queue.answer(request, Outcome(refused="no"))
+        queue.answer(request.number, Outcome(refused="no"))
     assert len(list(queue.take(T0))) == 2
 
 
@@ -243,7 +243,7 @@ def test_what_cannot_be_dropped_is_told_once_and_holds_nobody_up(tmp_path: Path)
     posted, queue = asked(tmp_path), RequestQueue(tmp_path)
     with structlog.testing.capture_logs() as captured:
         [request] = queue.take(T0)
-        queue.answer(request, Outcome(refused="no"))
+        queue.answer(request.number, Outcome(refused="no"))
     assert [event["event"] for event in captured] == ["request_ignored"] * 3
     assert posted.outcome() is not None
     assert not queue.has_requests()
@@ -254,7 +254,7 @@ def test_other_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / REQUESTS_FOLDER / "notes.txt").write_text("mine")
     queue = RequestQueue(tmp_path)
     for request in queue.take(T0):
-        queue.answer(request, Outcome(refused="no"))
+        queue.answer(request.number, Outcome(refused="no"))
     assert list(queue.take(T0)) == []
     posted.close()
     assert names(tmp_path) == ["notes.txt"]
@@ -264,7 +264,7 @@ def test_answers_that_nobody_fetched_are_swept_away(tmp_path: Path) -> None:
     asked(tmp_path)
     queue = RequestQueue(tmp_path)
     [request] = queue.take(T0)
-    queue.answer(request, Outcome(refused="no"))
+    queue.answer(request.number, Outcome(refused="no"))
     path = tmp_path / REQUESTS_FOLDER / f"{request.number}.answer"
     os.utime(path, ns=(T0, T0))
     assert list(queue.take(T0 + 500 * S)) == []
@@ -281,7 +281,7 @@ def test_another_user_may_read_a_request_and_its_answer(tmp_path: Path) -> None:
         [request] = queue.take(T0)
         taken = tmp_path / REQUESTS_FOLDER / f"{request.number}.taken"
         assert stat.S_IMODE(taken.stat().st_mode) == 0o644
-        queue.answer(request, Outcome(refused="no"))
+        queue.answer(request.number, Outcome(refused="no"))
         answer = taken.with_suffix(".answer")
         assert stat.S_IMODE(answer.stat().st_mode) == 0o644
     finally:

@@ -21,7 +21,8 @@ from ros2_memory.bag_dir.heartbeat import (
     write_heartbeat,
 )
 from ros2_memory.core.model import TimeWindow
-from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
 from tests.support.examples import examples
 from tests.support.plain_text_bags import PlainReader, close, grow, plain

@@ -10,7 +10,8 @@ import pytest
 
 from ros2_memory.index.bag_table import BagTable
 from ros2_memory.index.file_state import ScanContext
-from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import FixedClock
 from tests.support.plain_text_bags import PlainReader, plain
 

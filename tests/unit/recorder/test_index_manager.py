@@ -12,7 +12,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ros2_memory.core.model import BagFile, BagState, SetAside
-from ros2_memory.recorder.index_manager import IndexManager, Snapshot
+from ros2_memory.index.snapshot import Snapshot
+from ros2_memory.recorder.index_manager import IndexManager
 from tests.support.clocks import SettableClock
 from tests.support.plain_text_bags import PlainReader, close, grow, plain
 

@@ -11,6 +11,7 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.layout import SCREENED_FILE
 from ros2_memory.bag_dir.state_files import SCREENED, read_withheld
 from ros2_memory.core.model import TimeWindow
+from ros2_memory.recorder.background import Background
 from ros2_memory.storage.mcap.writer import McapWriter
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.triggers.screening import Screening
@@ -138,11 +139,12 @@ class TestTheHouse:
         house.wait()
         assert len(bags.served()) == 1
         (bags.bag_dir / SCREENED_FILE).write_text("{")
-        house = background_keeper_of(bags.bag_dir, screening=bags.new())
+        background = Background()
+        house = keeper_of(bags.bag_dir, screening=bags.new(), background=background)
         house.screen(())
-        assert "screened.json" in house.faults()["screen"]
+        assert "screened.json" in background.faults()["screen"]
         house.finish()
-        assert "screened.json" in house.faults()["screen"]
+        assert "screened.json" in background.faults()["screen"]
 
 
 def window() -> TimeWindow:

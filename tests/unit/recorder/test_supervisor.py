@@ -12,9 +12,9 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.state_files import read_losses
 from ros2_memory.core.errors import RecorderError
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_S
+from ros2_memory.recorder import handover
 from ros2_memory.recorder.sessions import Required
 from tests.support.simulated_recorders import (
-    PlayedHousekeeper,
     World,
     assert_each_counts_once,
     assert_what_stands_counts_once,
@@ -103,8 +103,11 @@ class TestRotation:
         world.supervisor.stop()
         assert_each_counts_once(world)
 
-    def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(self, tmp_path: Path) -> None:
-        world = World(tmp_path, session_duration_s=20, subscribe_timeout_s=6).started(19)
+    def test_a_topic_that_went_away_does_not_hold_it_up_for_ever(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+        world = World(tmp_path, session_duration_s=20).started(19)
         world.defaults = {"topics": ("/bumper",)}
         [said] = world.logged(12.25, "rotated_without")
         assert world.recorders[0].status == 0
@@ -374,8 +377,11 @@ class TestOffers:
             world.run(60)
         assert [each["topics"] for each in events(logs, "topic_not_offered")] == [["/lidar"]]
 
-    def test_nodes_that_have_gone_are_reported_until_they_come_back(self, tmp_path: Path) -> None:
-        world = World(tmp_path, subscribe_timeout_s=6).started(12)
+    def test_nodes_that_have_gone_are_reported_until_they_come_back(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(handover, "SUBSCRIBE_TIMEOUT_S", 6.0)
+        world = World(tmp_path).started(12)
         world.silent, world.defaults = True, {"topics": ()}
         [said] = world.logged(90, "topic_silent")
         assert said["topics"] == ["/bumper", "/door"]
@@ -603,14 +609,13 @@ def test_an_error_has_its_time_and_is_past_once_recording_goes_on(tmp_path: Path
 
 
 def test_an_error_that_lasts_is_not_past(tmp_path: Path) -> None:
-    housekeeper = PlayedHousekeeper()
-    world = World(tmp_path, housekeeper=housekeeper).started()
-    housekeeper.failed = {"apply": "the list cannot be read"}
+    world = World(tmp_path).started()
+    world.background.failed("apply", "the list cannot be read")
     world.run(30)
     assert (world.heartbeat()["last_error"], world.heartbeat()["recovered"]) == (
         "the list cannot be read",
         False,
     )
-    housekeeper.failed = {}
+    world.background.run("apply", bool)
     world.run(10)
     assert world.heartbeat()["recovered"] is True

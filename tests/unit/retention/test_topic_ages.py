@@ -15,6 +15,7 @@ from ros2_memory.bag_dir.bag_dir_reader import BagDirReader
 from ros2_memory.bag_dir.handover_file import Handover, Overlap, write_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, EXPIRED_FILE
 from ros2_memory.bag_dir.metadata_yaml import correct
+from ros2_memory.bag_dir.own_recordings import OwnRecordings
 from ros2_memory.bag_dir.state_files import (
     SHIPPED,
     Receipt,
@@ -93,6 +94,7 @@ def house(
         limits,
         is_synchronised=lambda: synchronised,
         split_duration_s=10.0,
+        own=OwnRecordings(bag_dir),
         static_topics=("/tf_static",),
         cutter=cutter,
         background=Direct(),

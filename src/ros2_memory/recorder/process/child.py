@@ -65,7 +65,7 @@ class Child:
         self._process = process
         self._patience = patience
         self.pid = process.pid
-        self.patience_s = patience.interrupt_s + patience.terminate_s + patience.kill_s
+        self.patience_s = sum(patience)
         self._lines: deque[str] = deque(maxlen=MAX_LINES)
         self._status: int | None = None
         self._ending_since: float | None = None

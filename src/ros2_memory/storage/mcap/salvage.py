@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
 from mcap.opcode import Opcode
-from mcap.records import Metadata
 
 from ros2_memory.core.timebase import MAX_NS
 from ros2_memory.storage.errors import MAX_SECTION_BYTES, SizeLimit, UnreadableError, as_unreadable
@@ -174,13 +173,6 @@ class ContentDigest:
         return True
 
 
-_NAME: Final = "rosbag2"
-_KEY: Final = "serialized_metadata"
-
-
-def retold(record: Metadata, edit_metadata: Callable[[str], str]) -> Metadata:
-    """Returns a metadata record; that of rosbag2 with its text changed."""
-    text = record.metadata.get(_KEY)
-    if record.name != _NAME or text is None:
-        return record
-    return Metadata(name=record.name, metadata={**record.metadata, _KEY: edit_metadata(text)})
+def is_of_rosbag2(record: mcap_records.McapRecord) -> bool:
+    """Returns whether a record is the metadata.yaml that rosbag2 embeds, which counts messages."""
+    return isinstance(record, mcap_records.Metadata) and record.name == "rosbag2"

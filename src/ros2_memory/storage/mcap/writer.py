@@ -18,7 +18,7 @@ from ros2_memory.storage.errors import MAX_CHUNK_MB, UnreadableError, reading, r
 from ros2_memory.storage.file_io import OpenFile
 from ros2_memory.storage.mcap.bag_file import McapBags
 from ros2_memory.storage.mcap.records import is_finished
-from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, retold
+from ros2_memory.storage.mcap.salvage import ContentDigest, Salvage, is_of_rosbag2
 from ros2_memory.storage.sqlite_bag import cut_sqlite
 from ros2_memory.typestore import full_name
 
@@ -96,12 +96,11 @@ class McapWriter(BagWriter):
         source: Path,
         target: Path,
         takes: Callable[[str, Ns, Ns], bool],
-        edit_metadata: Callable[[str], str],
     ) -> Counter[str]:
         """Writes a whole file again without some messages."""
         if source.suffix.lower() != ".mcap":
             with _written(target) as stream, reading(source):
-                return cut_sqlite(source, target, stream, takes, edit_metadata)
+                return cut_sqlite(source, target, stream, takes)
         taken = Counter[str]()
         with _written(target) as stream:
             with reading(source), OpenFile(source) as file:
@@ -110,8 +109,8 @@ class McapWriter(BagWriter):
                 salvage = Salvage(file, self._max_chunk_mb << 20)
                 copy, digest = _Copy(_writer(stream)), ContentDigest()
                 for record in _without(salvage, takes, taken):
-                    if isinstance(record, mcap_records.Metadata):
-                        record = retold(record, edit_metadata)  # noqa: PLW2901 - in its place
+                    if is_of_rosbag2(record):
+                        continue
                     if digest.add(record):
                         copy.put(record)
                     elif isinstance(record, mcap_records.Message):
