@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from starlette.responses import Response
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 PAGE_PATH: Final = "/"
@@ -49,9 +51,14 @@ class _File(NamedTuple):
     etag: str
 
 
-def _joined_file(names: tuple[str, ...], media_type: str) -> _File:
+def joined(names: Sequence[str]) -> str:
+    """Returns files of the page as one text."""
     folder = resources.files(__name__)
-    body = b"\n".join(folder.joinpath(name).read_bytes() for name in names)
+    return "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
+def _joined_file(names: Sequence[str], media_type: str) -> _File:
+    body = joined(names).encode()
     return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
 
 
