@@ -55,13 +55,8 @@ def room_at(x: float) -> str:
     return next((name for name, (_, end, *_) in ROOMS.items() if x < end), "kitchen")
 
 
-def wrapped(angle: float) -> float:
-    """Returns the same direction in (-pi, pi]."""
-    return math.pi - (math.pi - angle) % (2.0 * math.pi)
-
-
 class Planar(NamedTuple):
-    """A pose in the plane: metres, and `yaw` in radians from the x axis, in (-pi, pi]."""
+    """A pose in the plane: metres, and `yaw` in radians from the x axis, in [-pi, pi]."""
 
     x: float
     y: float
@@ -73,7 +68,7 @@ class Planar(NamedTuple):
         return Planar(
             self.x + cos * step.x - sin * step.y,
             self.y + sin * step.x + cos * step.y,
-            wrapped(self.yaw + step.yaw),
+            math.remainder(self.yaw + step.yaw, math.tau),
         )
 
     def inverse(self) -> Planar:
