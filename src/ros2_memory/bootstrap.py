@@ -698,7 +698,6 @@ def build_dispatcher(
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,
-        large=memory.large,
     )
 
 
