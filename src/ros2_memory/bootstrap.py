@@ -15,10 +15,9 @@ import os
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 
-from hydra.errors import HydraException
-from hydra.utils import instantiate
+from hydra.utils import get_class
 
 from ros2_memory import PACKAGE, package_version
 from ros2_memory.config import (
@@ -40,9 +39,7 @@ from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.telemetry import SILENT, Observer, Telemetry
 from ros2_memory.core.timebase import WallClock, ns_from_unix
-from ros2_memory.recorder.base import Recorder
 from ros2_memory.retention.policy import GB, RetentionLimits
-from ros2_memory.storage.base import BagReader
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -58,6 +55,7 @@ if TYPE_CHECKING:
     from ros2_memory.fleet.robots import Fleet
     from ros2_memory.history.context import Memory, QuerySettings
     from ros2_memory.recorder.background import Background
+    from ros2_memory.recorder.base import Recorder
     from ros2_memory.recorder.days import MemoryDays
     from ros2_memory.recorder.housekeeping import Housekeeping
     from ros2_memory.retention.repair import Repairer
@@ -66,13 +64,11 @@ if TYPE_CHECKING:
     from ros2_memory.serving.backfill import Backfill
     from ros2_memory.serving.dispatch import Dispatcher
     from ros2_memory.serving.mcp_server import EpisodicServer
-    from ros2_memory.storage.base import BagWriter
+    from ros2_memory.storage.base import BagReader, BagWriter
     from ros2_memory.triggers.exclusion import ExclusionRule
     from ros2_memory.triggers.rules import Rule
     from ros2_memory.triggers.screening import Screening
     from ros2_memory.triggers.watch import Triggers
-
-_Port = TypeVar("_Port")
 
 log = get_logger(__name__)
 
@@ -108,12 +104,12 @@ def build_reader(
     `large` is the turn to hold much of a bag, where several threads read.
 
     Raises:
-        ConfigError: it cannot be built.
+        ConfigError: it is refused.
     """
     options: dict[str, object] = {"large": large}
     if cache_mb is not None:
         options["cache_mb"] = cache_mb
-    return instantiated("storage", settings.storage, BagReader, **options)  # type: ignore[type-abstract]  # only compared with
+    return cast("BagReader", instantiated(settings.storage, **options))
 
 
 def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
@@ -122,35 +118,14 @@ def build_recorder(settings: Settings, **collaborators: object) -> Recorder:
     `collaborators` are arguments of its constructor that are not plain values.
 
     Raises:
-        ConfigError: it cannot be built.
+        ConfigError: it is refused.
     """
-    return instantiated("recorder", settings.recorder, Recorder, **collaborators)  # type: ignore[type-abstract]  # as above
+    return cast("Recorder", instantiated(settings.recorder, **collaborators))
 
 
-def instantiated(key: str, node: AdapterNode, port: type[_Port], **collaborators: object) -> _Port:
-    """Returns an adapter of a port, built by Hydra of a section of the configuration.
-
-    Args:
-        key: of the section.
-        node: the section.
-        port: what the adapter must be.
-        collaborators: arguments of its constructor that are not plain values.
-
-    Raises:
-        ConfigError: it cannot be built.
-    """
-    try:
-        # `all`: the adapter receives plain lists, not OmegaConf's. `partial`: collaborators do not
-        # go through a configuration, which would copy them.
-        partial: object = instantiate(
-            {"_target_": node.target, "_convert_": "all", "_partial_": True}, **node.arguments
-        )
-    except HydraException as error:
-        raise ConfigError(f"{key}: {node.target} cannot be built: {error}") from error
-    built: object = partial(**collaborators) if callable(partial) else None
-    if not isinstance(built, port):
-        raise ConfigError(f"{key}: {node.target} is not a {port.__name__}")
-    return built
+def instantiated(node: AdapterNode, **collaborators: object) -> object:
+    """Returns the adapter of a section; `collaborators` are arguments that are no plain values."""
+    return get_class(node.target)(**{**node.arguments, **collaborators})
 
 
 def retention_limits(settings: Settings) -> RetentionLimits:
@@ -728,7 +703,6 @@ def build_dispatcher(
         telemetry=telemetry,
         log_arguments=settings.logging.arguments,
         most_questions=server.keep_questions,
-        large=memory.large,
     )
 
 

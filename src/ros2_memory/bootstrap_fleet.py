@@ -8,7 +8,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
 import yaml
 
@@ -97,14 +97,13 @@ def open_lake(settings: Settings, node: DuckdbNode) -> Lake:
     """
     location = lake_location(settings)
     require_extra("lake: duckdb", "lake", "duckdb")
-    from ros2_memory.lake.engine import Lake
-
     opened = ExitStack()
     atexit.register(opened.close)
     # DuckDB complains at the end about objects that the garbage collector may not look at.
     opened.callback(gc.unfreeze)
     catalog = opened.enter_context(location.opened())
-    lake = instantiated("lake.engine", node, Lake, catalog=catalog, translated=location.translated)
+    engine = instantiated(node, catalog=catalog, translated=location.translated)
+    lake = cast("Lake", engine)
     opened.callback(lake.close)
     return lake
 

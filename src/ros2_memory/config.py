@@ -18,7 +18,7 @@ import os
 import re
 import sys
 from contextlib import contextmanager, suppress
-from dataclasses import fields
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 from typing import (
@@ -434,8 +434,7 @@ class AdapterNode:
     @property
     def arguments(self) -> dict[str, object]:
         """Returns the constructor's keyword arguments."""
-        names = (field.name for field in fields(self) if field.name != "target")
-        return {name: getattr(self, name) for name in names}
+        return {name: value for name, value in asdict(self).items() if name != "target"}
 
 
 @section

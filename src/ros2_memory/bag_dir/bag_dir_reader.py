@@ -154,10 +154,6 @@ class BagDirReader(BagReader):
         """Returns every channel that the file declares."""
         return self._reader.channels(self._located(path))
 
-    def profile(self, path: Path) -> str:
-        """Returns the profile of the file."""
-        return self._reader.profile(self._located(path))
-
     def undecodable(self, channel: Channel) -> str | None:
         """Returns what the adapter returns."""
         return self._reader.undecodable(channel)

@@ -12,7 +12,6 @@ from ros2_memory.bootstrap import require_extra
 from ros2_memory.cli.options import AsJson, Bags, Times
 from ros2_memory.cli.output import made_whole, print_json, print_line, print_notes, spinner
 from ros2_memory.core.errors import (
-    BagError,
     InvalidArgumentsError,
     NoDataError,
     NoDataReason,
@@ -26,7 +25,7 @@ from ros2_memory.history.coverage import lost_in, note_unread, unix_text
 from ros2_memory.history.no_data import require_bags
 from ros2_memory.history.stored_message import StoredMessage
 from ros2_memory.history.view import View
-from ros2_memory.storage.base import ROS2_PROFILE, BagReader, Channel, Record
+from ros2_memory.storage.base import BagReader, Channel, Record
 from ros2_memory.storage.mcap.writer import McapWriter
 
 
@@ -85,8 +84,7 @@ def export(
     with spinner("exporting"):
         if mcap is not None:
             undefined: list[str] = []
-            profile = profile_of(view, topics, window, earlier)
-            count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined), profile)
+            count = write_mcap(mcap, with_definitions(messages, memory.reader, undefined))
             lacking, where = describe_undefined(undefined), f"in {mcap}"
         elif parquet is not None:
             count, files, lacking = _write_parquet(parquet, messages, memory, robot)
@@ -152,21 +150,6 @@ def _latched_before(view: View, topics: Sequence[str], start: Ns) -> list[Stored
     return sorted(once.values(), key=lambda stored: stored.time)
 
 
-def profile_of(
-    view: View, topics: Sequence[str], window: TimeWindow, earlier: Sequence[StoredMessage]
-) -> str:
-    """Returns the MCAP profile of all bags that hold the messages; empty if they differ."""
-    chosen = frozenset(topics)
-    within = view.timeline.overlapping(window)
-    bags = {bag.path for bag in within if not chosen.isdisjoint(bag.summary.schema.positions)}
-    profiles: set[str] = set()
-    for path in bags | {stored.bag.path for stored in earlier}:
-        # A bag that cannot be read is reported when its messages are read.
-        with suppress(BagError):
-            profiles.add(view.memory.reader.profile(path))
-    return profiles.pop() if len(profiles) == 1 else ""
-
-
 def with_definitions(
     messages: Iterator[StoredMessage], reader: BagReader, undefined: list[str]
 ) -> Iterator[StoredMessage]:
@@ -200,7 +183,7 @@ def describe_undefined(types: Sequence[str]) -> str:
     )
 
 
-def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS2_PROFILE) -> int:
+def write_mcap(path: Path, messages: Iterator[StoredMessage]) -> int:
     """Writes an MCAP file, which appears when it is complete; returns the number of messages.
 
     Raises:
@@ -224,7 +207,7 @@ def write_mcap(path: Path, messages: Iterator[StoredMessage], profile: str = ROS
             yield stored.record
 
     with made_whole(path) as temporary:
-        McapWriter().write(temporary, records(), profile=profile)
+        McapWriter().write(temporary, records())
     return written
 
 

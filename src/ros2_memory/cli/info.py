@@ -21,14 +21,14 @@ from ros2_memory.cli.output import (
     with_shorter_lists,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.model import BagFile, JsonValue, TimeWindow
+from ros2_memory.core.model import BagFile, JsonValue
 from ros2_memory.core.reply import JsonObject, Scope, shown
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
+from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.index.recordings import name_of, recordings_of
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import budget_of, nothing_here
+from ros2_memory.insights.status import budget_of, nothing_here, usual_rate
 from ros2_memory.queries import list_recorded_topics
 from ros2_memory.results import Budget, TopicRow
 
@@ -37,8 +37,6 @@ _TOLD_TWICE: Final = frozenset(
 )
 _MOST_SILENT: Final = 30
 _OF_RECORDER: Final = frozenset({"recorder", "recorder_alive"})
-_SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
-_RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 
 
 def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
@@ -92,25 +90,6 @@ def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
         f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
         for note, topics in topics_by_note.items()
     ]
-
-
-def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
-    """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
-
-    None for a latched topic, for a log, whose lines come when something happens, and if no bag has
-    two messages of it, or all came at once.
-    """
-    if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
-        return None
-    last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
-    window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
-    bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
-    parts = [part for bag in bags for part in bag.summary.of(topic)]
-    intervals = sum(part.count - 1 for part in parts)
-    duration = sum(part.last - part.first for part in parts)
-    if not intervals or duration < _SHORTEST_RATED_NS:
-        return None
-    return round(intervals / unix_from_ns(duration), 2)
 
 
 def info(as_json: AsJson = False, *, bags: Bags) -> bool:

@@ -7,7 +7,6 @@ it never reach the terminal.
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import sys
@@ -380,9 +379,7 @@ def format_time(unix_s: float) -> str:
     Every option that takes a time reads it, and it is one word for a shell. Where clocks were set
     back, and the time occurs twice, it has its offset.
     """
-    fraction, whole = math.modf(unix_s)
-    microseconds = int(whole) * 1_000_000 + round(fraction * 1e6)
-    return local_time(microseconds * NS_PER_US).isoformat(timespec="microseconds")
+    return local_time(round(unix_s * 1e6) * NS_PER_US).isoformat(timespec="microseconds")
 
 
 def format_duration(seconds: float) -> str:

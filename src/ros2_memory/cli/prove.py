@@ -16,7 +16,7 @@ import typer
 
 from ros2_memory.bootstrap import build_dispatcher
 from ros2_memory.cli.ask import call_tools, question_for
-from ros2_memory.cli.export import describe_undefined, profile_of, with_definitions, write_mcap
+from ros2_memory.cli.export import describe_undefined, with_definitions, write_mcap
 from ros2_memory.cli.options import LOOKING, AsJson, Bags, is_folder, load_to_look, open_memory
 from ros2_memory.cli.output import print_line, print_notes, spinner
 from ros2_memory.columns.scanner import Scanner
@@ -189,7 +189,7 @@ def _write(
 
     Returns how many; collects types without a definition.
     """
-    profile, count = profile_of(view, [*spans], TimeWindow.everything(), ()), 0
+    count = 0
     whole = [(None, TimeWindow.everything())]
     for nth, (recording, window) in enumerate(whole if path.suffix == ".mcap" else parts):
         file = path
@@ -204,7 +204,7 @@ def _write(
         )
         with suppress(NoDataError):  # all that it has, another recording has too
             defined = with_definitions(stored_messages, view.memory.reader, undefined)
-            count += write_mcap(file, defined, profile)
+            count += write_mcap(file, defined)
     return count
 
 

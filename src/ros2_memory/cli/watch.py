@@ -15,7 +15,6 @@ from rich.table import Table
 from rich.text import Text
 
 from ros2_memory.bag_dir.heartbeat import RecorderState
-from ros2_memory.cli.info import usual_rate
 from ros2_memory.cli.options import AsJson, Bags
 from ros2_memory.cli.output import (
     escape,
@@ -35,7 +34,7 @@ from ros2_memory.history.coverage import cut_spans
 from ros2_memory.history.scan import count_messages
 from ros2_memory.history.view import View
 from ros2_memory.index.snapshot import Snapshot
-from ros2_memory.insights.status import memory_status
+from ros2_memory.insights.status import memory_status, usual_rate
 from ros2_memory.results import Status
 
 WINDOW_NS: Final[Ns] = 10 * NS_PER_S

@@ -24,12 +24,12 @@ from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, NS_PER_US, Ns
 from ros2_memory.demo import robot
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Iterator, Mapping
 
     from rosbags.interfaces.typing import FieldDesc
     from rosbags.typesys.store import Typestore
 
-    from ros2_memory.demo.robot import Planar, SimulatedThing
+    from ros2_memory.demo.robot import Planar
 
 ODOM: Final = "/odom"
 TF: Final = "/tf"
@@ -123,15 +123,12 @@ def _delay(stream: Stream, k: int) -> Ns:
 
 VISION_DEFINITIONS: Final = {
     "ros2_vision_interfaces/msg/VisionDetection": (
-        "string label\nfloat32 score\ngeometry_msgs/Point point\nint32[4] bbox\n"
+        "string label\nfloat32 score\ngeometry_msgs/Point point\n"
     ),
     "ros2_vision_interfaces/msg/VisionDetectionArray": (
         "std_msgs/Header header\nstring skill\nVisionDetection[] detections\n"
     ),
 }
-_FOCAL_PX: Final = 320.0
-_CENTRE_PX: Final = np.array([320.0, 240.0])
-_THING_M: Final = 0.15
 
 Body: TypeAlias = "dict[str, object]"
 """Fields of a message by name; others are zero or empty."""
@@ -148,13 +145,6 @@ def payload(message: Message) -> bytes:
 def definition(type_name: str) -> str:
     """Returns the type's ros2msg text with all nested definitions, as bags contain it."""
     return _typestore().generate_msgdef(type_name, ros_version=2)[0]
-
-
-def listed_in_words(names: Sequence[str]) -> str:
-    """Returns names for a sentence: `shoes, plant and umbrella`."""
-    if not names:
-        return "nothing"
-    return " and ".join([", ".join(names[:-1]), names[-1]] if names[1:] else names)
 
 
 @cache
@@ -191,7 +181,6 @@ def _detections(message: Message) -> Body:
             "label": thing.label,
             "score": thing.score,
             "point": _xyz(*thing.point),
-            "bbox": _bounding_box(thing),
         }
         for thing in robot.seen(message.t)
     ]
@@ -220,16 +209,6 @@ def _twist(message: Message) -> Body:
 def _transform(message: Message, parent: str, child: str, at: Planar, z: float = 0.0) -> Body:
     moved = {"translation": _xyz(at.x, at.y, z), "rotation": _rotation(at.yaw)}
     return {**_headed(message, parent), "child_frame_id": child, "transform": moved}
-
-
-def _bounding_box(thing: SimulatedThing) -> list[int]:
-    """Returns the pixels (left, top, right, bottom) in a pinhole camera, clipped to the image."""
-    ahead, left, up = np.subtract(thing.point, robot.CAMERA)
-    depth = max(ahead, _THING_M)
-    middle = _CENTRE_PX - _FOCAL_PX * np.array([left, up]) / depth
-    half = _FOCAL_PX * _THING_M / depth
-    corners = np.clip([middle - half, middle + half], 0, 2 * _CENTRE_PX)
-    return [round(edge) for edge in corners.flat]
 
 
 def _fixed(message: Message) -> Body:

@@ -34,7 +34,6 @@ from ros2_memory.demo.messages import (
     Message,
     MessageSchedule,
     Stream,
-    listed_in_words,
 )
 from ros2_memory.demo.robot import Planar, room_at
 
@@ -312,7 +311,7 @@ def _in_words(t: float) -> dict[str, str]:
         "facing": f"{math.degrees(yaw):.0f} degrees",
         "motion": f"{abs(forward):.2f} m/s {way}, {turn if abs(rate) >= 1 else 'straight on'}",
         "charge": f"{robot.battery(t):.1%}",
-        "objects": listed_in_words([thing.label for thing in robot.seen(t)]),
+        "objects": ", ".join(thing.label for thing in robot.seen(t)) or "nothing",
     }
 
 

@@ -8,7 +8,7 @@ velocity are continuous, and velocity, distance and pose are exact.
 Poses are in `odom`, whose origin is the dock and whose x axis points north; `MAP_TO_ODOM` says
 where that is in `map`, the frame of the flat. Frames and axes follow REP-103 and REP-105.
 
-The flat has three rooms in a row, walls between them, and objects. Its coordinates are metres in
+The flat has three rooms in a row, no walls between them, and objects. Its coordinates are metres in
 `map`: x points east, y north, z up. The living room is in the west, the kitchen in the east, the
 hall between them; its front door is in the north wall.
 """
@@ -20,28 +20,11 @@ from bisect import bisect_right
 from itertools import accumulate
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-import numpy as np
-
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from numpy.typing import NDArray
-
     from ros2_memory.core.model import Vector3
 
-
-_HALL_WEST: Final = 5.0
-_HALL_EAST: Final = 7.0
-_EAST: Final = 11.0
-_NORTH: Final = 4.0
-_WALLS: Final = np.array(
-    [
-        # x0, y0, x1, y1
-        *((0.0, y, _EAST, y) for y in (0.0, _NORTH)),
-        *((x, 0.0, x, _NORTH) for x in (0.0, _EAST)),
-        *((x, *ys) for x in (_HALL_WEST, _HALL_EAST) for ys in ((0.0, x, 1.5), (2.5, x, _NORTH))),
-    ]
-)
 
 THINGS: Final[Mapping[str, Vector3]] = {
     "sofa": (2.8, 3.6, 0.4),
@@ -60,9 +43,9 @@ THINGS: Final[Mapping[str, Vector3]] = {
 
 
 ROOMS: Final[Mapping[str, tuple[float, float, float, float]]] = {
-    "living room": (0.0, _HALL_WEST, 0.0, _NORTH),
-    "hall": (_HALL_WEST, _HALL_EAST, 0.0, _NORTH),
-    "kitchen": (_HALL_EAST, _EAST, 0.0, _NORTH),
+    "living room": (0.0, 5.0, 0.0, 4.0),
+    "hall": (5.0, 7.0, 0.0, 4.0),
+    "kitchen": (7.0, 11.0, 0.0, 4.0),
 }
 """The rooms: from and to which x, and from and to which y (m)."""
 
@@ -72,31 +55,8 @@ def room_at(x: float) -> str:
     return next((name for name, (_, end, *_) in ROOMS.items() if x < end), "kitchen")
 
 
-def wall_distances(x: float, y: float, bearings: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the distance (m) from (x, y) to the nearest wall along each bearing (rad, from east).
-
-    Ray and segment: with ray o + r d and wall p + s (q - p), r = (p - o) x (q - p) / d x (q - p)
-    and s = (p - o) x d / d x (q - p). Walls are met from inside the flat, so every ray ends.
-    """
-    cos, sin = np.cos(bearings)[:, None], np.sin(bearings)[:, None]
-    from_x, from_y = _WALLS[:, 0] - x, _WALLS[:, 1] - y
-    along_x, along_y = _WALLS[:, 2] - _WALLS[:, 0], _WALLS[:, 3] - _WALLS[:, 1]
-    across = cos * along_y - sin * along_x
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ray = (from_x * along_y - from_y * along_x) / across
-        wall = (from_x * sin - from_y * cos) / across
-    met = (across != 0.0) & (ray > 0.0) & (wall >= 0.0) & (wall <= 1.0)
-    nearest: NDArray[np.float64] = np.where(met, ray, np.inf).min(axis=1)
-    return nearest
-
-
-def wrapped(angle: float) -> float:
-    """Returns the same direction in (-pi, pi]."""
-    return math.pi - (math.pi - angle) % (2.0 * math.pi)
-
-
 class Planar(NamedTuple):
-    """A pose in the plane: metres, and `yaw` in radians from the x axis, in (-pi, pi]."""
+    """A pose in the plane: metres, and `yaw` in radians from the x axis, in [-pi, pi]."""
 
     x: float
     y: float
@@ -108,7 +68,7 @@ class Planar(NamedTuple):
         return Planar(
             self.x + cos * step.x - sin * step.y,
             self.y + sin * step.x + cos * step.y,
-            wrapped(self.yaw + step.yaw),
+            math.remainder(self.yaw + step.yaw, math.tau),
         )
 
     def inverse(self) -> Planar:
@@ -180,7 +140,6 @@ _POSES: Final = tuple(
 )
 _DRIVEN: Final = tuple(accumulate((abs(leg.length) for leg in LAP), initial=0.0))
 
-_AHEAD: Final = np.radians(np.arange(-15.0, 16.0))
 CLEAR_M: Final = 1.0
 SIGHT_M: Final = 3.0
 SIGHT_HALF_ANGLE: Final = math.radians(40.0)
@@ -217,25 +176,23 @@ def place(t: float) -> str:
 
 
 def seen(t: float) -> tuple[SimulatedThing, ...]:
-    """Returns the objects in the camera's view, nearest first: in range, and behind no wall."""
+    """Returns the objects in the camera's view and range, nearest first."""
     ahead, aside, _ = CAMERA
     camera = pose_in_map(t).then(Planar(ahead, aside, 0.0))
     things: list[SimulatedThing] = []
     for label, (x, y, z) in THINGS.items():
         x, y, _ = camera.inverse().then(Planar(x, y, 0.0))  # noqa: PLW2901
         bearing, distance = math.atan2(y, x), math.hypot(x, y)
-        if distance > SIGHT_M or abs(bearing) > SIGHT_HALF_ANGLE:
-            continue
-        if wall_distances(camera.x, camera.y, np.array([camera.yaw + bearing]))[0] >= distance:
+        if distance <= SIGHT_M and abs(bearing) <= SIGHT_HALF_ANGLE:
             score = round(0.97 - 0.1 * distance, 2)
             things.append(SimulatedThing(label, score, (x + ahead, y + aside, z)))
     return tuple(sorted(things, key=lambda thing: -thing.score))
 
 
 def path_clear(t: float) -> bool:
-    """Returns whether no wall within 15 degrees of straight ahead is nearer than `CLEAR_M`."""
-    laser = pose_in_map(t).then(Planar(LASER[0], LASER[1], 0.0))
-    return bool(wall_distances(laser.x, laser.y, laser.yaw + _AHEAD).min() > CLEAR_M)
+    """Returns whether what is `CLEAR_M` straight ahead of the laser is in a room."""
+    x, y, _ = pose_in_map(t).then(Planar(LASER[0] + CLEAR_M, 0.0, 0.0))
+    return any(west < x < east and south < y < north for west, east, south, north in ROOMS.values())
 
 
 def battery(t: float) -> float:

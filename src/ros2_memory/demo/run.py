@@ -96,12 +96,8 @@ def connection_hints(url: str) -> str:
 
 
 def _reply(text: str) -> Iterator[str]:
-    """Yields the JSON as received, broken after commas; of a long one the start and its length."""
-    lines = [""]
-    for piece in re.findall(r"[^,]*,|[^,]+$", text):
-        if lines[-1] and len(_INDENT) + len(lines[-1]) + len(piece) > WIDTH:
-            lines.append("")
-        lines[-1] += piece
+    """Yields the JSON as received, in lines; of a long one the start and its length."""
+    lines = textwrap.wrap(text, WIDTH - len(_INDENT), break_on_hyphens=False)
     for line in lines[:_JSON_LINES]:
         yield _INDENT + line
     if len(lines) > _JSON_LINES:

@@ -11,7 +11,7 @@ from ros2_memory.bag_dir.state_files import describe_leaving, read_thinned
 from ros2_memory.core.errors import RefusedError
 from ros2_memory.core.model import BagFile, BagState, SetAside, TimeWindow
 from ros2_memory.core.text import counted, listed
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.timebase import NS_PER_MS, NS_PER_S, Ns, unix_from_ns
 from ros2_memory.history.clock_steps import clock_steps
 from ros2_memory.history.coverage import (
     cut_spans,
@@ -34,7 +34,7 @@ from ros2_memory.retention.inventory import state_bytes_in
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from ros2_memory.history.context import Call, Memory
+    from ros2_memory.history.context import Call, Latching, Memory
     from ros2_memory.index.snapshot import Snapshot
 
 SILENT_AFTER_NS: Final[Ns] = 10 * NS_PER_S
@@ -49,6 +49,8 @@ _MIN_MESSAGES: Final = 5
 """A topic with fewer messages has no usual period."""
 _GROWTH_NS: Final[Ns] = 24 * 3600 * NS_PER_S
 """Growth is measured over the newest data of this length."""
+_SHORTEST_RATED_NS: Final[Ns] = 10 * NS_PER_MS
+_RATE_WINDOW_NS: Final[Ns] = 3600 * NS_PER_S
 _LEAST_GROWTH_NS: Final[Ns] = NS_PER_S
 """Of less data no growth is reported: some latched messages would make terabytes a day."""
 
@@ -351,3 +353,22 @@ def _why_undecodable(view: View, topic: str, type_name: str) -> str | None:
         if channel.topic == topic and channel.type == type_name
     ]
     return next(filter(None, reversed(reasons)), None)
+
+
+def usual_rate(snapshot: Snapshot, topic: str, latching: Latching) -> float | None:
+    """Returns the rate (Hz) of a topic in its newest hour, without the gaps between bags.
+
+    None for a latched topic, for a log, whose lines come when something happens, and if no bag has
+    two messages of it, or all came at once.
+    """
+    if latching.is_latched(snapshot, topic) or snapshot.timeline.is_log(topic):
+        return None
+    last = max((total.last for total in snapshot.timeline.totals(topic).values()), default=0)
+    window = TimeWindow(last - _RATE_WINDOW_NS, last + 1)
+    bags = dict.fromkeys(bag for bag, *_ in snapshot.timeline.extents(topic, window))
+    parts = [part for bag in bags for part in bag.summary.of(topic)]
+    intervals = sum(part.count - 1 for part in parts)
+    duration = sum(part.last - part.first for part in parts)
+    if not intervals or duration < _SHORTEST_RATED_NS:
+        return None
+    return round(intervals / unix_from_ns(duration), 2)

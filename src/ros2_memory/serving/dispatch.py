@@ -27,7 +27,6 @@ from ros2_memory.core.errors import (
     NoDataError,
     QueryTimeoutError,
 )
-from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
 from ros2_memory.core.malloc import return_free_memory
 from ros2_memory.core.telemetry import SILENT, UNKNOWN_TOOL, Answered, Telemetry
@@ -116,8 +115,7 @@ class Dispatcher:
     """Answers tool calls from one memory, a bounded number at a time.
 
     `readable`: tools that only the resources use. `log_arguments`: whether log events show what a
-    caller wrote, cut short. `most_questions`: how many calls are kept for the page. `large`: the
-    turn of the memory's reader to hold much of a bag.
+    caller wrote, cut short. `most_questions`: how many calls are kept for the page.
 
     Attributes:
         memory: what answers.
@@ -139,9 +137,7 @@ class Dispatcher:
         telemetry: Telemetry = SILENT,
         log_arguments: bool = True,
         most_questions: int = 0,
-        large: LargeReads | None = None,
     ) -> None:
-        self._large = large or LargeReads()
         self.tools = (*tools,)
         self.questions = QuestionLog(most_questions)
         self.memory = memory
@@ -357,7 +353,7 @@ class Dispatcher:
         begun = time.monotonic()
         try:
             # Around all of it: an error keeps what was read alive until it has become a reply.
-            with call.reading(self._large):
+            with call.reading(self.memory.large):
                 try:
                     return "ok", answer()
                 except QueryTimeoutError as error:

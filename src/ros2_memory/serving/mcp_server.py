@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 from contextlib import suppress
-from importlib import resources
 from typing import TYPE_CHECKING, Final, TypeAlias
 from urllib.parse import unquote
 
@@ -35,8 +34,8 @@ from mcp.types import (
 from mcp.types import Tool as ListedTool
 from starlette.requests import Request
 
-from ros2_memory.serving import page
 from ros2_memory.serving.auth import robots_of
+from ros2_memory.serving.page import joined
 from ros2_memory.serving.stdio import stdio_messages
 from ros2_memory.tools.instructions import prompt
 
@@ -59,14 +58,9 @@ _SCRIPTS: Final = ("text.js", "map.js", "timeline.js", "reply.js", "chat.js")
 
 def view() -> ReadResourceContents:
     """Returns the document."""
-    html = _joined(("chat.html",)).replace("<style></style>", f"<style>{_joined(_STYLES)}</style>")
-    html = html.replace("<script></script>", f"<script>{_joined(_SCRIPTS)}</script>")
+    html = joined(("chat.html",)).replace("<style></style>", f"<style>{joined(_STYLES)}</style>")
+    html = html.replace("<script></script>", f"<script>{joined(_SCRIPTS)}</script>")
     return ReadResourceContents(html, APP_MIME_TYPE, {"ui": {"prefersBorder": True}})
-
-
-def _joined(names: Iterable[str]) -> str:
-    folder = resources.files(page)
-    return "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
 
 
 MESSAGES_PATH: Final = "/messages/"

@@ -135,7 +135,12 @@ def web_app(
         *(page or ()),
     ]
     if metrics is not None:
-        routes.append(_metrics_route(metrics))
+
+        async def show_metrics(_request: Request) -> Response:
+            exposition = await metrics()
+            return Response(exposition.body, headers={"content-type": exposition.content_type})
+
+        routes.append(Route(METRICS_PATH, show_metrics, methods=["GET"]))
     app: ASGIApp = RequestLimits(Starlette(routes=routes, lifespan=lifespan))
     if needs_token:
         app = TokenGate(app, api_token, limited=limited)
@@ -143,14 +148,6 @@ def web_app(
         # The page comes before the token: it holds no data, and asks for the token.
         app = Page(app)
     return ForgeryGuard(app, host, admits=not needs_token)
-
-
-def _metrics_route(metrics: Callable[[], Awaitable[Exposition]]) -> Route:
-    async def show_metrics(_request: Request) -> Response:
-        exposition = await metrics()
-        return Response(exposition.body, headers={"content-type": exposition.content_type})
-
-    return Route(METRICS_PATH, show_metrics, methods=["GET"])
 
 
 def _session_manager(

@@ -329,16 +329,6 @@ class BagReader(ABC):
             BagError: they cannot be read.
         """
 
-    def profile(self, path: Path) -> str:
-        """Returns the MCAP profile of the file: `ros2`, or the one in its header.
-
-        Raises:
-            BagVanishedError: the file is not there.
-            BagError: it cannot be read.
-        """
-        del path
-        return ROS2_PROFILE
-
     @abstractmethod
     def decode(self, record: Record) -> object:
         """Decodes a message: an attribute object for a ROS type, a plain value for JSON.
@@ -476,15 +466,15 @@ class BagWriter(ABC):
         path: Path,
         records: Iterable[Record],
         *,
-        profile: str = ROS2_PROFILE,
         dense: bool = False,
     ) -> None:
         """Writes a bag of these messages, in the order given.
 
         Payloads, both times, definitions and the metadata of channels are unchanged; ROS 2
-        types are named `package/msg/Name`, as every reader knows them. `profile` is MCAP's. With
-        `dense` the file is a third smaller, and to read one message of it takes longer. The bag
-        is on the disk when this returns. There must be no file of that name.
+        types are named `package/msg/Name`, as every reader knows them. MCAP's profile is `ros2`
+        where the first message is CDR, else empty. With `dense` the file is a third smaller, and
+        to read one message of it takes longer. The bag is on the disk when this returns. There
+        must be no file of that name.
 
         Raises:
             BagError: it cannot be written; or what `records` raises.

@@ -286,11 +286,6 @@ class FileReader(BagReader):
         with reading(path), self._open(path) as (bags, file, _):
             return bags.channels(file)
 
-    def profile(self, path: Path) -> str:
-        """Returns the profile in the header of an MCAP file; `ros2` for a sqlite file."""
-        with reading(path), self._open(path) as (bags, file, _):
-            return bags.profile(file)
-
     def undecodable(self, channel: Channel) -> str | None:
         """Returns why no message of this channel can be decoded, or None."""
         decoder = self._decoder(channel)

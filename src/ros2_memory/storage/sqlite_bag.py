@@ -29,7 +29,6 @@ from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.text import counted
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.storage.base import (
-    ROS2_PROFILE,
     Batch,
     Channel,
     Closing,
@@ -186,11 +185,6 @@ class SqliteBags:
         """Returns the topics declared in the file."""
         with self._opened(path) as (_, topics):
             return list(topics.channels.values())
-
-    def profile(self, path: Path) -> str:
-        """Returns the profile of ROS 2: no other program writes such files."""
-        with OpenFile(path):
-            return ROS2_PROFILE
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, cast
 
 import anyio
@@ -11,6 +12,7 @@ import pytest
 
 from ros2_memory import results
 from ros2_memory.core.errors import NoDataError, NoDataReason
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import Sample
 from ros2_memory.core.telemetry import UNKNOWN_TOOL, Answered, Observer, Telemetry
 from ros2_memory.history.context import Memory
@@ -64,7 +66,8 @@ def dispatcher(*observers: Observer) -> Dispatcher:
     ]
     replies = Replies(Path("bags"), 1000)
     telemetry = Telemetry(observers)
-    return Dispatcher(cast("Memory", None), tools, replies, call_timeout_s=5, telemetry=telemetry)
+    nobody = cast("Memory", SimpleNamespace(large=LargeReads()))
+    return Dispatcher(nobody, tools, replies, call_timeout_s=5, telemetry=telemetry)
 
 
 @pytest.mark.parametrize(

@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import sys
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, cast
 
 import anyio
 import pytest
 
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.fleet.tools import fleet_tools
 from ros2_memory.history.context import QuerySettings
 from ros2_memory.serving.dispatch import Dispatcher
@@ -22,6 +24,8 @@ from tests.support.fleets import CALLS, TOOLS, fleet_over, seeded, write_robot
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from pathlib import Path
+
+    from ros2_memory.history.context import Memory
 
 OTHER = "zq7"
 MINE = ("r1", "r3")
@@ -81,8 +85,8 @@ def pair(folder: Path) -> Iterator[tuple[Dispatcher, Dispatcher]]:
     def over(names: tuple[str, ...]) -> Dispatcher:
         tools = fleet_tools(build_tools(QuerySettings()), fleet_over(folder, names), 24_000)
         # The memory is that of no robot.
-        none: Any = None
-        return Dispatcher(none, tools, Replies(folder / "none", 24_000), call_timeout_s=60)
+        nobody = cast("Memory", SimpleNamespace(large=LargeReads()))
+        return Dispatcher(nobody, tools, Replies(folder / "none", 24_000), call_timeout_s=60)
 
     both = over(("r1", OTHER, "r3")), over(MINE)
     yield both

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from ros2_memory.cli.info import usual_rate
 from ros2_memory.core.errors import NoDataError
 from ros2_memory.core.model import TimeWindow
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory, QuerySettings
 from ros2_memory.history.view import AtTime
 from ros2_memory.index.segment import Pace, TopicTotals
-from ros2_memory.insights.status import memory_status
+from ros2_memory.insights.status import memory_status, usual_rate
 from ros2_memory.queries import position, topic_value, value_when
 from ros2_memory.storage.mcap_reader import McapReader
 from ros2_memory.tools.replies import Replies

@@ -192,7 +192,6 @@ class TestTheBagOfCarriedMessages:
                 path: Path,
                 records: Iterable[Record],
                 *,
-                profile: str = "ros2",
                 dense: bool = False,
             ) -> None:
                 raise BagError(str(path), "it cannot be written: No space left on device")

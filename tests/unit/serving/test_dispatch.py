@@ -8,6 +8,7 @@ import json
 import re
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, cast
 
 import anyio
@@ -26,6 +27,7 @@ from ros2_memory.core.errors import (
     NoDataReason,
     QueryTimeoutError,
 )
+from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.model import Sample
 from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.dispatch import BLOCKING_AT_ONCE, QUICK_AT_ONCE, Dispatcher
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.results import Answer
 
-NOBODY = cast("Memory", None)
+NOBODY = cast("Memory", SimpleNamespace(large=LargeReads()))
 """The tools of these tests ask nothing of a memory."""
 
 

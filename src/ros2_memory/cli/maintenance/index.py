@@ -9,8 +9,8 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Final
 
@@ -61,6 +61,7 @@ def index(
     only the speed of answers.
     """
     keep_freed()
+    gc.set_threshold(*_RARELY)
     settings, _ = load_given(bag_dir, words)
     if for_server is not None:
         _fill_for_server(settings, for_server)
@@ -135,36 +136,22 @@ def fill_store(backfill: Backfill, show: Callable[[Progress], None] = lambda _: 
 
     A bag that changed a few seconds ago is left for a later run.
     """
-    with _garbage_collected_rarely():
-        goes_on = True
-        while goes_on:
-            progress = backfill.progress()
-            done = tried = 0
-            for nth, batch in enumerate(backfill.batches(), start=1):
-                if tried >= _BATCH:
-                    break
-                show(replace(progress, stored=min(progress.stored + done, progress.closed)))
-                tried += len(batch.bags)
-                done += backfill.store(batch)
-                if nth % _FOLLOWED == 0:
-                    backfill.follow()
-            goes_on = backfill.follow() or done > 0
+    goes_on = True
+    while goes_on:
+        progress = backfill.progress()
+        done = tried = 0
+        for nth, batch in enumerate(backfill.batches(), start=1):
+            if tried >= _BATCH:
+                break
+            show(replace(progress, stored=min(progress.stored + done, progress.closed)))
+            tried += len(batch.bags)
+            done += backfill.store(batch)
+            if nth % _FOLLOWED == 0:
+                backfill.follow()
+        goes_on = backfill.follow() or done > 0
     backfill.prune()
     backfill.precompute()
     return backfill.progress()
-
-
-@contextmanager
-def _garbage_collected_rarely() -> Iterator[None]:
-    """Has Python look for unused cycles rarely in the block, and not among what there is now."""
-    before = gc.get_threshold()
-    gc.freeze()
-    gc.set_threshold(*_RARELY)
-    try:
-        yield
-    finally:
-        gc.set_threshold(*before)
-        gc.unfreeze()
 
 
 def describe_progress(progress: Progress) -> str:

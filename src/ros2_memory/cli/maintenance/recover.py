@@ -5,7 +5,6 @@ that another recorder wrote, copies on a laptop, files so large that a recorder 
 """
 
 from collections.abc import Collection
-from contextlib import suppress
 from dataclasses import KW_ONLY, asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Final
@@ -53,16 +52,19 @@ def recover(
 
     Shows what it would change and asks first, where another program made the recording.
     """
-    if not (yes or dry_run) and (others := foreign_unfinished(path)):
-        if as_json:
-            raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
-        for line in recover_files(path, force=force, dry_run=True).lines:
-            print_line(line)
-        why = "was not made by this recorder" if len(others) == 1 else "were not made by it"
-        typer.confirm(f"{listed([*map(str, others)])} {why}. Change this?", abort=True)
+    if not (yes or dry_run):
+        planned = recover_files(path, force=force, dry_run=True)
+        if others := [*filter(is_foreign, sorted(planned.changed))]:
+            if as_json:
+                raise InvalidArgumentsError("--json asks nothing: give --yes or --dry-run, too")
+            print_line("\n".join(planned.lines))
+            why = "was not made by this recorder" if len(others) == 1 else "were not made by it"
+            typer.confirm(f"{listed([*map(str, others)])} {why}. Change this?", abort=True)
     outcome = recover_files(path, force=force, dry_run=dry_run)
     if as_json:
-        print_json(asdict(outcome))
+        shown = asdict(outcome)
+        del shown["changed"]
+        print_json(shown)
     else:
         print_line("\n".join(outcome.lines))
     return outcome.failed > 0
@@ -70,7 +72,10 @@ def recover(
 
 @dataclass(slots=True)
 class RecoveryOutcome:
-    """How many files were whole, repaired, removed or not repaired; and a line on each change."""
+    """How many files were whole, repaired, removed or not repaired; and a line on each change.
+
+    `changed` holds the folders in which a file was repaired or removed.
+    """
 
     whole: int = 0
     repaired: int = 0
@@ -78,6 +83,7 @@ class RecoveryOutcome:
     failed: int = 0
     messages: int = 0
     lines: list[str] = field(default_factory=list, compare=False)
+    changed: set[Path] = field(default_factory=set, compare=False)
 
     def summary(self, *, dry_run: bool) -> str:
         """Returns one line for people."""
@@ -120,7 +126,7 @@ def recover_files(
                 line = "whole already: there is nothing to repair"
             if line is not None:
                 done.lines.append(f"{name}: {line}")
-    done.lines += filter(None, map(recovery.correct_metadata, sorted(recovery.changed)))
+    done.lines += filter(None, map(recovery.correct_metadata, sorted(done.changed)))
     if others:
         left = counted(others, "bag file of another kind was", "bag files of other kinds were")
         done.lines.append(f"{left} left alone: only MCAP files are repaired")
@@ -128,32 +134,16 @@ def recover_files(
     return done
 
 
-def foreign_unfinished(path: Path) -> tuple[Path, ...]:
-    """Returns the folders with files to repair that are in no recorder's list of its recordings.
-
-    Raises:
-        RecorderError: there is no such file or directory.
-    """
-    repairer, unfinished = build_repairer(), set[Path]()
-    for file in _files_below(path, WallClock())[0]:
-        with suppress(BagError):
-            if file.parent not in unfinished and not repairer.is_whole(file):
-                unfinished.add(file.parent)
-    foreign: list[Path] = []
-    for folder in sorted(unfinished):
-        above = folder.absolute().parents
-        listing = next((root for root in above if (root / LIST_FILE).exists()), None)
-        if listing is None or not OwnRecordings(listing).owns(folder.absolute()):
-            foreign.append(folder)
-    return tuple(foreign)
+def is_foreign(folder: Path) -> bool:
+    """Returns whether a folder is in no recorder's list of its recordings."""
+    path = folder.absolute()
+    listing = next((root for root in path.parents if (root / LIST_FILE).exists()), None)
+    return listing is None or not OwnRecordings(listing).owns(path)
 
 
 @dataclass
 class _Recovery:
-    """Repairs one file after the other, and counts what became of them.
-
-    `changed` holds the folders in which a file was repaired or removed.
-    """
+    """Repairs one file after the other, and counts what became of them."""
 
     clock: Clock
     repairer: Repairer
@@ -162,7 +152,6 @@ class _Recovery:
     dry_run: bool
     opened: Collection[tuple[int, int]] = field(default_factory=open_files)
     outcome: RecoveryOutcome = field(default_factory=RecoveryOutcome)
-    changed: set[Path] = field(default_factory=set)
 
     def recover(self, file: Path) -> str | None:
         """Repairs a file, and returns what was done; None where it was whole."""
@@ -181,7 +170,7 @@ class _Recovery:
             outcome.failed += 1
             return f"NOT REPAIRED: {error.reason}"
         rewritten = None if repaired is None else repaired.rewritten
-        self.changed.add(file.parent)
+        outcome.changed.add(file.parent)
         if rewritten is None and not (self.dry_run and size):
             outcome.removed += 1
             return f"empty, {'would be ' if self.dry_run else ''}removed"

@@ -10,11 +10,14 @@ from __future__ import annotations
 
 import hashlib
 from importlib import resources
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
+from starlette.datastructures import Headers
 from starlette.responses import Response
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from starlette.types import ASGIApp, Receive, Scope, Send
 
 PAGE_PATH: Final = "/"
@@ -41,18 +44,25 @@ POLICY: Final = (
 framed, and makes no markup or code of text."""
 
 _METHODS: Final = frozenset({"GET", "HEAD"})
+_HEADERS: Final = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+    "cache-control": "no-cache",
+}
 
 
-class _File(NamedTuple):
-    body: bytes
-    media_type: str
-    etag: str
-
-
-def _joined_file(names: tuple[str, ...], media_type: str) -> _File:
+def joined(names: Sequence[str]) -> str:
+    """Returns files of the page as one text."""
     folder = resources.files(__name__)
-    body = b"\n".join(folder.joinpath(name).read_bytes() for name in names)
-    return _File(body, media_type, f'"{hashlib.sha256(body).hexdigest()[:32]}"')
+    return "\n".join(folder.joinpath(name).read_text(encoding="utf-8") for name in names)
+
+
+def _response(names: Sequence[str], media_type: str) -> Response:
+    body = joined(names).encode()
+    etag = f'"{hashlib.sha256(body).hexdigest()[:32]}"'
+    return Response(body, media_type=media_type, headers={**_HEADERS, "etag": etag})
 
 
 class Page:
@@ -61,9 +71,9 @@ class Page:
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
         self._files = {
-            PAGE_PATH: _joined_file(("index.html",), "text/html"),
-            "/page/page.js": _joined_file(SCRIPTS, "text/javascript"),
-            "/page/page.css": _joined_file(STYLES, "text/css"),
+            PAGE_PATH: _response(("index.html",), "text/html"),
+            "/page/page.js": _response(SCRIPTS, "text/javascript"),
+            "/page/page.css": _response(STYLES, "text/css"),
         }
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -72,16 +82,8 @@ class Page:
         if file is None or scope["method"] not in _METHODS:
             await self._app(scope, receive, send)
             return
-        headers = {
-            "content-security-policy": POLICY,
-            "x-content-type-options": "nosniff",
-            "referrer-policy": "no-referrer",
-            "cross-origin-resource-policy": "same-origin",
-            "cache-control": "no-cache",
-            "etag": file.etag,
-        }
-        if dict(scope["headers"]).get(b"if-none-match", b"").decode("latin-1") == file.etag:
-            await Response(status_code=304, headers=headers)(scope, receive, send)
-            return
+        etag = file.headers["etag"]
+        if Headers(scope=scope).get("if-none-match") == etag:
+            file = Response(status_code=304, headers={**_HEADERS, "etag": etag})
         # Uvicorn leaves the body out of the response to HEAD.
-        await Response(file.body, media_type=file.media_type, headers=headers)(scope, receive, send)
+        await file(scope, receive, send)

@@ -32,6 +32,7 @@ from ros2_memory.history.scan import scan
 from ros2_memory.history.view import View
 from ros2_memory.insights.fields import fields_of
 from ros2_memory.insights.recap import found_events
+from ros2_memory.insights.status import usual_rate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -221,21 +222,10 @@ def _topic_row(view: View, topic: str, window: TimeWindow) -> JsonObject:
         "topic": topic,
         "type": newest_type,
         "count": by_type[newest_type].messages,
-        "rate_hz": _rate(view, topic),
+        "rate_hz": usual_rate(view.snapshot, topic, view.limits.latching),
         "spoke": _spoke(view, topic, window).tolist(),
         "numbers": [*_numbers(view, topic)],
     }
-
-
-def _rate(view: View, topic: str) -> float | None:
-    """Returns how often (Hz) a topic speaks while it is recorded; None for a single message."""
-    timeline = view.timeline
-    spans = timeline.recordings(topic)
-    length = sum(last - first for first, last in spans.values())
-    count = sum(total.messages for total in timeline.totals(topic).values())
-    if count <= len(spans) or not length:
-        return None
-    return rounded((count - len(spans)) / unix_from_ns(length), 3)
 
 
 def _spoke(view: View, topic: str, window: TimeWindow) -> NDArray[np.int64]:

@@ -17,8 +17,6 @@ from operator import attrgetter
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from mcap.opcode import Opcode
-from mcap.records import Header
 
 from ros2_memory.core.bag_summary import READ_WITHOUT_INDEXES, BagSummary
 from ros2_memory.core.large_reads import LargeReads
@@ -73,10 +71,8 @@ from ros2_memory.storage.mcap.merge import RunRows, SortedRun, merged
 from ros2_memory.storage.mcap.records import (
     MESSAGE,
     RECORD,
-    BodyStream,
     Declarations,
     closing_of,
-    file_records,
     is_finished,
 )
 from ros2_memory.storage.mcap.scan import index_by_scan
@@ -156,15 +152,6 @@ class McapBags:
         """Returns the channels declared in the file."""
         with OpenFile(path) as file:
             return list(_Reading(self, file).index.channels.values())
-
-    def profile(self, path: Path) -> str:
-        """Returns the profile in the header of the file; empty if there is no header."""
-        with OpenFile(path) as file:
-            first = next(file_records(file), None)
-            if first is None or first.opcode != Opcode.HEADER:
-                return ""
-            header: Header = Header.read(BodyStream(first.body(file)))
-            return header.profile
 
     def records(
         self, path: Path, topics: Collection[str], window: TimeWindow, *, newest_first: bool

@@ -7,6 +7,7 @@ from collections import Counter
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache
+from itertools import chain, islice
 from typing import IO, TYPE_CHECKING, Final
 
 from mcap import records as mcap_records
@@ -53,13 +54,15 @@ class McapWriter(BagWriter):
         path: Path,
         records: Iterable[Record],
         *,
-        profile: str = ROS2_PROFILE,
         dense: bool = False,
     ) -> None:
         """Writes a bag that holds these messages; a `dense` one has no message indexes."""
         with _written(path) as stream:
             writer = _writer(stream, dense=dense)
-            writer.start(profile, LIBRARY)
+            received = iter(records)
+            first = [*islice(received, 1)]
+            is_ros2 = all(record.channel.encoding == "cdr" for record in first)
+            writer.start(ROS2_PROFILE if is_ros2 else "", LIBRARY)
 
             @cache
             def schema_id(schema: Schema) -> int:
@@ -71,7 +74,7 @@ class McapWriter(BagWriter):
                 schema, metadata = schema_id(_exported(channel)), dict(channel.metadata)
                 return writer.register_channel(channel.topic, channel.encoding, schema, metadata)
 
-            for record in records:
+            for record in chain(first, received):
                 number = channel_id(record.channel)
                 writer.add_message(number, record.log_time, record.payload, record.publish_time)
             writer.finish()
