@@ -149,10 +149,10 @@ DOUBTS: Final = (
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
-def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
-    """Returns count, first and last of each topic of summaries that share one schema.
+def numbers_of(summaries: Sequence[BagSummary], positions: Sequence[int]) -> IntArray:
+    """Returns count, first and last of some topics of summaries that share one schema.
 
-    Of the shape (summaries, topics, 3).
+    Of the shape (positions, summaries, 3).
     """
     topics = len(summaries[0].schema.topics)
     stored = [summary._numbers for summary in summaries]
@@ -160,15 +160,16 @@ def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
     size = _BASE.size + topics * step
     if {*map(len, stored)} != {size}:
         whole = b"".join([summary.numbers for summary in summaries])
-        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
+        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)[:, positions].swapaxes(0, 1)
     packed = b"".join(stored)
-    base = np.ndarray((len(stored), 1, 1), "<i8", packed, 0, (size, 0, 0))
-    # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
-    shape, strides = (len(stored), topics, 2), (size, step, _TIME_BYTES)
-    pairs = np.ndarray(shape, "<u8", packed, _BASE.size, strides)
-    numbers: IntArray = np.empty((len(stored), topics, 3), np.int64)
-    numbers[:, :, 0] = pairs[:, :, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
-    numbers[:, :, 1:] = base + (pairs >> 8 * _COUNT_BYTES).astype(np.int64)
+    base = np.ndarray((len(stored), 1), "<i8", packed, 0, (size, 0))
+    numbers: IntArray = np.empty((len(positions), len(stored), 3), np.int64)
+    for of_topic, position in zip(numbers, positions, strict=True):
+        # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
+        begin = _BASE.size + position * step
+        pairs = np.ndarray((len(stored), 2), "<i8", packed, begin, (size, _TIME_BYTES))
+        of_topic[:, 0] = pairs[:, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
+        of_topic[:, 1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
     return numbers
 
 
