@@ -1,12 +1,12 @@
 """Some consecutive bags of a timeline, and what follows from their summaries.
 
 Everything is computed when it is first asked for, and serves for as long as the bags stay together.
-A query looks at few topics of many bags, so the numbers of their summaries are kept as columns.
+A query looks at few topics of many bags, so the numbers of their summaries are joined.
 """
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, reduce
 from itertools import chain
 from operator import attrgetter, ne
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
@@ -15,7 +15,7 @@ import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
-from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
+from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, joined_numbers, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import Pause, pauses_between
@@ -42,9 +42,6 @@ _JITTER_NS: Final[Ns] = 50 * NS_PER_MS
 """The mean spacing may be shorter by this: publishers and transports are not exact."""
 _FEW_MESSAGES: Final = 5
 """Fewer have no usual spacing: a map may be published twice when its node starts."""
-
-_CACHED_COLUMNS: Final = 256
-"""Four topics of a week of splits, in 6 MB."""
 
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
@@ -218,7 +215,7 @@ class Segment:
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
         folders, numbers = self.numbered_folders
-        messages = self.numbers(self.headers)[:, :, 0].sum(axis=0)
+        messages = self._numbers(self._headers)[:, :, 0].sum(axis=0)
         columns = (np.bincount(numbers), np.bincount(numbers, messages))
         rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
         return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
@@ -253,20 +250,24 @@ class Segment:
         return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
 
     @cached_property
-    def _schema_numbers(self) -> NDArray[np.uint16]:
-        """For each bag the position of its schema among `schemas`."""
-        number_of = {id(schema): nth for nth, schema in enumerate(self.schemas)}
-        return np.array([number_of[id(bag.summary.schema)] for bag in self.bags], np.uint16)
+    def _joined(self) -> list[tuple[SummarySchema, NDArray[np.uint16], bytes]]:
+        """The schemas, the positions of the bags of each, and the numbers of these, joined."""
+        bags_of: dict[int, list[int]] = {}
+        for nth, bag in enumerate(self.bags):
+            bags_of.setdefault(id(bag.summary.schema), []).append(nth)
+        return [
+            (
+                schema,
+                np.array(bags, np.uint16),
+                joined_numbers([self.bags[nth].summary for nth in bags]),
+            )
+            for schema, bags in zip(self.schemas, bags_of.values(), strict=True)
+        ]
 
     @cached_property
-    def headers(self) -> tuple[TopicHeader, ...]:
+    def _headers(self) -> tuple[TopicHeader, ...]:
         """All topics, each type of one by itself."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
-
-    @cached_property
-    def positions(self) -> NDArray[np.intp]:
-        """The positions of the bags in the segment."""
-        return np.arange(len(self.bags))
 
     def _bags_with(self, name: str) -> list[BagFile]:
         """Returns the bags of whose schemas an attribute is not empty: mostly none."""
@@ -277,9 +278,9 @@ class Segment:
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
         """By topic and type, the totals of the bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        counts, firsts, lasts = self.numbers(self.headers).transpose(2, 0, 1)
+        counts, firsts, lasts = self._numbers(self._headers).transpose(2, 0, 1)
         rows = zip(
-            self.headers,
+            self._headers,
             firsts.min(axis=1, initial=MAX_NS, where=counts > 0).tolist(),
             lasts.max(axis=1, initial=MIN_NS, where=counts > 0).tolist(),
             counts.sum(axis=1).tolist(),
@@ -338,25 +339,32 @@ class Segment:
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
-        return _column(self, topic)
+        headers = [header for header in self._headers if header.topic == topic]
+        if not headers:
+            return None
+        numbers = self._numbers(headers)
+        bags, types = np.nonzero(numbers[:, :, 0].T)
+        counts, firsts, lasts = numbers[types, bags].T
+        return TopicColumn(bags, firsts, lasts, counts)
 
-    def numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
+    def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
         """Returns count (0 where it has none), first and last by topic of one type, and bag."""
-        row_of = {header: row for row, header in enumerate(headers)}
         numbers = np.zeros((len(headers), len(self.bags), 3), np.int64)
-        for nth, schema in enumerate(self.schemas):
-            positions = [at for at, header in enumerate(schema.topics) if header in row_of]
-            if positions:
-                rows = np.array([row_of[schema.topics[at]] for at in positions])
-                bags = np.flatnonzero(self._schema_numbers == nth)
-                summaries = [self.bags[bag].summary for bag in bags.tolist()]
-                numbers[rows[:, None], bags] = numbers_of(summaries, positions)
+        for schema, bags, joined in self._joined:
+            at = {header: position for position, header in enumerate(schema.topics)}
+            rows = [row for row, header in enumerate(headers) if header in at]
+            if rows:
+                positions = [at[headers[row]] for row in rows]
+                found = numbers_of(schema, joined, bags.size, positions)
+                if found.shape == numbers.shape:
+                    return found
+                numbers[np.array(rows)[:, None], bags] = found
         return numbers
 
     def _numbers_by_topic(self) -> NDArray[np.int64]:
         """Returns count, first and last by topic (sorted) and bag; its types count together."""
-        headers = sorted(self.headers, key=attrgetter("topic"))
-        numbers = self.numbers(headers)
+        headers = sorted(self._headers, key=attrgetter("topic"))
+        numbers = self._numbers(headers)
         topics = [header.topic for header in headers]
         starts = np.flatnonzero([True, *map(ne, topics, topics[1:])])
         if len(starts) == len(headers):
@@ -466,20 +474,6 @@ def _spans_of(
 def folder_of(bag: BagFile) -> str:
     """Returns the folder of a bag: that of its recording, as a string."""
     return bag.file[: bag.file.rfind("/")]
-
-
-@lru_cache(maxsize=_CACHED_COLUMNS)
-def _column(segment: Segment, topic: str) -> TopicColumn | None:
-    """Returns what a segment holds of a topic: a copy, so that few of a week are kept."""
-    headers = [header for header in segment.headers if header.topic == topic]
-    if not headers:
-        return None
-    numbers = segment.numbers(headers)
-    if len(headers) == 1 and numbers[0, :, 0].all():
-        return TopicColumn(segment.positions, *numbers[0].T[[1, 2, 0]])
-    bags, types = np.nonzero(numbers[:, :, 0].T)
-    counts, firsts, lasts = numbers[types, bags].T
-    return TopicColumn(bags, firsts, lasts, counts)
 
 
 def _activities(numbers: NDArray[np.int64], lengths: _Times) -> Iterator[Activity]:
