@@ -19,9 +19,9 @@ from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Fragments, 
 from ros2_memory.columns.outline import OUTLINE, outline_of
 from ros2_memory.columns.pack import Packed, decompressed, is_large, unpack
 from ros2_memory.columns.stored import StoredTable, lazy_columns
-from ros2_memory.columns.table import Column, Table, Zone, column_bytes
+from ros2_memory.columns.table import Column, Table, Texts, Zone, column_bytes
 from ros2_memory.columns.units import GoneError, Unit
-from ros2_memory.columns.writing import LOG_TIME
+from ros2_memory.columns.writing import BAG, LOG_TIME
 from ros2_memory.columns.zones import PartZones, Zones
 from ros2_memory.core.errors import BagContradictionError, BagError
 from ros2_memory.core.large_reads import LargeReads
@@ -452,6 +452,10 @@ class Scanner:
             # Else each question about the part would fail, for ever.
             self._store_of_parts.give_up(error)
             raise GoneError from error
+        is_number = path == BAG or path.endswith("#")
+        if is_number and not isinstance(column, Texts) and all(column.strides):
+            # Numbers of rows and bags: none is negative, and few need eight bytes.
+            column = column.astype(np.min_scalar_type(column.max(initial=0)))
         self.caches.read.put(key, column, column_bytes(column))
         return column
 

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Protocol, TypeVar, cast
 
+import numpy as np
+
 from ros2_memory.columns.table import Column, Elements, Table, Zone
 
 if TYPE_CHECKING:
     from ros2_memory.columns.layout import Layout
     from ros2_memory.columns.outline import Outline
     from ros2_memory.columns.pack import Packed
-    from ros2_memory.storage.base import Channel, Definition, IntArray
+    from ros2_memory.storage.base import Channel, Definition
 
 V = TypeVar("V")
 
@@ -138,7 +140,7 @@ def lazy_columns(
 
     def elements(name: str) -> Elements:
         path = sequences[name]
-        owners = cast("IntArray", column(f"{path}#"))
+        owners = np.asarray(column(f"{path}#"), np.int64)
         return Elements(owners, *lazy_columns(layout, column, dropped, path))
 
     kept: Collection[str] = columns

@@ -149,26 +149,33 @@ DOUBTS: Final = (
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
-def numbers_of(summaries: Sequence[BagSummary]) -> IntArray:
-    """Returns count, first and last of each topic of summaries that share one schema.
-
-    Of the shape (summaries, topics, 3).
-    """
-    topics = len(summaries[0].schema.topics)
+def joined_numbers(summaries: Sequence[BagSummary]) -> bytes:
+    """Returns the numbers of summaries that share one schema, packed where all are."""
     stored = [summary._numbers for summary in summaries]
-    step = _COUNT_BYTES + 2 * _TIME_BYTES
-    size = _BASE.size + topics * step
-    if {*map(len, stored)} != {size}:
-        whole = b"".join([summary.numbers for summary in summaries])
-        return np.frombuffer(whole, "<i8").reshape(-1, topics, 3)
-    packed = b"".join(stored)
-    base = np.ndarray((len(stored), 1, 1), "<i8", packed, 0, (size, 0, 0))
-    # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
-    shape, strides = (len(stored), topics, 2), (size, step, _TIME_BYTES)
-    pairs = np.ndarray(shape, "<u8", packed, _BASE.size, strides)
-    numbers: IntArray = np.empty((len(stored), topics, 3), np.int64)
-    numbers[:, :, 0] = pairs[:, :, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
-    numbers[:, :, 1:] = base + (pairs >> 8 * _COUNT_BYTES).astype(np.int64)
+    if len({*map(len, stored)}) > 1:
+        stored = [summary.numbers for summary in summaries]
+    return b"".join(stored)
+
+
+def numbers_of(
+    schema: SummarySchema, joined: bytes, summaries: int, positions: Sequence[int]
+) -> IntArray:
+    """Returns count, first and last of some topics of a schema, of so many joined summaries.
+
+    Of the shape (positions, summaries, 3).
+    """
+    size = len(joined) // summaries
+    if size == schema.numbers.size:
+        whole = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
+        return whole[:, positions].swapaxes(0, 1)
+    base = np.ndarray((summaries, 1), "<i8", joined, 0, (size, 0))
+    numbers: IntArray = np.empty((len(positions), summaries, 3), np.int64)
+    for of_topic, position in zip(numbers, positions, strict=True):
+        # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
+        begin = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
+        pairs = np.ndarray((summaries, 2), "<i8", joined, begin, (size, _TIME_BYTES))
+        of_topic[:, 0] = pairs[:, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
+        of_topic[:, 1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
     return numbers
 
 

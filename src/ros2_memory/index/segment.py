@@ -1,20 +1,21 @@
 """Some consecutive bags of a timeline, and what follows from their summaries.
 
 Everything is computed when it is first asked for, and serves for as long as the bags stay together.
-A query looks at few topics of many bags, so the numbers of their summaries are kept as columns.
+A query looks at few topics of many bags, so the numbers of their summaries are joined.
 """
 
 from __future__ import annotations
 
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, reduce
 from itertools import chain
+from operator import attrgetter, ne
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
-from ros2_memory.core.bag_summary import SummarySchema, numbers_of
+from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, joined_numbers, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.holes import Pause, pauses_between
@@ -29,7 +30,7 @@ from ros2_memory.index.split_order import (
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -41,9 +42,6 @@ _JITTER_NS: Final[Ns] = 50 * NS_PER_MS
 """The mean spacing may be shorter by this: publishers and transports are not exact."""
 _FEW_MESSAGES: Final = 5
 """Fewer have no usual spacing: a map may be published twice when its node starts."""
-
-_CACHED_SEGMENTS: Final = 80
-"""A week of splits has some 60: 16 MB of eleven topics. Of one more than fit, none would stay."""
 
 Span: TypeAlias = "tuple[Ns, Ns]"
 """Log times of a first and a last message, both inclusive."""
@@ -217,7 +215,7 @@ class Segment:
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
         folders, numbers = self.numbered_folders
-        messages = _topic_columns(self).numbers[:, :, 0].sum(axis=0)
+        messages = self._numbers(self._headers)[:, :, 0].sum(axis=0)
         columns = (np.bincount(numbers), np.bincount(numbers, messages))
         rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
         return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
@@ -251,6 +249,26 @@ class Segment:
         schemas = [bag.summary.schema for bag in self.bags]
         return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
 
+    @cached_property
+    def _joined(self) -> list[tuple[SummarySchema, NDArray[np.uint16], bytes]]:
+        """The schemas, the positions of the bags of each, and the numbers of these, joined."""
+        bags_of: dict[int, list[int]] = {}
+        for nth, bag in enumerate(self.bags):
+            bags_of.setdefault(id(bag.summary.schema), []).append(nth)
+        return [
+            (
+                schema,
+                np.array(bags, np.uint16),
+                joined_numbers([self.bags[nth].summary for nth in bags]),
+            )
+            for schema, bags in zip(self.schemas, bags_of.values(), strict=True)
+        ]
+
+    @cached_property
+    def _headers(self) -> tuple[TopicHeader, ...]:
+        """All topics, each type of one by itself."""
+        return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
+
     def _bags_with(self, name: str) -> list[BagFile]:
         """Returns the bags of whose schemas an attribute is not empty: mostly none."""
         odd = {id(schema) for schema in self.schemas if getattr(schema, name)}
@@ -260,10 +278,9 @@ class Segment:
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
         """By topic and type, the totals of the bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        columns = _topic_columns(self)
-        counts, firsts, lasts = columns.numbers.transpose(2, 0, 1)
+        counts, firsts, lasts = self._numbers(self._headers).transpose(2, 0, 1)
         rows = zip(
-            columns.headers,
+            self._headers,
             firsts.min(axis=1, initial=MAX_NS, where=counts > 0).tolist(),
             lasts.max(axis=1, initial=MIN_NS, where=counts > 0).tolist(),
             counts.sum(axis=1).tolist(),
@@ -322,7 +339,40 @@ class Segment:
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
-        return _topic_columns(self).of(topic)
+        headers = [header for header in self._headers if header.topic == topic]
+        if not headers:
+            return None
+        numbers = self._numbers(headers)
+        bags, types = np.nonzero(numbers[:, :, 0].T)
+        counts, firsts, lasts = numbers[types, bags].T
+        return TopicColumn(bags, firsts, lasts, counts)
+
+    def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
+        """Returns count (0 where it has none), first and last by topic of one type, and bag."""
+        numbers = np.zeros((len(headers), len(self.bags), 3), np.int64)
+        for schema, bags, joined in self._joined:
+            at = {header: position for position, header in enumerate(schema.topics)}
+            rows = [row for row, header in enumerate(headers) if header in at]
+            if rows:
+                positions = [at[headers[row]] for row in rows]
+                found = numbers_of(schema, joined, bags.size, positions)
+                if found.shape == numbers.shape:
+                    return found
+                numbers[np.array(rows)[:, None], bags] = found
+        return numbers
+
+    def _numbers_by_topic(self) -> NDArray[np.int64]:
+        """Returns count, first and last by topic (sorted) and bag; its types count together."""
+        headers = sorted(self._headers, key=attrgetter("topic"))
+        numbers = self._numbers(headers)
+        topics = [header.topic for header in headers]
+        starts = np.flatnonzero([True, *map(ne, topics, topics[1:])])
+        if len(starts) == len(headers):
+            return numbers
+        numbers[numbers[:, :, 0] == 0] = (0, MAX_NS, MIN_NS)
+        joined = (np.add, np.minimum, np.maximum)
+        parts = [add.reduceat(numbers[:, :, nth], starts, axis=0) for nth, add in enumerate(joined)]
+        return np.stack(parts, axis=2)
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -343,9 +393,8 @@ class Segment:
     @cached_property
     def activities(self) -> dict[str, Activity]:
         """By topic, when the bags hold it and how often."""
-        columns = _topic_columns(self)
-        topics = sorted(columns.topics)
-        numbers = columns.of_all(topics)
+        topics = sorted(self.types)
+        numbers = self._numbers_by_topic()
         lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)
         # Between absences a bag is as many: what follows each comes behind all bags.
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
@@ -425,72 +474,6 @@ def _spans_of(
 def folder_of(bag: BagFile) -> str:
     """Returns the folder of a bag: that of its recording, as a string."""
     return bag.file[: bag.file.rfind("/")]
-
-
-class _TopicColumns:
-    """The numbers of a segment's summaries.
-
-    Attributes:
-        headers: of all topics, each type of one by itself.
-        numbers: by header and bag the count, 0 where it has none, the first and the last time.
-    """
-
-    def __init__(self, bags: Sequence[BagFile], schemas: Sequence[SummarySchema]) -> None:
-        headers = dict.fromkeys(chain.from_iterable(schema.topics for schema in schemas))
-        header_rows = {header: row for row, header in enumerate(headers)}
-        self.headers = tuple(headers)
-        self.numbers = np.zeros((len(headers), len(bags), 3), np.int64)
-        summaries = [bag.summary for bag in bags]
-        schema_of = np.array([id(summary.schema) for summary in summaries])
-        for schema in schemas:
-            rows = np.flatnonzero(schema_of == id(schema))
-            headers_of_schema = np.array([header_rows[header] for header in schema.topics])
-            numbers = numbers_of([summaries[row] for row in rows.tolist()])
-            self.numbers[np.ix_(headers_of_schema, rows)] = numbers.swapaxes(0, 1)
-        self._all_bags = np.arange(len(bags))
-        self._columns: dict[str, TopicColumn] = {}
-        self._rows_by_topic: dict[str, list[int]] = {}
-        for header, row in header_rows.items():
-            self._rows_by_topic.setdefault(header.topic, []).append(row)
-
-    def of_all(self, topics: Sequence[str]) -> NDArray[np.int64]:
-        """Returns count, first and last by topic and bag; the types of a topic count together."""
-        rows = [self._rows_by_topic[topic] for topic in topics]
-        starts = np.cumsum([0, *map(len, rows)])[:-1]
-        numbers = self.numbers[[*chain.from_iterable(rows)]]
-        if len(numbers) == len(topics):
-            return numbers
-        has_none = numbers[:, :, 0] == 0
-        numbers[has_none] = (0, MAX_NS, MIN_NS)
-        joined = (np.add, np.minimum, np.maximum)
-        parts = [add.reduceat(numbers[:, :, nth], starts, axis=0) for nth, add in enumerate(joined)]
-        return np.stack(parts, axis=2)
-
-    @property
-    def topics(self) -> Collection[str]:
-        """Their names."""
-        return self._rows_by_topic.keys()
-
-    def of(self, topic: str) -> TopicColumn | None:
-        """Returns what the bags hold of a topic; None where nothing."""
-        if topic in self._rows_by_topic and topic not in self._columns:
-            self._columns[topic] = self._column(self._rows_by_topic[topic])
-        return self._columns.get(topic)
-
-    def _column(self, header_rows: Sequence[int]) -> TopicColumn:
-        """Returns the column of a topic, whose types have these headers."""
-        counts, firsts, lasts = self.numbers[header_rows[0]].T
-        if len(header_rows) == 1 and counts.all():
-            return TopicColumn(self._all_bags, firsts, lasts, counts)
-        bags, types = np.nonzero(self.numbers[header_rows, :, 0].T)
-        counts, firsts, lasts = self.numbers[header_rows][types, bags].T
-        return TopicColumn(bags, firsts, lasts, counts)
-
-
-@lru_cache(maxsize=_CACHED_SEGMENTS)
-def _topic_columns(segment: Segment) -> _TopicColumns:
-    """Returns the columns of a segment: a copy of its summaries, so few of a week are kept."""
-    return _TopicColumns(segment.bags, segment.schemas)
 
 
 def _activities(numbers: NDArray[np.int64], lengths: _Times) -> Iterator[Activity]:

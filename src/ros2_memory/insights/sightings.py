@@ -439,13 +439,14 @@ def _with_fields(
         try:
             shown = view.extractor.shown(message, record.channel.type, fields)
         except InvalidArgumentsError as error:
-            refused.append(error)
+            # A traceback has this frame, which has the errors: they would stay for long.
+            refused.append(error.with_traceback(None))
             extended.append(sighting)
             continue
         view.notes.add(*shown.notes)
         extended.append(replace(sighting, matched=(), value=quote(shown.value)))
     if refused and len(refused) == len(extended):
-        raise refused[0]
+        raise refused.pop(0)
     return tuple(extended)
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ros2_memory.core.bag_summary import BagSummary, TopicSummary, numbers_of
+from ros2_memory.core.bag_summary import BagSummary, TopicSummary, joined_numbers, numbers_of
 from ros2_memory.core.timebase import MAX_NS, MIN_NS
 
 moments = st.integers(MIN_NS, MAX_NS)
@@ -55,10 +54,22 @@ def test_packing_changes_nothing_but_the_size(
     )
     for topics_of in (given_topics, alike):
         summary = BagSummary(topics_of)
-        numbers = numbers_of([summary, summary]) if topics_of else ()
+        some = range(len(topics_of))[::-2]
+
+        def numbers(*summaries: BagSummary, some: range = some) -> object:
+            joined = joined_numbers(summaries)
+            schema = summaries[0].schema
+            return numbers_of(schema, joined, len(summaries), some).tolist() if joined else []
+
+        unpacked = numbers(summary, summary)
+        expected = [
+            [[topics_of[at].count, topics_of[at].first, topics_of[at].last]] * 2 for at in some
+        ]
+        assert unpacked == expected
         for _ in range(2):
             summary.pack()
-            assert not topics_of or np.array_equal(numbers_of([summary, summary]), numbers)
+            assert numbers(summary, summary) == unpacked
+            assert numbers(summary, BagSummary(topics_of)) == unpacked
             assert summary == BagSummary(topics_of)
             assert summary.topics == topics_of
             assert [summary.at(number) for number in range(len(topics_of))] == list(topics_of)
