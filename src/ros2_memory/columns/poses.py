@@ -6,6 +6,7 @@ The same as `SchemaExtractor.pose` and `twist` give for each message, rounded al
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -68,10 +69,16 @@ class PoseColumns:
             return None
         if not columns.axes:
             raise NoPoseError
+        read = partial(_read, _RoundedRows(table, index), columns, times)
         try:
-            return _read(_RoundedRows(table, index), columns, times)
+            # Of a part the path, stands, tracks and sights follow from the same ones.
+            return table.remember("poses", read, _bytes_of) if index is None else read()
         except UnknownShapeError:
             return None
+
+
+def _bytes_of(poses: Poses) -> int:
+    return 1000 + 76 * len(poses)
 
 
 class NoPoseError(Exception):

@@ -275,6 +275,10 @@ class Scan:
         reaching = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
         return tuple(self._numbers[reaching].tolist())
 
+    def is_stored(self, window: TimeWindow) -> bool:
+        """Returns whether all rows in a window are of parts."""
+        return all(source.part for source in self._sources_in(window))
+
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
         assert self._coverage is not None  # noqa: S101 - there are no parts without one
