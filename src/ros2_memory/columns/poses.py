@@ -71,14 +71,11 @@ class PoseColumns:
             raise NoPoseError
         read = partial(_read, _RoundedRows(table, index), columns, times)
         try:
-            # Of a part the path, stands, tracks and sights follow from the same ones.
-            return table.remember("poses", read, _bytes_of) if index is None else read()
+            if index is not None:
+                return read()
+            return table.remember("poses", read, lambda poses: 1000 + 76 * len(poses))
         except UnknownShapeError:
             return None
-
-
-def _bytes_of(poses: Poses) -> int:
-    return 1000 + 76 * len(poses)
 
 
 class NoPoseError(Exception):

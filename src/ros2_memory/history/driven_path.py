@@ -177,14 +177,14 @@ def slices_by_poses(
         needs_all = stretch.parts is not None or not view.call.stored
         for pose_slice in pose_slices(read, beside):
             inside = TimeWindow(pose_slice.start, pose_slice.stop)
-            key, load = pose_slice.key(settings), partial(make, pose_slice)
+            key = pose_slice.key(settings)
             may_be_made = needs_all or (key and opened.is_stored(inside.widened(beside)))
             if may_be_made and not wanted.intersect(inside).empty:
                 # Those before it in the stretch are wanted next.
                 before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
                 yield (
                     pose_slice.start,
-                    remembered(view, kind, key, load, also_before=before),
+                    remembered(view, kind, key, partial(make, pose_slice), also_before=before),
                 )
 
     def key_of(stretch: Stretch) -> FragmentKey | None:

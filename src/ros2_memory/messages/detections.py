@@ -167,19 +167,18 @@ def _without_hypotheses(
 
 
 def _is_below(value: dict[str, JsonValue], least: float | None) -> bool:
-    score = None if least is None else _score(value)
-    return score is not None and least is not None and score < least
+    return least is not None and (score := _score(value)) is not None and score < least
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
-    whole_number: str | None = None
+    whole = None
     for name in naming(value):
         label = value.get(name)
         if isinstance(label, str) and label.strip():
             return label
-        if type(label) is int and whole_number is None:  # a boolean is an int
-            whole_number = str(label)
-    return whole_number
+        if type(label) is int:  # a boolean is an int
+            whole = whole or str(label)
+    return whole
 
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
