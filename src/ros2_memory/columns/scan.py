@@ -275,6 +275,10 @@ class Scan:
         reaching = begin + np.flatnonzero(self._lasts[begin:end] >= window.start)
         return tuple(self._numbers[reaching].tolist())
 
+    def is_stored(self, window: TimeWindow) -> bool:
+        """Returns whether all rows in a window are of parts."""
+        return all(source.part for source in self._sources_in(window))
+
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
         assert self._coverage is not None  # noqa: S101 - there are no parts without one
@@ -490,7 +494,8 @@ class Scan:
 
         `judge` is given all of their messages in the window.
         """
-        units = [*self._units_in(window)]
+        sources = _with_next(self._sources_in(window))
+        units = [unit for source in sources for unit in self._units(*source)]
         if len({unit.first_bag.recording for unit in units}) > 1:
             rows = [np.flatnonzero(_in_window(unit, window)) for unit in units]
             judged = judge(self._messages(units, rows))
@@ -540,10 +545,6 @@ class Scan:
         begin = int(np.searchsorted(self._latest, window.start))
         stop = int(np.searchsorted(self._firsts, window.stop))
         return [source for source in self._sources[begin:stop] if source.last >= window.start]
-
-    def _units_in(self, window: TimeWindow) -> Iterator[Unit]:
-        for source, together in _with_next(self._sources_in(window)):
-            yield from self._units(source, together)
 
     def _messages(self, units: Sequence[Unit], rows: Sequence[IntArray]) -> Identities:
         """Returns what tells messages apart, of some rows of each unit."""

@@ -23,6 +23,7 @@ from ros2_memory.analysis.poses import Poses, joined_poses
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Sized
 from ros2_memory.columns.kinds import PATHS
 from ros2_memory.columns.scan import STRETCH_NS
+from ros2_memory.columns.writing import PART_NS
 from ros2_memory.core.errors import (
     InvalidArgumentsError,
     NoDataError,
@@ -163,24 +164,27 @@ def slices_by_poses(
                 yield pose_slice.start, make(pose_slice)
         return
     twice = () if view.call.stored else parallel_or_twice(view, topic, window)
-    opened = open_scan(view, topic, window, stored=view.call.stored)
+    # What is stored follows from whole parts: also from those that the window cuts.
+    reach = window.widened(2 * PART_NS) if view.call.stored else window
+    opened = open_scan(view, topic, reach, stored=view.call.stored)
     reader = PoseReader(view, failures, twice)
 
     def made_in(stretch: Stretch) -> Iterator[tuple[Ns, T]]:
         around = stretch.window.widened(beside)
         rows = opened.rows(newest_first=True, among=around)
         read = map(reader.block, blocks(rows, newest_first=True))
+        wanted = stretch.window if stretch.parts else stretch.window.intersect(window)
         needs_all = stretch.parts is not None or not view.call.stored
-        for pose_slice in pose_slices(
-            (block for block in read if block.parts or needs_all), beside
-        ):
-            if stretch.window.overlaps(pose_slice.start, pose_slice.stop - 1):
-                key, load = pose_slice.key(settings), partial(make, pose_slice)
+        for pose_slice in pose_slices(read, beside):
+            inside = TimeWindow(pose_slice.start, pose_slice.stop)
+            key = pose_slice.key(settings)
+            may_be_made = needs_all or (key and opened.is_stored(inside.widened(beside)))
+            if may_be_made and not wanted.intersect(inside).empty:
                 # Those before it in the stretch are wanted next.
                 before = min(max(pose_slice.start - stretch.window.start, 0), STRETCH_NS)
                 yield (
                     pose_slice.start,
-                    remembered(view, kind, key, load, also_before=before),
+                    remembered(view, kind, key, partial(make, pose_slice), also_before=before),
                 )
 
     def key_of(stretch: Stretch) -> FragmentKey | None:

@@ -19,7 +19,7 @@ from ros2_memory.core.text import LABELS, LISTS_OF_LABELS
 from ros2_memory.messages.conversions import number, triple, xyz
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterator, Sequence
 
     from ros2_memory.core.model import JsonValue, Vector3
 
@@ -76,16 +76,16 @@ def detections_of(
     return tuple(detections)
 
 
-def naming(fields: Collection[str]) -> tuple[str, ...]:
-    """Returns which fields name an object that has some fields, the first choice first.
+def naming(fields: Collection[str]) -> Iterator[str]:
+    """Yields which fields name an object that has some fields, the first choice first.
 
     Of these the first text that is not blank is its name, else the first whole number.
     """
-    if not NOT_LABELLED.isdisjoint(fields):
-        return ()
-    names = [name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields)]
-    is_seen = any(name in fields for name in SCORES) and not _SHOWN.isdisjoint(fields)
-    return (*LABELS, *names, *(("name", "category", "id") if is_seen else ()))
+    if NOT_LABELLED.isdisjoint(fields):
+        yield from LABELS
+        yield from (name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields))
+        if any(name in fields for name in SCORES) and not _SHOWN.isdisjoint(fields):
+            yield from ("name", "category", "id")
 
 
 def without_low_scores(value: JsonValue, min_score: float, depth: int = MAX_DEPTH) -> JsonValue:
@@ -167,15 +167,18 @@ def _without_hypotheses(
 
 
 def _is_below(value: dict[str, JsonValue], least: float | None) -> bool:
-    score = _score(value)
-    return score is not None and least is not None and score < least
+    return least is not None and (score := _score(value)) is not None and score < least
 
 
 def _label(value: dict[str, JsonValue]) -> str | None:
-    labels = [value.get(name) for name in naming(value)]
-    texts = [label for label in labels if isinstance(label, str) and label.strip()]
-    # A boolean is an int.
-    return next(iter(texts), None) or next((str(n) for n in labels if type(n) is int), None)
+    whole = None
+    for name in naming(value):
+        label = value.get(name)
+        if isinstance(label, str) and label.strip():
+            return label
+        if type(label) is int:  # a boolean is an int
+            whole = whole or str(label)
+    return whole
 
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
