@@ -503,7 +503,10 @@ def check_ros(robot: Examined) -> Iterator[Finding]:
     settings, recorder = robot.settings, robot.settings.recorder
     setup_files = () if isinstance(recorder, NullRecorderNode) else recorder.setup_files
     try:
-        build_recorder(settings, reader=robot.memory.reader).check()
+        # A check uses none of them.
+        unused = dict.fromkeys(("housekeeper", "own", "background"))
+        reader = robot.memory.reader
+        build_recorder(settings, reader=reader, keep_open=(), excluding={}, **unused).check()
     except EpisodicError as problem:
         reason, _, do = str(problem).partition("; ")
         given = "give this command the settings of the recorder (its environment and arguments)"
