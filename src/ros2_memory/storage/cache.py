@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import lru_cache
+from itertools import islice
 from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 if TYPE_CHECKING:
@@ -15,14 +16,17 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+_SPARED: Final = 3
 _SHARED_BYTES: Final = 32 << 10
 """The size up to which a channel is shared; a longer one belongs to its file alone."""
 
 
 class ByteLru(Generic[T]):
-    """An LRU cache of up to `capacity` bytes. Safe to use from several threads.
+    """A cache of up to `capacity` bytes, which drops what was not used lately. Thread-safe.
 
-    A value that is larger than the capacity is not cached.
+    A value that is larger than the capacity is not cached. A few that were used still longer ago
+    are spared for each that goes: of what is asked for in a circle, and is a little more than fits,
+    an LRU cache would drop each value just before it is asked for.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -51,18 +55,20 @@ class ByteLru(Generic[T]):
             return value
 
     def put(self, key: Hashable, value: T, size: int) -> None:
-        """Caches `value`, which takes about `size` bytes, and drops the least recently used."""
+        """Caches `value`, which takes about `size` bytes, and drops others."""
         entries = self._all
         with entries.lock:
             _, replaced = entries.values.pop((self, key), (None, 0))
             entries.bytes -= replaced
             if size > entries.capacity:
                 return
-            entries.values[(self, key)] = (value, size)
-            entries.bytes += size
-            while entries.bytes > entries.capacity:
+            while entries.bytes + size > entries.capacity:
+                for oldest in [*islice(entries.values, min(_SPARED, len(entries.values) - 1))]:
+                    entries.values.move_to_end(oldest)
                 _, (_, dropped) = entries.values.popitem(last=False)
                 entries.bytes -= dropped
+            entries.values[(self, key)] = (value, size)
+            entries.bytes += size
 
 
 @dataclass(slots=True)

@@ -30,3 +30,14 @@ def test_what_is_taken_is_cached_no_more_and_leaves_room() -> None:
     cache.put("b", "second", 6)
     cache.put("c", "third", 4)
     assert (cache.get("b"), cache.get("c")) == ("second", "third")
+
+
+def test_most_of_a_circle_that_is_a_little_larger_than_the_cache_is_found() -> None:
+    cache: ByteLru[int] = ByteLru(100)
+    found = 0
+    for key in [*range(110)] * 4:
+        if cache.get(key) is None:
+            cache.put(key, key, 1)
+        else:
+            found += 1
+    assert found > 3 * 110 * 0.6
