@@ -27,7 +27,8 @@ if TYPE_CHECKING:
 pytestmark = needs_chromium
 
 SPAN = {"start": ASKED_AT_S - 150, "end": ASKED_AT_S - 20}
-EARLIER = {"with_start": ASKED_AT_S - 300, "with_end": ASKED_AT_S - 160}
+STOOD = {"start": ASKED_AT_S - 100, "end": ASKED_AT_S - 20}
+EARLIER = {"with_start": ASKED_AT_S - 160, "with_end": ASKED_AT_S - 120}
 OBJECTS = "/vision/scene/scene_objects"
 CALLS: dict[str, dict[str, Any]] = {
     "recap": SPAN,
@@ -35,7 +36,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "find_things": {},
     "find_matches": {"topic": OBJECTS, "condition_type": "contains", "value": "cup"},
     "trajectory_summary": {**SPAN, "frame_id": "map"},
-    "compare": {**SPAN, **EARLIER},
+    "compare": {**STOOD, **EARLIER},
 }
 TEXTS = {
     "recap": "slowed down suddenly",

@@ -27,7 +27,6 @@ Habit: TypeAlias = "Callable[[int], Awaitable[Seen]]"
 LONG: Final = ("get_topic_in_range", {"topic": "/odom", "start": 0, "end": 2e9})
 """The longest question about these bags; its reply is long, too."""
 
-AT_ONCE: Final = 64 if examples.LONG else 24
 UNREAD_AT_ONCE: Final = 4000 if examples.LONG else 100
 """Calls whose replies nobody reads, one right after another; 75 fill what the system buffers."""
 BETWEEN_S: Final = 0.5
@@ -54,7 +53,7 @@ async def all_tools(port: int) -> Seen:
 
 
 async def many_calls_at_once(port: int) -> Seen:
-    """Many calls by one client; all are answered, or refused with a reason."""
+    """64 calls by one client; all are answered, or refused with a reason."""
     seen: Seen = Counter()
 
     async def one(client: Client, number: int) -> None:
@@ -65,7 +64,7 @@ async def many_calls_at_once(port: int) -> Seen:
 
     for transport in transports(port):
         async with Client(transport) as client, asyncio.timeout(BOUND_S):
-            await asyncio.gather(*(one(client, number) for number in range(AT_ONCE)))
+            await asyncio.gather(*(one(client, number) for number in range(64)))
     return seen
 
 

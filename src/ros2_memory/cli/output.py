@@ -7,6 +7,7 @@ it never reach the terminal.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import sys
@@ -379,7 +380,9 @@ def format_time(unix_s: float) -> str:
     Every option that takes a time reads it, and it is one word for a shell. Where clocks were set
     back, and the time occurs twice, it has its offset.
     """
-    return local_time(round(unix_s * 1e6) * NS_PER_US).isoformat(timespec="microseconds")
+    fraction, whole = math.modf(unix_s)  # the product of the whole would be rounded twice
+    microseconds = int(whole) * 1_000_000 + round(fraction * 1e6)
+    return local_time(microseconds * NS_PER_US).isoformat(timespec="microseconds")
 
 
 def format_duration(seconds: float) -> str:

@@ -83,6 +83,7 @@ function query() {
   } else given.set("last", state.last === "all" ? 1e10 : state.last);
   for (const each of plots.names) given.append("signal", each);
   for (const [name, value] of Object.entries(chosenPart())) given.set(name, value);
+  given.set("named", "1");
   return given;
 }
 

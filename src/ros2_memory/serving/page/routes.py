@@ -79,7 +79,8 @@ def page_routes(
     def span(given: QueryParams, part: Memory, call: Call) -> JsonObject:
         shown = span_shown(part, call, span_request(given), progress, dispatcher.questions)
         if "status" in shown:
-            shown |= {**recordings.shown(part, call), "memory": named(memory)}
+            shown |= recordings.shown(part, call)
+            shown |= {"memory": named(memory)} if given.get("named") == "1" else {}
         if shown.get("mixed") and "path" in shown:
             window = TimeWindow.from_unix(float(str(shown["start"])), float(str(shown["end"])))
             shown |= recordings.paths(part, call, window)
