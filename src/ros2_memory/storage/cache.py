@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 _SPARED: Final = 3
+"""Values that stay, though they are older, for each that goes."""
 _SHARED_BYTES: Final = 32 << 10
 """The size up to which a channel is shared; a longer one belongs to its file alone."""
 
