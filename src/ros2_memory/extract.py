@@ -383,14 +383,18 @@ class SchemaExtractor:
         return {name: rendering.value(node, name) for name, node in nodes}
 
     def _find(self, message: object, type_name: str, path: str) -> object:
-        """Returns what is at one of `fields` in a message, or `ABSENT`."""
+        """Returns what is at a path in a message, or `ABSENT`.
+
+        By the name that the schema map has for it; in a type that it does not map, as the message
+        is shown; else by the path of the message's own fields.
+        """
         plan = self.plan(type_name)
         segments = tuple(path.split("."))
-        mapped = plan.fields.get(segments[0])
+        mapped, node = plan.fields.get(segments[0]), ABSENT
         if mapped is not None:
             node = descend(_converted(segments[0], _at(message, mapped)), segments[1:], view)
-        else:
-            node = ABSENT if plan.fields else descend(message, segments, view)
+        elif not plan.fields:
+            node = descend(message, segments, view)
         return _plain(_at(message, segments)) if node is ABSENT else node
 
 

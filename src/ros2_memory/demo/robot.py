@@ -178,15 +178,17 @@ def place(t: float) -> str:
 def seen(t: float) -> tuple[SimulatedThing, ...]:
     """Returns the objects in the camera's view and range, nearest first."""
     ahead, aside, _ = CAMERA
-    camera = pose_in_map(t).then(Planar(ahead, aside, 0.0))
-    things: list[SimulatedThing] = []
+    to_camera = pose_in_map(t).then(Planar(ahead, aside, 0.0)).inverse()
+    things: list[tuple[float, SimulatedThing]] = []
     for label, (x, y, z) in THINGS.items():
-        x, y, _ = camera.inverse().then(Planar(x, y, 0.0))  # noqa: PLW2901
-        bearing, distance = math.atan2(y, x), math.hypot(x, y)
+        forward, left, _ = to_camera.then(Planar(x, y, 0.0))
+        bearing, distance = math.atan2(left, forward), math.hypot(forward, left)
         if distance <= SIGHT_M and abs(bearing) <= SIGHT_HALF_ANGLE:
             score = round(0.97 - 0.1 * distance, 2)
-            things.append(SimulatedThing(label, score, (x + ahead, y + aside, z)))
-    return tuple(sorted(things, key=lambda thing: -thing.score))
+            things.append(
+                (distance, SimulatedThing(label, score, (forward + ahead, left + aside, z)))
+            )
+    return tuple(thing for _, thing in sorted(things))
 
 
 def path_clear(t: float) -> bool:

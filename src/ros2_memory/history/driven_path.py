@@ -386,6 +386,7 @@ def _is_odometry(frame: str) -> bool:
 
 
 def _body_rank(frame: str, map_frame: str | None) -> int:
+    """Returns how unlikely a frame is the body: named bodies first, frames of the world last."""
     name = frame.rpartition("/")[2]
     if name == map_frame or _is_odometry(frame):
         return len(_BODIES) + 1  # of the world: it moves as the map is corrected
@@ -441,15 +442,18 @@ def newest_of_body(
     if own_session and not sessions.recordings_of(own_session, topics):
         own_session = None
     for stored in view.stream.messages(topics, window, newest_first=True):
+        if own_session and not sessions.has(own_session, stored):
+            continue
+        recorded_in = stored.bag.recording
         for transform in decoded_transforms(view, [stored]):
-            is_of_session = not own_session or sessions.has(own_session, stored)
-            if transform.child.lstrip("/") != body.child or not is_of_session:
+            if transform.child.lstrip("/") != body.child:
                 continue
             clock = frames_of(view, (), [transform], parent).clock
             moment = transform.stamp if clock == "stamp" else transform.log_time
-            by = stored.bag.recording
-            with suppress(NoDataError):  # as in `poses_of_body`
-                there = transform_at(view, parent, body.child, moment, by, explains=False).transform
+            with suppress(NoDataError):  # no other transforms lead there: an older one may
+                there = transform_at(
+                    view, parent, body.child, moment, recorded_in, explains=False
+                ).transform
                 return stored, Pose(there.translation, there.rotation, parent)
     return None
 
