@@ -24,7 +24,7 @@ def return_large_at_once() -> None:
 
 
 def keep_freed() -> None:
-    """Has up to 64 MiB of what is freed stay: to take it from the system anew takes time."""
+    """Has up to 64 MiB of freed memory stay with the process, which takes it again sooner."""
     _set(_MMAP_THRESHOLD, _KEPT // 2)
     _set(_TRIM_THRESHOLD, _KEPT)
 

@@ -352,7 +352,7 @@ class BinnedWindow:
         self.add_lengths(column, "duration", without(heard, self.gaps))
 
     def bounds(self, topics: Sequence[str]) -> tuple[Ints, Ints]:
-        """Returns the first and the last log time of topics in each bag of what is counted."""
+        """Returns first and last log times (ns) of topics: one for each topic and bag counted."""
         bounds = [self.view.bounds(topic, self.counted) for topic in topics]
         firsts, lasts = np.concatenate(bounds, axis=1)
         is_inside = (firsts < self.counted.stop) & (lasts >= self.counted.start)

@@ -290,9 +290,9 @@ class TrackReader:
     def _stretch_settings(
         self, recordings: Sequence[Path], moving: Collection[Path], span: TimeWindow
     ) -> str | None:
-        """Returns the hash of what places the poses of some recordings; None of what may change.
+        """Returns the hash of all transforms that place poses; None while these may change.
 
-        `moving`: the recordings of the transforms around that time.
+        `recordings`: of the poses. `moving`: of the transforms around that time.
         """
         sessions = self._view.sessions
         numbers: dict[Session, int] = {}

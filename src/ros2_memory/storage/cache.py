@@ -25,9 +25,9 @@ _SHARED_BYTES: Final = 32 << 10
 class ByteLru(Generic[T]):
     """A cache of up to `capacity` bytes, which drops what was not used lately. Thread-safe.
 
-    A value that is larger than the capacity is not cached. A few that were used still longer ago
-    are spared for each that goes: of what is asked for in a circle, and is a little more than fits,
-    an LRU cache would drop each value just before it is asked for.
+    A value that is larger than the capacity is not cached. For each value that it drops, a few
+    older ones stay. A question that reads slightly more than fits, and is asked again, then finds
+    most of it; LRU would drop each value just before it is read again.
     """
 
     def __init__(self, capacity: int) -> None:
