@@ -290,6 +290,37 @@ def _blocks(slots: _Slots, inner: Ints, chains: Ints) -> Blocks:
     return blocks
 
 
+class _Bends(NamedTuple):
+    """Second differences of poses, slot by slot.
+
+    Attributes:
+        squares: of their lengths (m2).
+        edges: where those of each slot begin, and where the last one's stop.
+    """
+
+    squares: Floats
+    edges: Ints
+
+    def noises(self, firsts: Ints, stops: Ints) -> Floats:
+        """Returns the standard deviation (m) of the poses in ranges of slots.
+
+        By a median, since a stopping robot bends once; 0 where there is no bend.
+        """
+        begins = self.edges[firsts]
+        counts = self.edges[stops] - begins
+        groups = np.repeat(np.arange(counts.size), counts)
+        before = np.cumsum(counts) - counts
+        rows = np.arange(groups.size) - np.repeat(before - begins, counts)
+        values = self.squares[rows]
+        values = values[np.lexsort((values, groups))]
+        has_bends = counts > 0
+        middles = values[before[has_bends] + (counts[has_bends] - 1) // 2]
+        deviations = np.zeros(counts.size)
+        # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
+        deviations[has_bends] = np.sqrt(middles / 6 / 0.6)
+        return deviations
+
+
 class _Slots:
     """Poses, of which there is one at least, by their slots of time."""
 
@@ -315,40 +346,37 @@ class _Slots:
         return means
 
     @cached_property
-    def _bends(self) -> tuple[Floats, Ints, Ints]:
-        """Squares (m2) of the second differences of poses, and where each slot's lie.
+    def bends(self) -> _Bends:
+        """The second differences of poses: each is of the slot of its middle pose.
 
-        Inside of slots; where most have too few poses for that, also across them: a bend is then
-        in the slot of its middle pose.
+        A slot with enough poses has those inside of it alone.
         """
         bends = self.positions[:-2] - 2 * self.positions[1:-1] + self.positions[2:]
         slot = np.repeat(np.arange(len(self)), self.counts)
-        is_counted = slot[2:] == slot[:-2]
-        if np.median(self.counts) < _OWN_BENDS:
-            is_counted |= self.times[2:] - self.times[:-2] <= _SPARSE_NS
+        is_inside = slot[2:] == slot[:-2]
+        is_short = self.times[2:] - self.times[:-2] <= _SPARSE_NS
+        is_counted = is_inside | (is_short & (self.counts[slot[1:-1]] < _OWN_BENDS))
         counts = np.bincount(slot[1:-1][is_counted], minlength=len(self))
-        stops = np.cumsum(counts)
-        return row_sums(bends * bends)[is_counted], stops - counts, stops
+        return _Bends(row_sums(bends * bends)[is_counted], np.r_[0, np.cumsum(counts)])
 
     @cached_property
     def noises(self) -> Floats:
         """The standard deviation (m) of the poses of each slot; 0 where they are too few."""
-        bends, begins, stops = self._bends
-        return _noises(bends, begins, stops)
+        slots = np.arange(len(self))
+        return self.bends.noises(slots, slots + 1)
 
     def links(self) -> Flags:
         """Returns whether the robot may have stood still from each slot to the next with poses."""
         follows = self.firsts[1:] - self.lasts[:-1] <= SILENCE_NS
         apart_m = _lengths(np.diff(self.means, axis=0))
         allowed_m = DRIFT_MPS * (np.diff(self.numbers) * SLOT_NS / NS_PER_S)
-        bends, begins, stops = self._bends
-        unsure = np.flatnonzero(follows & (apart_m > allowed_m) & (stops[1:] > begins[:-1]))
+        many = self.bends.edges[2:] - self.bends.edges[:-2]
+        unsure = np.flatnonzero(follows & (apart_m > allowed_m) & (many > 0))
         if unsure.size:
-            many = stops[unsure + 1] - begins[unsure]
             spread = np.sqrt(1 / self.counts[unsure] + 1 / self.counts[unsure + 1])
             # Few of them may show much less noise than there is, hence the allowance.
-            factor = _NOISE_FACTOR * (1 + 4 / many) * spread
-            noise = _noises(bends, begins[unsure], stops[unsure + 1])
+            factor = _NOISE_FACTOR * (1 + 4 / many[unsure]) * spread
+            noise = self.bends.noises(unsure, unsure + 2)
             allowed_m[unsure] = np.maximum(allowed_m[unsure], factor * noise)
         linked: Flags = follows & (apart_m <= allowed_m)
         return linked
@@ -364,8 +392,7 @@ class _Slots:
         low, high = sorted((at, at - step * min(_PLACE_SLOTS - 1, abs(at - other))))
         at_end = self.positions[self.begins[low] : self.stops[high]]
         place = at_end.mean(axis=0)
-        bends, begins, stops = self._bends
-        [noise] = _noises(bends, begins[low : low + 1], stops[high : high + 1]).tolist()
+        noise = float(self.bends.noises(np.array([low]), np.array([high + 1]))[0])
         reach = max(_NEAREST_M, _ELSEWHERE * noise, 1.2 * float(_lengths(at_end - place).max()))
         far = np.searchsorted(self.numbers, self.numbers[at] + step * _OUTWARDS, side="left")
         low, high = sorted((at, int(far)))
@@ -382,25 +409,6 @@ class _Slots:
 
 def _lengths(vectors: Vectors) -> Floats:
     return np.sqrt(row_sums(vectors * vectors))
-
-
-def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
-    """Returns the standard deviation (m) of poses by their bends from `begins` to `stops`.
-
-    By a median, since a stopping robot bends once; 0 where there is no bend.
-    """
-    counts = stops - begins
-    groups = np.repeat(np.arange(counts.size), counts)
-    before = np.cumsum(counts) - counts
-    rows = np.arange(groups.size) - np.repeat(before - begins, counts)
-    values = bends[rows]
-    values = values[np.lexsort((values, groups))]
-    has_bends = counts > 0
-    middles = values[before[has_bends] + (counts[has_bends] - 1) // 2]
-    deviations = np.zeros(counts.size)
-    # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-    deviations[has_bends] = np.sqrt(middles / 6 / 0.6)
-    return deviations
 
 
 def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:

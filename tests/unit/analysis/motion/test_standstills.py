@@ -158,6 +158,16 @@ def test_slices_of_any_length_change_nothing(made: World, blocks: int) -> None:
     assert parts == whole
 
 
+def test_how_often_poses_come_at_another_time_changes_nothing() -> None:
+    legs = [(25.0, 0.4), (120.0, 0.0), (25.0, 0.4)]
+    rare = world(legs, hz=4, begin=100, noise=0.003)
+    often = world([(300.0, 0.4)], hz=50, begin=271, noise=0.003)
+    alone = standstills_of(rare.poses)
+    assert len(alone) == 1
+    assert standstills_of(rare.poses + often.poses) == alone
+    assert standstills_of(rare.poses + often.poses, blocks=20) == alone
+
+
 def test_long_standing_with_noise_of_a_centimetre_is_one_standstill() -> None:
     poses = world([(900.0, 0.0)], noise=0.01).poses
     [found] = standstills_of(poses)
