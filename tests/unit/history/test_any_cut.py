@@ -105,6 +105,7 @@ def questions(draw: Random, world: World, moments: Sequence[int], most: int) -> 
             window["fields"] = FIELDS[topic]
         found.append(("get_topic_in_range", {**window, "max_samples": 7}))
         found.append(("get_topic_in_range", {**window, "by": draw.choice(["hour", "day"])}))
+    found += [*_about_the_robot(draw, moments)]
     some = found if LONG else draw.sample(found, min(most, len(found)))
     return [("data_time_range", {}), *some]
 
@@ -125,6 +126,26 @@ def _matches(draw: Random, condition: dict[str, Any], moments: Sequence[int]) ->
             **draw.choice([{}, {"where": {"x": 0.2, "y": 0, "radius_m": 0.5}}, {"while": still}]),
         },
     )
+
+
+def _about_the_robot(draw: Random, moments: Sequence[int]) -> Iterator[Question]:
+    """Where it was, how it got there, what it saw, and what happened."""
+    at = {"timestamp": draw.choice(moments) / S}
+    yield "get_position_at", at
+    yield "get_velocity_at", at
+    yield "get_transform_at", {"parent": "base_link", "child": "cam", **at}
+    yield "list_frames", {}
+    place = {"x": round(draw.gauss(0, 1), 2), "y": 0, "radius_m": draw.choice([0.3, 1.0])}
+    for more in ({}, _window(draw, moments)):
+        yield "visits", {"where": place, **more}
+        yield "visits", {**place, "by": draw.choice(["hour", "day"]), **more}
+        yield "find_things", {**draw.choice([{}, {"label": "cup"}, {"where": place}]), **more}
+    yield "trajectory_summary", _window(draw, moments)
+    yield "trajectory_summary", {**_window(draw, moments), "by": draw.choice(["hour", "day"])}
+    yield "recap", _window(draw, moments)
+    then = _window(draw, moments)
+    earlier = {"with_start": then["start"], "with_end": then["end"]}
+    yield "compare", {**_window(draw, moments), **earlier}
 
 
 def _window(draw: Random, moments: Sequence[int]) -> dict[str, Any]:
@@ -321,7 +342,7 @@ def check_silences(known: Any, splits: Splits, plain: Mapping[str, list[Plain]])
             assert ends in [[each["start"], each["end"]] for each in known]
 
 
-UNLIKE: Final = {"bags", "budget", "clock_faults", "silences", "doubts"}
+UNLIKE: Final = {"bags", "budget", "clock_faults", "silences", "silent_s", "doubts"}
 """How many bags, their bytes, and which no clock dated. Silences lie between bags."""
 
 
@@ -337,8 +358,14 @@ def alike(reply: Any) -> Any:
         for note in reply.get("notes", ())
         # These name bags or silences, or are of a minute ago, before the last bags came.
         if "dated by a wrong clock" not in note
-        and not note.startswith(("silent while", "robots are mixed"))
+        and not note.startswith(("silent while", "robots are mixed", "left out, because"))
     ]
+    if "events" in reply:
+        counts = kept["counts"] = {**reply["counts"]}
+        is_all = sum(counts.values()) == len(reply["events"])
+        events = [event for event in reply["events"] if "was silent" not in event["text"]]
+        kept["events"] = events if is_all else None  # silences left others out
+        counts.pop("silences", None)
     if "topic_s" in reply.get("columns", ()):  # how long there were bags with the topic
         at = reply["columns"].index("topic_s")
         for row in (kept["columns"], *kept["rows"]):
