@@ -279,9 +279,9 @@ class ColumnStore(Database):
         rows: dict[int, int] = {}
         if known is not None and known.deletion == deletion:
             rows = dict(zip(map(id, known.bags), known.rows.tolist(), strict=True))
-        found = [rows.get(id(bag)) for bag in bags]
-        others = [bag for bag, row in zip(bags, found, strict=True) if row is None]
-        if others:
+        found = [*map(rows.get, map(id, bags))]
+        if None in found:
+            others = [bag for bag, row in zip(bags, found, strict=True) if row is None]
             keys = [(relative(bag.file, bag_dir), *_stamps(bag)) for bag in others]
             query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
             given = [self._definitions]
