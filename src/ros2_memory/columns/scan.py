@@ -458,7 +458,7 @@ class Scan:
         order = order[(self._lasts[source] >= starts[span])[order]]
         before, after = order[:-1], order[1:]
         may_repeat = (span[before] == span[after]) & (latest[before] >= earliest[after])
-        return [self._shared[nth] for nth in sorted({*span[before][may_repeat].tolist()})]
+        return [self._shared[nth] for nth in np.unique(span[before][may_repeat]).tolist()]
 
     def _repeated(self, unit: Unit) -> IntArray:
         """Returns the rows of a unit that repeat a message of another recording."""

@@ -49,14 +49,10 @@ class Pause(NamedTuple):
 
 
 def pause_between(before: BagFile, after: BagFile) -> Pause:
-    """Returns the pause between two bags."""
-    return Pause(before.end, after.start, (before, after), _follows(before, after))
-
-
-def _follows(before: BagFile, after: BagFile) -> bool:
-    """Returns whether a bag is the next split of the same recording."""
+    """Returns the pause between two bags, of one recorder if they are splits that follow."""
     name, next_name = split_of(before.file), split_of(after.file)
-    return name is not None and next_name == (name.series, name.number + 1)
+    ran_on = name is not None and next_name == (name.series, name.number + 1)
+    return Pause(before.end, after.start, (before, after), ran_on)
 
 
 class Rhythm:

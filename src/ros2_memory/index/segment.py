@@ -54,6 +54,8 @@ _FEWEST: Final = 3
 _PER_OCTAVE: Final = 2
 _OCTAVES: Final = 64 * _PER_OCTAVE
 """A period of 64 bits is in one of so many parts of octaves."""
+_NONE: Final = (0, MAX_NS, MIN_NS)
+"""Count, first and last log time of a topic of which a bag has no message."""
 
 _Times: TypeAlias = "NDArray[np.int64]"
 
@@ -346,14 +348,15 @@ class Segment:
         return TopicColumn(bags, firsts, lasts, counts)
 
     def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
-        """Returns count (0 where it has none), first and last by topic of one type, and bag."""
+        """Returns count, first and last by topic of one type, and bag; `_NONE` without messages."""
         parts: list[NDArray[np.int64]] = []
         for schema, bags, joined in self._joined:
             at = {header: position for position, header in enumerate(schema.topics)}
             rows = [row for row, header in enumerate(headers) if header in at]
             part = numbers_of(schema, joined, bags.size, [at[headers[row]] for row in rows])
             if len(rows) < len(headers):
-                found, part = part, np.zeros((len(headers), bags.size, 3), np.int64)
+                found, part = part, np.empty((len(headers), bags.size, 3), np.int64)
+                part[:] = _NONE
                 part[rows] = found
             parts.append(part)
         if len(parts) == 1:
@@ -480,7 +483,6 @@ def _added(
     numbers: NDArray[np.int64], begins: Sequence[int] | NDArray[np.intp], axis: int
 ) -> NDArray[np.int64]:
     """Returns count, first and last of some rows together, each from one of `begins` on."""
-    numbers[numbers[:, :, 0] == 0] = (0, MAX_NS, MIN_NS)
     added = (np.add, np.minimum, np.maximum)
     return np.stack(
         [add.reduceat(numbers[:, :, nth], begins, axis) for nth, add in enumerate(added)], axis=2
@@ -494,11 +496,9 @@ def folder_of(bag: BagFile) -> str:
 
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
     """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
-    is_there = numbers[:, :, 0] > 0
-    firsts = np.where(is_there, numbers[:, :, 1], MAX_NS)
+    _, firsts, lasts = numbers.transpose(2, 0, 1)
     order = np.argsort(firsts, axis=1, kind="stable")
     begins = np.take_along_axis(firsts, order, axis=1)
-    lasts = np.where(is_there, numbers[:, :, 2], MIN_NS)
     reach = np.maximum.accumulate(np.take_along_axis(lasts, order, axis=1), axis=1)
     is_break = (begins[:, 1:] - SHORTEST_NS > reach[:, :-1]) & (begins[:, 1:] < MAX_NS)
     for nth, breaks in enumerate(is_break):
