@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from functools import cached_property, reduce
 from itertools import chain
-from operator import attrgetter, ne
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
@@ -32,7 +33,6 @@ from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -209,11 +209,9 @@ class Segment:
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, numbers = self.numbered_folders
-        starts, ends = np.full(len(folders), MAX_NS), np.full(len(folders), MIN_NS)
-        np.minimum.at(starts, numbers, self.starts)
-        np.maximum.at(ends, numbers, self.ends)
-        return dict(zip(folders, zip(starts.tolist(), ends.tolist(), strict=True), strict=True))
+        folders, _ = self.numbered_folders
+        _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
+        return dict(zip(folders, zip(firsts, lasts, strict=True), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
@@ -315,6 +313,7 @@ class Segment:
     def _by_folder(self) -> NDArray[np.int64]:
         """Count, first and last by topic of one type, and folder."""
         folders, numbers = self.numbered_folders
+        numbers = numbers[self._order]
         order = np.argsort(numbers, kind="stable")
         begins = np.searchsorted(numbers[order], np.arange(len(folders)))
         return _added(self._numbers(self._headers)[:, order], begins, axis=1)
@@ -323,9 +322,8 @@ class Segment:
     def _recording_paths(self) -> list[Path]:
         """The recordings of the bags, in the order in which their folders are numbered."""
         # A path for each bag of a week would take longer than all else.
-        _, folder_numbers = self.numbered_folders
-        _, rows = np.unique(folder_numbers, return_index=True)
-        return [self.bags[row].recording for row in rows.tolist()]
+        folders, _ = self.numbered_folders
+        return [Path(folder or "/") for folder in folders]
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic in a window, in order, once for each type."""
@@ -342,35 +340,32 @@ class Segment:
         headers = [header for header in self._headers if header.topic == topic]
         if not headers:
             return None
-        numbers = self._numbers(headers)
+        numbers = self._numbers(headers)[:, np.argsort(self._order)]
         bags, types = np.nonzero(numbers[:, :, 0].T)
         counts, firsts, lasts = numbers[types, bags].T
         return TopicColumn(bags, firsts, lasts, counts)
 
     def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
-        """Returns count, first and last by topic of one type, and bag; `_NONE` without messages."""
-        parts: list[NDArray[np.int64]] = []
+        """Returns count, first and last by topic of one type, and bag; `_NONE` without messages.
+
+        The bags are in the order of `_joined`.
+        """
+        numbers = np.empty((len(headers), len(self.bags), 3), np.int64)
+        end = 0
         for schema, bags, joined in self._joined:
+            begin, end = end, end + bags.size
             at = {header: position for position, header in enumerate(schema.topics)}
             rows = [row for row, header in enumerate(headers) if header in at]
-            part = numbers_of(schema, joined, bags.size, [at[headers[row]] for row in rows])
             if len(rows) < len(headers):
-                found, part = part, np.empty((len(headers), bags.size, 3), np.int64)
-                part[:] = _NONE
-                part[rows] = found
-            parts.append(part)
-        if len(parts) == 1:
-            return parts[0]
-        order = np.argsort(np.concatenate([bags for _, bags, _ in self._joined]))
-        return np.concatenate(parts, axis=1).take(order, axis=1)
+                numbers[:, begin:end] = _NONE
+            positions = [at[headers[row]] for row in rows]
+            numbers[rows, begin:end] = numbers_of(schema, joined, bags.size, positions)
+        return numbers
 
-    def _numbers_by_topic(self) -> NDArray[np.int64]:
-        """Returns count, first and last by topic (sorted) and bag; its types count together."""
-        headers = sorted(self._headers, key=attrgetter("topic"))
-        numbers = self._numbers(headers)
-        topics = [header.topic for header in headers]
-        starts = np.flatnonzero([True, *map(ne, topics, topics[1:])])
-        return numbers if len(starts) == len(headers) else _added(numbers, starts, axis=0)
+    @cached_property
+    def _order(self) -> NDArray[np.uint16]:
+        """The positions of the bags in the order of `_joined`."""
+        return np.concatenate([bags for _, bags, _ in self._joined])
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -409,12 +404,15 @@ class Segment:
         In all (ns), of the bags that hold each topic. Between absences a bag is as many: what
         follows each comes behind all bags. A count is 0 where a bag holds none.
         """
-        topics = sorted(self.types)
-        numbers = self._numbers_by_topic()
-        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)
+        headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
+        numbers = self._numbers(headers)
+        if len(headers) > len(topics):
+            names = [header.topic for header in headers]
+            numbers = _added(numbers, [*map(names.index, topics)], axis=0)
+        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)[self._order]
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
-        has_absences = bool(self._bags_with("absences"))
-        for row, bag in enumerate(self.bags if has_absences else ()):
+        order = self._order.tolist() if self._bags_with("absences") else ()
+        for row, bag in enumerate(map(self.bags.__getitem__, order)):
             for topic, pauses in bag.summary.schema.absences:
                 nth = topics.index(topic)
                 count, _, last = numbers[nth, row].tolist()
@@ -423,10 +421,13 @@ class Segment:
                     count, last = sent, start
                     lengths[nth] -= end - start
                 numbers[nth, row, [0, 2]] = count, last
-        more = np.zeros((len(topics), len(parts), 3), np.int64)
-        for at, (nth, part) in enumerate(parts):
-            more[nth, at] = part
-        return np.concatenate((numbers, more), axis=1), lengths
+        if parts:
+            more = np.empty((len(topics), len(parts), 3), np.int64)
+            more[:] = _NONE
+            for at, (nth, part) in enumerate(parts):
+                more[nth, at] = part
+            numbers = np.concatenate((numbers, more), axis=1)
+        return numbers, lengths
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
