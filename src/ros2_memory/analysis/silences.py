@@ -15,7 +15,7 @@ counts is one rule over the whole memory:
   between two, as one that starts late each time, only those count that last `UNUSUAL` times as long
   as half of them do.
 
-Activities of parts of a memory add up exactly, in whichever parts it is cut.
+What parts of a memory have adds up exactly, in whichever parts it is cut.
 """
 
 from __future__ import annotations
@@ -53,18 +53,15 @@ class Spacing(NamedTuple):
     intervals: int = 0
 
 
-class Activity(NamedTuple):
-    """When some bags hold a topic, and how often.
+class Pacing(NamedTuple):
+    """How often some bags hold a topic.
 
     Attributes:
-        runs: from its first message to its last, in order, parted where bag after bag holds none
-            for more than `SHORTEST_NS`.
         spacings: those of bags with enough messages, by the octave of the period or a part of it.
         messages: in all bags.
         length: of the bags that hold the topic, in all.
     """
 
-    runs: tuple[Span, ...]
     spacings: Mapping[int, Spacing]
     messages: int
     length: Ns
@@ -95,19 +92,15 @@ class Silence(NamedTuple):
         return Silence(self.topic, first, last, min(self.length, last - first), goes_on)
 
 
-def joined(parts: Sequence[Activity]) -> Activity:
-    """Returns the activity in all of these parts together; at least one."""
+def joined(parts: Sequence[Pacing]) -> Pacing:
+    """Returns the pacing in all of these parts together."""
     spacings: dict[int, Spacing] = {}
     for part in parts:
         for octave, spacing in part.spacings.items():
             both = zip(spacings.get(octave, Spacing()), spacing, strict=True)
             spacings[octave] = Spacing(*map(sum, both))
-    runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
-    return Activity(
-        tuple(runs),
-        spacings,
-        sum(part.messages for part in parts),
-        sum(part.length for part in parts),
+    return Pacing(
+        spacings, sum(part.messages for part in parts), sum(part.length for part in parts)
     )
 
 
@@ -116,39 +109,41 @@ def shortest_silence(period: Ns) -> Ns:
     return max(SHORTEST_NS, PERIODS * period)
 
 
-def usual_period(activity: Activity) -> Ns | None:
+def usual_period(pacing: Pacing) -> Ns | None:
     """Returns the usual time between two messages; None for a topic without a usual rate."""
-    octaves = sorted(activity.spacings)
-    bags = [*accumulate(activity.spacings[octave].bags for octave in octaves)]
+    octaves = sorted(pacing.spacings)
+    bags = [*accumulate(pacing.spacings[octave].bags for octave in octaves)]
     if not bags:
         return None
     median = next(
         octave for octave, upto in zip(octaves, bags, strict=True) if 2 * upto >= bags[-1]
     )
-    spacing = activity.spacings[median]
+    spacing = pacing.spacings[median]
     period = spacing.span // spacing.intervals
-    return period if 2 * activity.messages * period >= activity.length else None
+    return period if 2 * pacing.messages * period >= pacing.length else None
 
 
-def usual_periods(activities: Mapping[str, Activity]) -> dict[str, Ns]:
+def usual_periods(pacings: Mapping[str, Pacing]) -> dict[str, Ns]:
     """Returns the usual period of each topic that has one."""
-    periods = ((topic, usual_period(activity)) for topic, activity in activities.items())
+    periods = ((topic, usual_period(pacing)) for topic, pacing in pacings.items())
     return {topic: period for topic, period in periods if period is not None}
 
 
 def silences(
-    activities: Mapping[str, Activity],
+    periods: Mapping[str, Ns],
+    runs_of: Mapping[str, Sequence[Span]],
     together: Iterable[Iterable[str]],
     gaps: Sequence[Span] = (),
 ) -> list[Silence]:
     """Returns the silences of all topics, in order of time.
 
     Args:
-        activities: by topic, in the whole memory.
+        periods: the usual ones, by topic.
+        runs_of: by topic, in the whole memory, from its first message to its last, in order, parted
+            where bag after bag holds none for more than `SHORTEST_NS`.
         together: the topics of each bag; of bags with the same topics once is enough.
         gaps: when nothing was recorded, in order: also pauses of less than `SHORTEST_NS`.
     """
-    periods = usual_periods(activities)
     companions: dict[str, set[str]] = {}
     for names in {frozenset(periods.keys() & topics) for topics in together}:
         for topic in names:
@@ -158,9 +153,9 @@ def silences(
     for topic, period in periods.items():
         others = frozenset(companions.get(topic, ()))
         if others not in robot_on:
-            robot_on[others] = _heard([activities[other].runs for other in sorted(others)])
+            robot_on[others] = _heard([runs_of[other] for other in sorted(others)])
         limit = shortest_silence(period)
-        runs = united(activities[topic].runs, limit)
+        runs = united(runs_of[topic], limit)
         found = _silences_of(topic, runs, robot_on[others], limit, gaps)
         reported += _without_habit([*found], runs)
     return sorted(reported, key=lambda silence: (silence.start, silence.end, silence.topic))

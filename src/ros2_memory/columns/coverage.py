@@ -179,7 +179,8 @@ class Covering:
 
     def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
         """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
-        is_closed = np.array([bag.state is BagState.CLOSED for bag in segment.bags], np.bool_)
+        closed = BagState.CLOSED
+        is_closed = np.fromiter((bag.state is closed for bag in segment.bags), np.bool_)
         is_stored: NDArray[np.bool_] = is_closed & (rows >= 0)
         missing = tuple(segment.bags[nth] for nth in np.flatnonzero(~is_stored).tolist())
         numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)

@@ -374,7 +374,7 @@ class Group:
             batch.places,
             left_out={"": kind.reason},
             payload_hashes=hashes,
-            definition=kind.definition,
+            define=lambda: kind.definition,
             bags=bags,
         )
         if kind.plan is None:

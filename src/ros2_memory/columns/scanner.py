@@ -370,7 +370,7 @@ class Scanner:
             none,
             *lazy_columns(topic.layout, load, head.dropped),
             left_out,
-            definition=topic.definition,
+            define=lambda: topic.definition,
             packed=packed,
             outline=partial(self._outlines.get, _outline_key(head), older),
             memory=self.caches.read,

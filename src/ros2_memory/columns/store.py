@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 from functools import partial
-from itertools import accumulate, pairwise
+from itertools import accumulate, pairwise, repeat
 from operator import attrgetter
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
@@ -63,6 +63,7 @@ _ALL_TIME: Final = TimeWindow.everything()
 LONG_NS: Final[Ns] = 2 * PART_NS
 """A bag that lasts longer becomes parts at once."""
 
+_UNKNOWN: Final = -2
 _FEW: Final = 2048
 """Bags that are looked up one by one; for more of them all stored ones are read."""
 _stamps = attrgetter("size", "mtime_ns", "sidecar_ns", "start", "end")
@@ -273,27 +274,27 @@ class ColumnStore(Database):
         One more where copies of its messages can be recognised. `deletion` is that of the `state`
         of the moment.
         """
-        if not bags:
-            return np.empty(0, np.int64)
         known, self._known = self._known, None
         rows: dict[int, int] = {}
         if known is not None and known.deletion == deletion:
             rows = dict(zip(map(id, known.bags), known.rows.tolist(), strict=True))
-        found = [rows.get(id(bag)) for bag in bags]
-        others = [bag for bag, row in zip(bags, found, strict=True) if row is None]
-        if others:
-            keys = [(relative(bag.file, bag_dir), *_stamps(bag)) for bag in others]
+        found = np.fromiter(map(rows.get, map(id, bags), repeat(_UNKNOWN)), np.int64)
+        others = np.flatnonzero(found == _UNKNOWN)
+        if others.size:
+            keys = [
+                (relative(bag.file, bag_dir), *_stamps(bag))
+                for bag in map(bags.__getitem__, others.tolist())
+            ]
             query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
             given = [self._definitions]
-            if len(others) <= _FEW:
+            if others.size <= _FEW:
                 query += " AND path IN (SELECT value FROM json_each(?))"
                 given.append(json.dumps([path for path, *_ in keys]))
             stored = self._asked(
                 lambda read: {row[1:]: row[0] for row in read}, dict[Key, int](), query, *given
             )
-            asked = (stored.get(key, -1) for key in keys)
-            found = [next(asked) if row is None else row for row in found]
-        return np.array(found, np.int64)
+            found[others] = [stored.get(key, -1) for key in keys]
+        return found
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""

@@ -229,7 +229,7 @@ class Table:
         left_out: which fields have no column (or not in all rows), by dot-path, and why; "" stands
             for the whole message, whose times are all there is.
         payload_hashes: CRC-32 of each payload, or `UNHASHED`; None where none was asked for.
-        definition: the fields of the type; None where they are not known.
+        define: returns the `definition`.
         bags: of each row the number of its bag among those that were decoded together; None: 0.
     """
 
@@ -241,12 +241,17 @@ class Table:
     elements: Mapping[str, Elements] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     payload_hashes: IntArray | None = None
-    definition: Definition | None = None
+    define: Callable[[], Definition | None] = lambda: None
     bags: IntArray | None = None
 
     def __len__(self) -> int:
         """Returns the number of messages."""
         return self.log_times.size
+
+    @property
+    def definition(self) -> Definition | None:
+        """The fields of the type; None where they are not known."""
+        return self.define()
 
     @property
     def bag_numbers(self) -> IntArray:
@@ -335,7 +340,7 @@ def joined(tables: Sequence[Table]) -> Table:
         *_joined_levels(tables),
         dict(ChainMap(*(dict(table.left_out) for table in tables))),
         np.concatenate([*map(_hashes, tables)]) if is_hashed else None,
-        first.definition,
+        first.define,
         np.concatenate([table.bag_numbers for table in tables]),
     ).sorted()
 

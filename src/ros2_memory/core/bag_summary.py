@@ -39,6 +39,7 @@ _NUMBERS: Final = struct.Struct("<qqq")
 _COUNT_BYTES: Final = 3
 _TIME_BYTES: Final = 5
 """Of a count, and of a time since the first one, in packed numbers: for bags of up to 18 min."""
+_TOPIC_BYTES: Final = _COUNT_BYTES + 2 * _TIME_BYTES
 _BASE: Final = struct.Struct("<q")
 
 _CACHED_SCHEMAS: Final = 1024
@@ -169,13 +170,12 @@ def numbers_of(
         whole = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
         return whole[:, positions].swapaxes(0, 1)
     base = np.ndarray((summaries, 1), "<i8", joined, 0, (size, 0))
+    # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
+    shape, strides = (len(schema.topics), summaries, 2), (_TOPIC_BYTES, size, _TIME_BYTES)
+    pairs = np.ndarray(shape, "<i8", joined, _BASE.size, strides)[[*positions]]
     numbers: IntArray = np.empty((len(positions), summaries, 3), np.int64)
-    for of_topic, position in zip(numbers, positions, strict=True):
-        # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
-        begin = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
-        pairs = np.ndarray((summaries, 2), "<i8", joined, begin, (size, _TIME_BYTES))
-        of_topic[:, 0] = pairs[:, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
-        of_topic[:, 1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
+    numbers[:, :, 0] = pairs[:, :, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
+    numbers[:, :, 1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
     return numbers
 
 
@@ -263,7 +263,7 @@ class BagSummary:
             count, first, last = _NUMBERS.unpack_from(self._numbers, position * _NUMBERS.size)
             return count, first, last
         packed = self._numbers
-        at = _BASE.size + position * (_COUNT_BYTES + 2 * _TIME_BYTES)
+        at = _BASE.size + position * _TOPIC_BYTES
         begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
         (base,) = _BASE.unpack_from(packed)
         count = int.from_bytes(packed[at:begin], "little")

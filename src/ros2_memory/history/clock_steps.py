@@ -228,6 +228,8 @@ def _step_by_stamps(view: View, pause: Pause) -> ClockStep | None:
         counts.update({info.topic: info.count for info in bag.summary.topics})
     changes: list[Ns] = []
     for topic, _ in counts.most_common(_MOST_STAMPED):
+        if view.timeline.is_log(topic):
+            continue  # they have no header, and are mostly latched: their parts are many
         by_recording = _stamps(view, topic, around).values()
         found = (delay_change((pause.start, pause.end), *stamped) for stamped in by_recording)
         changes += islice((change for change in found if change is not None), 1)

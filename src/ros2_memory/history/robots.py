@@ -434,7 +434,9 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             span = TimeWindow(first, min(last, until) + 1)
             # One that a wrong clock dated spans years, mostly without a bag.
             near = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
-            is_there = until <= last or any(other in some.recordings(topic) for some in near)
+            is_there = until <= last or any(
+                str(other) in some.folders and other in some.recordings(topic) for some in near
+            )
             if is_there and window.overlaps(span.start, span.stop - 1):
                 shortest = min(last - first, until - since)
                 is_edge = since < first and until < last and 2 * (until - first) < shortest

@@ -41,6 +41,7 @@ from ros2_memory.history.scan import (
     remembered,
     scan,
 )
+from ros2_memory.index.segment import wider
 from ros2_memory.retention.latched_carry import origin_of
 
 if TYPE_CHECKING:
@@ -135,7 +136,7 @@ class Sessions:
         for topic in topics:
             for path, span in self._view.timeline.recordings(topic).items():
                 there = by_folder.setdefault(self.folder(path), {})
-                there[path] = enclosing((span, there.get(path, span)))
+                there[path] = wider(there.get(path), span)
         return by_folder
 
     def has(self, session: Session, stored: StoredMessage) -> bool:

@@ -132,9 +132,11 @@ class View:
         """
         first, last = window.asked()
         bounds = (window.start, window.stop - 1) if around else (last, first)
-        gaps = self.snapshot.gaps
-        touched = [(start, end) for start, end in gaps if start < bounds[0] and bounds[1] < end]
-        return without_steps(self, touched) if touched else touched
+        pauses = [(pause.start, pause.end) for pause in self.snapshot.pauses]
+        touched = {(start, end) for start, end in pauses if start < bounds[0] and bounds[1] < end}
+        # What is a gap follows from all bags; at most moments there is not even a pause.
+        gaps = [gap for gap in self.snapshot.gaps if gap in touched] if touched else []
+        return without_steps(self, gaps) if gaps else gaps
 
     def census(self, topic: str) -> dict[str, TopicTotals]:
         """Returns what is recorded of a topic under each of its types, each message counted once.

@@ -14,6 +14,7 @@ clock is before 2017 no date counts as being in the future.
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from itertools import chain, takewhile
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 from ros2_memory.core.bag_summary import set_back_while_written
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
-from ros2_memory.index.segment import Segment
+from ros2_memory.index.segment import Segment, in_time
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
@@ -166,7 +167,7 @@ def check_dates(
     dating = Dating(faults=tuple(faults), note=note)
     if len(dating.misdated) == bags:
         dating = replace(dating, faults=tuple(fault._replace(misleads=False) for fault in faults))
-    dated = dated_segments(segments, dating.misdated)
+    dated = dated_segments(segments, dating.faults)
     return replace(
         dating,
         earliest=dated[0].bags[0].start if dated else None,
@@ -201,16 +202,17 @@ def _step_faults(
                 yield ClockFault(bag, FaultyClock.STRAY)
 
 
-def dated_segments(segments: Sequence[Segment], misdated: Collection[str]) -> Sequence[Segment]:
-    """Returns segments without the bags at these paths, in order."""
-    if not misdated:
-        return segments
+def dated_segments(segments: Sequence[Segment], faults: Sequence[ClockFault]) -> Sequence[Segment]:
+    """Returns segments without the bags that mislead, in order."""
+    misdated = [fault.bag for fault in faults if fault.misleads]
+    firsts, files = [segment.first for segment in segments], {bag.file for bag in misdated}
+    # Of the others, what they remember serves the next snapshot.
+    touched = {bisect_right(firsts, in_time(bag)) - 1 for bag in misdated}
     dated: list[Segment] = []
-    for segment in segments:
-        bags = [bag for bag in segment.bags if bag.file not in misdated]
-        if len(bags) == len(segment.bags):
-            dated.append(segment)  # what it remembers serves the next snapshot
-        elif bags:
+    for nth, segment in enumerate(segments):
+        if nth not in touched:
+            dated.append(segment)
+        elif bags := [bag for bag in segment.bags if bag.file not in files]:
             dated.append(Segment(bags))
     return dated
 

@@ -11,14 +11,12 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.analysis.silences import Activity, usual_periods
 from ros2_memory.bag_dir.layout import is_thinned
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Mapping
 
     from ros2_memory.core.model import BagFile
 
@@ -50,31 +48,22 @@ class Pause(NamedTuple):
         return self.end - self.start
 
 
-def pauses_between(bags: Sequence[BagFile]) -> Iterator[Pause]:
-    """Yields the pauses between bags, which are in order of time and may overlap."""
-    before = bags[0]
-    for after in bags[1:]:
-        if after.start - before.end > SHORTEST_PAUSE_NS:
-            yield Pause(before.end, after.start, (before, after), _follows(before, after))
-        if after.end > before.end:
-            before = after
-
-
-def _follows(before: BagFile, after: BagFile) -> bool:
-    """Returns whether a bag is the next split of the same recording."""
+def pause_between(before: BagFile, after: BagFile) -> Pause:
+    """Returns the pause between two bags, of one recorder if they are splits that follow."""
     name, next_name = split_of(before.file), split_of(after.file)
-    return name is not None and next_name == (name.series, name.number + 1)
+    ran_on = name is not None and next_name == (name.series, name.number + 1)
+    return Pause(before.end, after.start, (before, after), ran_on)
 
 
 class Rhythm:
     """How often the topics of bags have a message.
 
     Args:
-        activities: when the bags of a memory hold each topic.
+        periods: the usual period of each topic of a memory that has one.
     """
 
-    def __init__(self, activities: Mapping[str, Activity]) -> None:
-        self._periods = usual_periods(activities)
+    def __init__(self, periods: Mapping[str, Ns]) -> None:
+        self._periods = periods
 
     def gaps(self, pauses: Iterable[Pause]) -> list[Pause]:
         """Returns the pauses that are gaps."""

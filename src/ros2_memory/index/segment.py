@@ -8,17 +8,19 @@ from __future__ import annotations
 
 from functools import cached_property, reduce
 from itertools import chain
-from operator import attrgetter, ne
+from operator import attrgetter
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
 import numpy as np
 
-from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
+from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
 from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, joined_numbers, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import Pause, pauses_between
+from ros2_memory.index.holes import Pause, pause_between
 from ros2_memory.index.split_order import (
     Series,
     SplitNames,
@@ -31,7 +33,6 @@ from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -53,6 +54,8 @@ _FEWEST: Final = 3
 _PER_OCTAVE: Final = 2
 _OCTAVES: Final = 64 * _PER_OCTAVE
 """A period of 64 bits is in one of so many parts of octaves."""
+_NONE: Final = (0, MAX_NS, MIN_NS)
+"""Count, first and last log time of a topic of which a bag has no message."""
 
 _Times: TypeAlias = "NDArray[np.int64]"
 
@@ -137,17 +140,16 @@ class Segment:
     def __init__(self, bags: Sequence[BagFile]) -> None:
         self.bags = tuple(bags)
         self.first = in_time(self.bags[0])
-        self._known_recordings: dict[str, dict[Path, TopicTotals]] = {}
 
     @cached_property
     def starts(self) -> NDArray[np.int64]:
         """Log time of the first message in each bag."""
-        return np.array([bag.start for bag in self.bags], np.int64)
+        return np.fromiter(map(attrgetter("start"), self.bags), np.int64)
 
     @cached_property
     def ends(self) -> NDArray[np.int64]:
         """Log time of the last message in each bag."""
-        return np.array([bag.end for bag in self.bags], np.int64)
+        return np.fromiter(map(attrgetter("end"), self.bags), np.int64)
 
     @cached_property
     def latest(self) -> Ns:
@@ -207,17 +209,16 @@ class Segment:
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, numbers = self.numbered_folders
-        spans = _spans_of(len(folders), numbers, self.starts, self.ends)
-        return dict(zip(folders, spans, strict=True))
+        folders, _ = self.numbered_folders
+        _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
+        return dict(zip(folders, zip(firsts, lasts, strict=True), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
         folders, numbers = self.numbered_folders
-        messages = self._numbers(self._headers)[:, :, 0].sum(axis=0)
-        columns = (np.bincount(numbers), np.bincount(numbers, messages))
-        rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
+        messages = self._by_folder[:, :, 0].sum(axis=0)
+        rows = zip(np.bincount(numbers).tolist(), messages.tolist(), strict=True)
         return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
 
     @cached_property
@@ -228,10 +229,13 @@ class Segment:
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
         """The bags that are not readable as a whole, or that contradict themselves."""
+        odd = {id(schema) for schema in self.schemas if schema.remarks}
+        if not odd and BagState.INCOMPLETE not in map(attrgetter("state"), self.bags):
+            return ()
         return tuple(
             bag
             for bag in self.bags
-            if bag.summary.schema.remarks or bag.state is BagState.INCOMPLETE
+            if id(bag.summary.schema) in odd or bag.state is BagState.INCOMPLETE
         )
 
     @cached_property
@@ -246,22 +250,22 @@ class Segment:
     @cached_property
     def schemas(self) -> tuple[SummarySchema, ...]:
         """The different schemas of the summaries; mostly one."""
-        schemas = [bag.summary.schema for bag in self.bags]
+        schemas = [*map(attrgetter("summary.schema"), self.bags)]
         return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
 
     @cached_property
     def _joined(self) -> list[tuple[SummarySchema, NDArray[np.uint16], bytes]]:
         """The schemas, the positions of the bags of each, and the numbers of these, joined."""
-        bags_of: dict[int, list[int]] = {}
-        for nth, bag in enumerate(self.bags):
-            bags_of.setdefault(id(bag.summary.schema), []).append(nth)
+        summaries = [*map(attrgetter("summary"), self.bags)]
+        ids = np.fromiter(map(id, map(attrgetter("schema"), summaries)), np.int64)
+        rows = [np.flatnonzero(ids == id(schema)) for schema in self.schemas]
         return [
             (
                 schema,
-                np.array(bags, np.uint16),
-                joined_numbers([self.bags[nth].summary for nth in bags]),
+                bags.astype(np.uint16),
+                joined_numbers([summaries[nth] for nth in bags.tolist()]),
             )
-            for schema, bags in zip(self.schemas, bags_of.values(), strict=True)
+            for schema, bags in zip(self.schemas, rows, strict=True)
         ]
 
     @cached_property
@@ -278,15 +282,10 @@ class Segment:
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
         """By topic and type, the totals of the bags."""
         totals: dict[str, dict[str, TopicTotals]] = {}
-        counts, firsts, lasts = self._numbers(self._headers).transpose(2, 0, 1)
-        rows = zip(
-            self._headers,
-            firsts.min(axis=1, initial=MAX_NS, where=counts > 0).tolist(),
-            lasts.max(axis=1, initial=MIN_NS, where=counts > 0).tolist(),
-            counts.sum(axis=1).tolist(),
-            strict=True,
-        )
-        for (topic, type_name, *_), first, last, messages in rows:
+        of_headers = _added(self._by_folder, [0], axis=1)[:, 0].tolist()
+        for (topic, type_name, *_), (messages, first, last) in zip(
+            self._headers, of_headers, strict=True
+        ):
             add_totals(totals.setdefault(topic, {}), type_name, (first, last, messages))
         return totals
 
@@ -300,32 +299,31 @@ class Segment:
 
     def recordings(self, topic: str) -> dict[Path, TopicTotals]:
         """Returns what the bags of each recording that holds the topic have of it, of any type."""
-        if topic not in self._known_recordings:
-            self._known_recordings[topic] = self._totals_by_recording(topic)
-        return self._known_recordings[topic]
-
-    def _totals_by_recording(self, topic: str) -> dict[Path, TopicTotals]:
-        column = self.column(topic)
-        if column is None:
+        headers = [nth for nth, header in enumerate(self._headers) if header.topic == topic]
+        if not headers:
             return {}
-        _, folder_numbers = self.numbered_folders
-        numbers, paths = folder_numbers[column.bags], self._recording_paths
-        spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
-        counts = np.zeros(len(paths), np.int64)
-        np.add.at(counts, numbers, column.messages)
-        totals = [
-            TopicTotals(first, last, messages)
-            for (first, last), messages in zip(spans, counts.tolist(), strict=True)
-        ]
-        return {paths[number]: totals[number] for number in dict.fromkeys(numbers.tolist())}
+        [of_topic] = _added(self._by_folder[headers], [0], axis=0).tolist()
+        return {
+            path: TopicTotals(first, last, messages)
+            for path, (messages, first, last) in zip(self._recording_paths, of_topic, strict=True)
+            if messages
+        }
+
+    @cached_property
+    def _by_folder(self) -> NDArray[np.int64]:
+        """Count, first and last by topic of one type, and folder."""
+        folders, numbers = self.numbered_folders
+        numbers = numbers[self._order]
+        order = np.argsort(numbers, kind="stable")
+        begins = np.searchsorted(numbers[order], np.arange(len(folders)))
+        return _added(self._numbers(self._headers)[:, order], begins, axis=1)
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
         """The recordings of the bags, in the order in which their folders are numbered."""
         # A path for each bag of a week would take longer than all else.
-        _, folder_numbers = self.numbered_folders
-        _, rows = np.unique(folder_numbers, return_index=True)
-        return [self.bags[row].recording for row in rows.tolist()]
+        folders, _ = self.numbered_folders
+        return [Path(folder or "/") for folder in folders]
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic in a window, in order, once for each type."""
@@ -342,37 +340,32 @@ class Segment:
         headers = [header for header in self._headers if header.topic == topic]
         if not headers:
             return None
-        numbers = self._numbers(headers)
+        numbers = self._numbers(headers)[:, np.argsort(self._order)]
         bags, types = np.nonzero(numbers[:, :, 0].T)
         counts, firsts, lasts = numbers[types, bags].T
         return TopicColumn(bags, firsts, lasts, counts)
 
     def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
-        """Returns count (0 where it has none), first and last by topic of one type, and bag."""
-        numbers = np.zeros((len(headers), len(self.bags), 3), np.int64)
+        """Returns count, first and last by topic of one type, and bag; `_NONE` without messages.
+
+        The bags are in the order of `_joined`.
+        """
+        numbers = np.empty((len(headers), len(self.bags), 3), np.int64)
+        end = 0
         for schema, bags, joined in self._joined:
+            begin, end = end, end + bags.size
             at = {header: position for position, header in enumerate(schema.topics)}
             rows = [row for row, header in enumerate(headers) if header in at]
-            if rows:
-                positions = [at[headers[row]] for row in rows]
-                found = numbers_of(schema, joined, bags.size, positions)
-                if found.shape == numbers.shape:
-                    return found
-                numbers[np.array(rows)[:, None], bags] = found
+            if len(rows) < len(headers):
+                numbers[:, begin:end] = _NONE
+            positions = [at[headers[row]] for row in rows]
+            numbers[rows, begin:end] = numbers_of(schema, joined, bags.size, positions)
         return numbers
 
-    def _numbers_by_topic(self) -> NDArray[np.int64]:
-        """Returns count, first and last by topic (sorted) and bag; its types count together."""
-        headers = sorted(self._headers, key=attrgetter("topic"))
-        numbers = self._numbers(headers)
-        topics = [header.topic for header in headers]
-        starts = np.flatnonzero([True, *map(ne, topics, topics[1:])])
-        if len(starts) == len(headers):
-            return numbers
-        numbers[numbers[:, :, 0] == 0] = (0, MAX_NS, MIN_NS)
-        joined = (np.add, np.minimum, np.maximum)
-        parts = [add.reduceat(numbers[:, :, nth], starts, axis=0) for nth, add in enumerate(joined)]
-        return np.stack(parts, axis=2)
+    @cached_property
+    def _order(self) -> NDArray[np.uint16]:
+        """The positions of the bags in the order of `_joined`."""
+        return np.concatenate([bags for _, bags, _ in self._joined])
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -391,15 +384,35 @@ class Segment:
         )
 
     @cached_property
-    def activities(self) -> dict[str, Activity]:
-        """By topic, when the bags hold it and how often."""
-        topics = sorted(self.types)
-        numbers = self._numbers_by_topic()
-        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)
-        # Between absences a bag is as many: what follows each comes behind all bags.
+    def pacings(self) -> dict[str, Pacing]:
+        """By topic, how often the bags hold it."""
+        numbers, lengths = self._between_absences()
+        counts = numbers[:, :, 0]
+        spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
+        rows = zip(spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
+        return {topic: Pacing(*row) for topic, row in zip(sorted(self.types), rows, strict=True)}
+
+    @cached_property
+    def runs(self) -> dict[str, tuple[Span, ...]]:
+        """By topic, when the bags hold it; see `analysis.silences`."""
+        numbers, _ = self._between_absences()
+        return dict(zip(sorted(self.types), _runs(numbers), strict=True))
+
+    def _between_absences(self) -> tuple[NDArray[np.int64], _Times]:
+        """Returns count, first and last by topic (sorted) and bag, and the length of the bags.
+
+        In all (ns), of the bags that hold each topic. Between absences a bag is as many: what
+        follows each comes behind all bags. A count is 0 where a bag holds none.
+        """
+        headers, topics = sorted(self._headers, key=attrgetter("topic")), sorted(self.types)
+        numbers = self._numbers(headers)
+        if len(headers) > len(topics):
+            names = [header.topic for header in headers]
+            numbers = _added(numbers, [*map(names.index, topics)], axis=0)
+        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)[self._order]
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
-        has_absences = bool(self._bags_with("absences"))
-        for row, bag in enumerate(self.bags if has_absences else ()):
+        order = self._order.tolist() if self._bags_with("absences") else ()
+        for row, bag in enumerate(map(self.bags.__getitem__, order)):
             for topic, pauses in bag.summary.schema.absences:
                 nth = topics.index(topic)
                 count, _, last = numbers[nth, row].tolist()
@@ -408,11 +421,13 @@ class Segment:
                     count, last = sent, start
                     lengths[nth] -= end - start
                 numbers[nth, row, [0, 2]] = count, last
-        more = np.zeros((len(topics), len(parts), 3), np.int64)
-        for at, (nth, part) in enumerate(parts):
-            more[nth, at] = part
-        activities = _activities(np.concatenate((numbers, more), axis=1), lengths)
-        return dict(zip(topics, activities, strict=True))
+        if parts:
+            more = np.empty((len(topics), len(parts), 3), np.int64)
+            more[:] = _NONE
+            for at, (nth, part) in enumerate(parts):
+                more[nth, at] = part
+            numbers = np.concatenate((numbers, more), axis=1)
+        return numbers, lengths
 
     @cached_property
     def together(self) -> frozenset[frozenset[str]]:
@@ -422,7 +437,14 @@ class Segment:
     @cached_property
     def pauses(self) -> tuple[Pause, ...]:
         """The pauses between the bags."""
-        return tuple(pauses_between(self.bags))
+        ends = self.ends
+        later = np.flatnonzero(
+            self.starts[1:] - np.maximum.accumulate(ends)[:-1] > SHORTEST_PAUSE_NS
+        )
+        return tuple(
+            pause_between(self.bags[int(ends[: nth + 1].argmax())], self.bags[nth + 1])
+            for nth in later.tolist()
+        )
 
     @cached_property
     def pauses_within(self) -> tuple[Pause, ...]:
@@ -458,17 +480,14 @@ def add_totals(totals: dict[str, TopicTotals], type_name: str, more: tuple[Ns, N
     totals[type_name] = added if before is None else before | added
 
 
-def _spans_of(
-    folders: int,
-    numbers: NDArray[np.uint16],
-    firsts: _Times,
-    lasts: _Times,
-) -> list[Span]:
-    """Returns the span of each folder; of each row there are its folder's number, and its span."""
-    starts, ends = np.full(folders, MAX_NS), np.full(folders, MIN_NS)
-    np.minimum.at(starts, numbers, firsts)
-    np.maximum.at(ends, numbers, lasts)
-    return [*zip(starts.tolist(), ends.tolist(), strict=True)]
+def _added(
+    numbers: NDArray[np.int64], begins: Sequence[int] | NDArray[np.intp], axis: int
+) -> NDArray[np.int64]:
+    """Returns count, first and last of some rows together, each from one of `begins` on."""
+    added = (np.add, np.minimum, np.maximum)
+    return np.stack(
+        [add.reduceat(numbers[:, :, nth], begins, axis) for nth, add in enumerate(added)], axis=2
+    )
 
 
 def folder_of(bag: BagFile) -> str:
@@ -476,26 +495,11 @@ def folder_of(bag: BagFile) -> str:
     return bag.file[: bag.file.rfind("/")]
 
 
-def _activities(numbers: NDArray[np.int64], lengths: _Times) -> Iterator[Activity]:
-    """Yields when bags hold each of some topics, and how often.
-
-    Args:
-        numbers: count, first and last log time by topic and bag; a count of 0 where it has none.
-        lengths: of the bags that hold each topic, in all (ns).
-    """
-    counts = numbers[:, :, 0]
-    spacings = _spacings(counts, numbers[:, :, 2] - numbers[:, :, 1])
-    rows = zip(_runs(numbers), spacings, counts.sum(axis=1).tolist(), lengths.tolist(), strict=True)
-    yield from (Activity(*row) for row in rows)
-
-
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
-    """Yields the runs of each topic; see `Activity`."""
-    is_there = numbers[:, :, 0] > 0
-    firsts = np.where(is_there, numbers[:, :, 1], MAX_NS)
+    """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
+    _, firsts, lasts = numbers.transpose(2, 0, 1)
     order = np.argsort(firsts, axis=1, kind="stable")
     begins = np.take_along_axis(firsts, order, axis=1)
-    lasts = np.where(is_there, numbers[:, :, 2], MIN_NS)
     reach = np.maximum.accumulate(np.take_along_axis(lasts, order, axis=1), axis=1)
     is_break = (begins[:, 1:] - SHORTEST_NS > reach[:, :-1]) & (begins[:, 1:] < MAX_NS)
     for nth, breaks in enumerate(is_break):

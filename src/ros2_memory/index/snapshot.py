@@ -9,21 +9,22 @@ from typing import TYPE_CHECKING, Final
 
 from ros2_memory.analysis.silences import (
     LONGEST_OFF_NS,
-    Activity,
+    SHORTEST_NS,
+    Pacing,
     Silence,
     joined,
     length_in,
     shortest_silence,
     silences,
-    usual_period,
+    usual_periods,
 )
 from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
-from ros2_memory.core.spans import united, without
+from ros2_memory.core.spans import Spans, united, without
 from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates, dated_segments
-from ros2_memory.index.holes import Pause, Rhythm, pauses_between
+from ros2_memory.index.holes import Pause, Rhythm, pause_between
 from ros2_memory.index.split_order import (
     Neighbours,
     is_recording,
@@ -115,17 +116,33 @@ class Snapshot:
     @cached_property
     def _dated_segments(self) -> Sequence[Segment]:
         """The bags that a correct clock dated, without that of carried messages, in order."""
-        return dated_segments(self.timeline.recorded_segments, self.dating.misdated)
+        return dated_segments(self.timeline.recorded_segments, self.dating.faults)
+
+    @property
+    def _whole_segments(self) -> Iterator[Segment]:
+        """Those bags that have every message that was recorded."""
+        return filter(None, (segment.unthinned for segment in self._dated_segments))
 
     @cached_property
-    def _activities(self) -> dict[str, Activity]:
-        """When bags hold each topic; not of logs, whose lines come when something happens."""
-        by_topic: dict[str, list[Activity]] = {}
-        for part in filter(None, (segment.unthinned for segment in self._dated_segments)):
-            for topic, activity in part.activities.items():
-                by_topic.setdefault(topic, []).append(activity)
+    def _periods(self) -> dict[str, Ns]:
+        """The usual period of each topic; not of logs, whose lines come when something happens."""
+        by_topic: dict[str, list[Pacing]] = {}
+        for segment in self._whole_segments:
+            for topic, pacing in segment.pacings.items():
+                by_topic.setdefault(topic, []).append(pacing)
         is_log = self.timeline.is_log
-        return {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
+        return usual_periods(
+            {topic: joined(parts) for topic, parts in by_topic.items() if not is_log(topic)}
+        )
+
+    @cached_property
+    def _runs(self) -> dict[str, Spans]:
+        """By topic, when bags hold it; see `silences`."""
+        by_topic: dict[str, list[tuple[Ns, Ns]]] = {}
+        for segment in self._whole_segments:
+            for topic, runs in segment.runs.items():
+                by_topic.setdefault(topic, []).extend(runs)
+        return {topic: united(runs, SHORTEST_NS) for topic, runs in by_topic.items()}
 
     @cached_property
     def silences(self) -> tuple[Silence, ...]:
@@ -133,17 +150,15 @@ class Snapshot:
         together = frozenset(
             chain.from_iterable(segment.together for segment in self._dated_segments)
         )
-        return tuple(silences(self._activities, together, self.gaps))
+        return tuple(silences(self._periods, self._runs, together, self.gaps))
 
     def shortest_silence(self, topic: str) -> Ns:
         """Returns how long a topic must have no message to count as silent."""
-        activity = self._activities.get(topic)
-        return shortest_silence((activity and usual_period(activity)) or 0)
+        return shortest_silence(self._periods.get(topic, 0))
 
     def longest_silence(self, topic: str) -> Ns:
         """Returns for how long others were recorded, at most, between two messages of a topic."""
-        activity = self._activities.get(topic)
-        pauses = () if activity is None else pairwise(activity.runs)
+        pauses = () if self.timeline.is_log(topic) else pairwise(self._runs.get(topic, ()))
         return max(
             (stop - start - length_in(self.gaps, start, stop) for (_, start), (stop, _) in pauses),
             default=0,
@@ -179,12 +194,12 @@ class Snapshot:
         dated do not count. A step forward of the clock looks alike: see `View.gaps`.
         """
         # Each bag of several that hold the same has it.
-        return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self._pauses)})
+        return sorted({(pause.start, pause.end) for pause in self._rhythm.gaps(self.pauses)})
 
     @cached_property
     def breaks(self) -> Sequence[tuple[Ns, Ns]]:
         """Those gaps after which another run of a recorder began."""
-        pauses = [*self._rhythm.gaps(self._pauses)]
+        pauses = [*self._rhythm.gaps(self.pauses)]
         within_runs = {(pause.start, pause.end) for pause in pauses if pause.ran_on}
         return [gap for gap in self.gaps if gap not in within_runs]
 
@@ -196,22 +211,23 @@ class Snapshot:
     @cached_property
     def suspects(self) -> Sequence[Pause]:
         """Where the clock may have been set forward, as a recorder ran on, in order of time."""
-        return self._rhythm.suspects(self._pauses)
+        return self._rhythm.suspects(self.pauses)
 
     @cached_property
     def _rhythm(self) -> Rhythm:
-        return Rhythm(self._activities)
+        return Rhythm(self._periods)
 
     @cached_property
-    def _pauses(self) -> Sequence[Pause]:
+    def pauses(self) -> Sequence[Pause]:
         """Where no dated bag has a message for a while, in order of time."""
         pauses: list[Pause] = []
         newest: BagFile | None = None
         for segment in self._dated_segments:
             if newest is not None:
                 # Bags of other parts may last into this one.
-                pauses += pauses_between([newest, segment.bags[0]])
                 reach = newest.end
+                if segment.bags[0].start - reach > SHORTEST_PAUSE_NS:
+                    pauses.append(pause_between(newest, segment.bags[0]))
                 pauses += (
                     pause._replace(start=max(pause.start, reach))
                     for pause in segment.pauses
@@ -221,7 +237,7 @@ class Snapshot:
                 pauses += segment.pauses
             for pause in segment.pauses_within:
                 pauses += self._shared_parts(pause)
-            last = max(segment.bags, key=lambda bag: bag.end)
+            last = segment.bags[int(segment.ends.argmax())]
             newest = last if newest is None or last.end > newest.end else newest
         return sorted(pauses, key=lambda pause: (pause.start, pause.end))
 

@@ -140,9 +140,15 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
     edges = np.searchsorted(positions[order], np.arange(len(all_series) + 1))
     late_edges = np.searchsorted(late, edges).tolist()
 
+    # Ranks stand for numbers of which one is beyond 64 bits.
+    highest = int(numbers.argmax())
+    name = split_of(bags[highest].file)
+    are_ranks = name is not None and name.number != numbers[highest]
+
     def split(series: Series, at: int) -> Split:
-        bag = bags[order[at]]
-        return Split(int(stem_of(bag.file).removeprefix(series)), bag)
+        row = order[at]
+        bag, number = bags[row], int(numbers[row])
+        return Split(int(stem_of(bag.file).removeprefix(series)) if are_ranks else number, bag)
 
     ranges: dict[Series, SplitRange] = {}
     for series, (begin, end), among in zip(

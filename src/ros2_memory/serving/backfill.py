@@ -171,7 +171,9 @@ class Backfill:
     def _follow(self, filling: Filling, timeline: Timeline) -> bool:
         columns = self.memory.scanner
         coverage = columns.coverage(timeline)
-        waiting = [] if coverage is None else [bag.start for bag in coverage.missing]
+        missing = () if coverage is None else coverage.missing
+        # Others than closed ones are never stored.
+        waiting = [bag.start for bag in missing if bag.state is BagState.CLOSED]
         make_fragments(self.memory, filling.whole_since(), waiting)
         filling.thin()
         filling.trim()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from itertools import count
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 from hypothesis import given
@@ -8,36 +9,66 @@ from hypothesis import strategies as st
 
 from ros2_memory.analysis.silences import (
     LONGEST_OFF_NS,
-    Activity,
+    SHORTEST_NS,
+    Pacing,
     Silence,
     Spacing,
     joined,
     silences,
+    usual_periods,
 )
+from ros2_memory.core.spans import united
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Mapping, Sequence
 
 S = 10**9
 MINUTE, HOUR = 60 * S, 3600 * S
 ODOM, SEEN = "/odom", "/seen"
 
 
+class Activity(NamedTuple):
+    """When bags hold a topic, and how often."""
+
+    runs: Sequence[tuple[int, int]]
+    pacing: Pacing
+
+
 def heard(*runs: tuple[int, int], hz: int = 1) -> Activity:
     """A topic that is recorded at a rate during runs."""
     length = sum(last - first for first, last in runs)
     count = length * hz // S
-    return Activity(runs, {0: Spacing(len(runs), length, max(count, 1))}, count, length)
+    spacings = {0: Spacing(len(runs), length, max(count, 1))}
+    return Activity(runs, Pacing(spacings, count, length))
 
 
 def found(together: tuple[str, ...] = (ODOM, SEEN), **runs: Activity) -> list[Silence]:
-    return silences({f"/{name}": each for name, each in runs.items()}, [together])
+    return silences_of({f"/{name}": each for name, each in runs.items()}, [together])
+
+
+def silences_of(
+    activities: Mapping[str, Activity],
+    together: Iterable[Iterable[str]],
+    gaps: Sequence[tuple[int, int]] = (),
+) -> list[Silence]:
+    periods = usual_periods({topic: activity.pacing for topic, activity in activities.items()})
+    runs = {topic: activity.runs for topic, activity in activities.items()}
+    return silences(periods, runs, together, gaps)
+
+
+def all_of(parts: Sequence[Activity]) -> Activity:
+    runs = united((run for part in parts for run in part.runs), SHORTEST_NS)
+    return Activity(runs, joined([part.pacing for part in parts]))
 
 
 DAY = (0, 9 * HOUR)
 GAPPED = (0, 2 * HOUR), (5 * HOUR, 9 * HOUR)
 DRIVES = tuple((at * HOUR, at * HOUR + 20 * MINUTE) for at in range(9))
 SLOW = Activity(
-    ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)), {0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR
+    ((0, HOUR), (HOUR + 3 * MINUTE, 9 * HOUR)),
+    Pacing({0: Spacing(9, 9 * HOUR, 3240)}, 3240, 9 * HOUR),
 )
-BURST = Activity(((0, HOUR), (5 * HOUR, 9 * HOUR)), {0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR)
+BURST = Activity(((0, HOUR), (5 * HOUR, 9 * HOUR)), Pacing({0: Spacing(3, 6 * S, 6)}, 30, 5 * HOUR))
 
 
 @pytest.mark.parametrize(
@@ -85,13 +116,13 @@ def test_a_short_outage_of_the_recorder_is_no_part_of_a_silence() -> None:
         ODOM: heard((0, 99 * S), (128 * S, 200 * S)),
         SEEN: heard((0, 98 * S), (129 * S, 200 * S)),
     }
-    [silence] = silences(activities, [activities])
+    [silence] = silences_of(activities, [activities])
     assert silence.length == 31 * S
     gap = (99 * S, 128 * S)
-    assert silences(activities, [activities], [gap]) == []
+    assert silences_of(activities, [activities], [gap]) == []
     # What is silent before and after it is so in all.
     activities[SEEN] = heard((0, 80 * S), (150 * S, 200 * S))
-    [silence] = silences(activities, [activities], [(0, S), gap, (180 * S, 190 * S)])
+    [silence] = silences_of(activities, [activities], [(0, S), gap, (180 * S, 190 * S)])
     assert (silence.start, silence.end, silence.length) == (80 * S, 150 * S, 41 * S)
 
 
@@ -112,13 +143,13 @@ def test_the_topics_of_another_robot_do_not_make_this_one_silent() -> None:
         "/b/odom": heard((0, 9 * HOUR)),
         "/b/seen": heard((0, 9 * HOUR)),
     }
-    assert silences(activities, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
+    assert silences_of(activities, [("/a/odom", "/a/seen"), ("/b/odom", "/b/seen")]) == []
 
 
 def test_one_of_many_topics_does_not_show_that_the_robot_is_on() -> None:
     many = {f"/{name}": heard((0, HOUR), (5 * HOUR, 9 * HOUR)) for name in "abcde"}
     activities = {**many, "/battery": heard((0, 9 * HOUR))}
-    assert silences(activities, [activities]) == []
+    assert silences_of(activities, [activities]) == []
 
 
 def test_a_topic_that_pauses_each_night_is_reported_each_night() -> None:
@@ -134,8 +165,8 @@ RUNS = st.lists(st.tuples(st.integers(0, 400), st.integers(1, 60)), min_size=1, 
 def test_a_silence_lies_between_messages_while_others_are_heard(
     drawn: list[tuple[int, int]], others: list[tuple[int, int]]
 ) -> None:
-    seen = joined([heard((a * S, (a + n) * S)) for a, n in drawn])
-    odom = joined([heard((a * S, (a + n) * S)) for a, n in others])
+    seen = all_of([heard((a * S, (a + n) * S)) for a, n in drawn])
+    odom = all_of([heard((a * S, (a + n) * S)) for a, n in others])
     for each in found(odom=odom, seen=seen):
         own, other = (seen, odom) if each.topic == SEEN else (odom, seen)
         assert all(last <= each.start or first >= each.end for first, last in own.runs)

@@ -73,6 +73,17 @@ def test_a_topic_of_two_types_is_heard_under_either() -> None:
     assert Snapshot(Timeline.of(bags)).silences == ()
 
 
+def test_what_is_absent_within_a_bag_leaves_the_other_topics_of_it_alone() -> None:
+    topics = [
+        TopicSummary(topic, "std_msgs/msg/Bool", "cdr", 500, BEGIN, BEGIN + 800 * S)
+        for topic in ("/odom", "/seen")
+    ]
+    absences = (("/seen", ((BEGIN + 100 * S, BEGIN + 400 * S, 100),)),)
+    bag = split(0, topics)._replace(summary=BagSummary(topics, absences=absences))
+    snapshot = Snapshot(Timeline.of([bag]))
+    assert [snapshot.longest_silence(topic.topic) for topic in topics] == [0, 300 * S]
+
+
 def test_bags_that_a_wrong_clock_dated_show_no_silence() -> None:
     bags = [*day(600, range(0))]
     unset = TopicSummary("/odom", "std_msgs/msg/Bool", "cdr", 3000, 0, 60 * S)

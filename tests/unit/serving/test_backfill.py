@@ -32,7 +32,7 @@ from ros2_memory.history.context import Call, Memory
 from ros2_memory.serving.backfill import BACKLOG, Backfill, keep_backfilled
 from ros2_memory.serving.health import Health
 from ros2_memory.storage.mcap_reader import McapReader
-from tests.support.bags import McapLayout, odom, write_mcap
+from tests.support.bags import McapLayout, odom, text, write_mcap
 from tests.support.clocks import SettableClock
 from tests.support.housekeepers import recorded_before
 from tests.support.memories import memory_of
@@ -113,6 +113,30 @@ def test_what_followed_under_other_settings_is_made_again_a_few_slices_a_round(
     known = storing(tmp_path, reading="before")[0].scanner
     assert known is not None
     assert known.fragments_of_others() == []
+
+
+def test_bags_that_a_crash_left_open_keep_nothing_from_being_joined(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in ("columns.scan", "serving.backfill"):
+        monkeypatch.setattr(f"ros2_memory.{module}.STRETCH_NS", 4 * 3600 * NS_PER_S)
+    joined = []
+    for name in ("whole", "crashed"):
+        bag_dir = tmp_path / name
+        bag(bag_dir, 0)
+        bag(bag_dir, 2000)  # behind the stretch of the first
+        if name == "crashed":
+            messages = [text(T0 + n * NS_PER_S, str(n)) for n in range(20, 60)]
+            layout = McapLayout(finish=False, chunk_size=300)
+            write_mcap(bag_dir / "other" / "other_0.mcap", messages, layout)
+        clock = SettableClock(T0 + 86_400 * NS_PER_S)
+        memory, backfill = storing(bag_dir, clock)
+        fill_store(backfill)
+        assert len(memory.index.snapshot().bags) == (3 if name == "crashed" else 2)
+        with closing(sqlite3.connect(bag_dir / OWN_FOLDER / FILE)) as base:
+            query = "SELECT kind, start_ns FROM fragment WHERE kind LIKE 'path-joined%'"
+            joined.append(base.execute(query).fetchall())
+    assert joined[0] == joined[1] != []
 
 
 def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path: Path) -> None:
