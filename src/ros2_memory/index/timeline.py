@@ -132,6 +132,21 @@ class Timeline:
         """Log time of the first message in each of all bags."""
         return np.concatenate([np.empty(0, np.int64), *(part.starts for part in self.segments)])
 
+    @property
+    def ends(self) -> NDArray[np.int64]:
+        """Log time of the last message in each of all bags."""
+        return np.concatenate([np.empty(0, np.int64), *(part.ends for part in self.segments)])
+
+    @property
+    def folders(self) -> tuple[list[str], NDArray[np.int64]]:
+        """The folders of all bags, and for each bag the position of its folder among them."""
+        number_of: dict[str, int] = {}
+        numbers = [np.empty(0, np.int64)]
+        for names, of_segment in (segment.numbered_folders for segment in self.segments):
+            numbered = [number_of.setdefault(name, len(number_of)) for name in names]
+            numbers.append(np.array(numbered)[of_segment])
+        return [*number_of], np.concatenate(numbers)
+
     @cached_property
     def recorded_segments(self) -> tuple[Segment, ...]:
         """The bags that show when there was a recording, in order, some at a time.
@@ -231,14 +246,7 @@ class Timeline:
         """The half-open spans in which bags of different recordings may hold copies, in order."""
         if not self.segments:
             return []
-        number_of: dict[str, int] = {}
-        folders = np.concatenate(
-            [
-                np.array([number_of.setdefault(name, len(number_of)) for name in names])[numbers]
-                for names, numbers in (segment.numbered_folders for segment in self.segments)
-            ]
-        )
-        starts, ends = self.starts, np.concatenate([segment.ends for segment in self.segments])
+        folders, starts, ends = self.folders[1], self.starts, self.ends
         # Of bags of one recording that follow each other those count that begin while another one
         # goes on, and the one that reaches farthest.
         is_first = np.diff(folders, prepend=-1) != 0

@@ -17,7 +17,7 @@ import numpy as np
 
 from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS
-from ros2_memory.bag_dir.layout import is_carried
+from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import packed, united
@@ -25,7 +25,6 @@ from ros2_memory.core.arrays import in_ranges
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
 from ros2_memory.history.scan import open_scan, remembered, scan
-from ros2_memory.index.segment import folder_of
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
 
 if TYPE_CHECKING:
@@ -142,12 +141,11 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         window: the stretch.
-        bags: that reach into it, or nearly so; `first_bags` are the first ones of each recording.
-        sessions: those that the bags are of, in the order of their names.
+        first_bags: of each recording that reaches into it, or nearly so.
+        sessions: those that the recordings are of, in the order of their names.
     """
 
     window: TimeWindow
-    bags: Sequence[BagFile]
     first_bags: Sequence[BagFile]
     sessions: Sequence[_Lending]
 
@@ -182,8 +180,26 @@ class Watching:
         self._needed = tuple(dict.fromkeys(topics))
         self._scans: list[Scan] = []
         self._may_be_repeated = view.stream.may_be_repeated(self._topics)
-        self._digested: tuple[object, str] = None, ""
-        self._newest = max((segment.latest for segment in timeline.segments), default=MIN_NS)
+        self._bags = self._rows_of_bags()
+        self._folder_of = timeline.folders[1][self._bags]
+        self._firsts, self._lasts = timeline.starts[self._bags], timeline.ends[self._bags]
+        self._latest = np.maximum.accumulate(self._lasts)
+        self._newest = int(timeline.ends.max(initial=MIN_NS))
+
+    def _rows_of_bags(self) -> IntArray:
+        """Returns the positions of bags: not of carried messages that nothing is seen by.
+
+        Those reach over all of the history.
+        """
+        bags, (folders, folder_of) = self._view.timeline.bags, self._view.timeline.folders
+        carried = [nth for nth, folder in enumerate(folders) if folder.endswith(CARRY_FOLDER)]
+        may_be_carried = np.flatnonzero(np.isin(folder_of, carried)).tolist()
+        left_out = [
+            row
+            for row in may_be_carried
+            if is_carried(bags[row].file) and not any(map(bags[row].summary.of, self._needed))
+        ]
+        return np.delete(np.arange(len(folder_of)), np.array(left_out, np.int64))
 
     def newest_first(
         self, until: Ns = MAX_NS, most: float = math.inf
@@ -197,7 +213,7 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         spots = 0
-        for nth, together in enumerate(self._together_in(TimeWindow(MIN_NS, until))):
+        for nth, together in enumerate(self._stretches_in(TimeWindow(MIN_NS, until))):
             whole = self._joined(together) if nth else None
             is_whole = whole is not None and spots + spots_in(whole) < most
             for part in [whole] if is_whole else map(self._seen_in, together):
@@ -214,44 +230,34 @@ class Watching:
         Raises:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
-        for together in self._together_in(window.widened(SIGHTS_NS)):
-            start = together[0].window.start // STRETCH_NS * STRETCH_NS
+        for together in self._stretches_in(window.widened(SIGHTS_NS)):
+            start = together[0].start // STRETCH_NS * STRETCH_NS
             if is_joined and window.covers(start, start + STRETCH_NS - 1):
                 self._joined(together)
-            for around in together:
-                if not is_joined and self._parts_around(around.window) is not None:
-                    self._seen_in(around)
-                yield around.window.start
+            for stretch in together:
+                if not is_joined and self._parts_around(stretch) is not None:
+                    self._seen_in(stretch)
+                yield stretch.start
 
-    def _together_in(self, window: TimeWindow) -> Iterator[list[_Surroundings]]:
-        """Yields the stretches of each `STRETCH_NS` as `_stretches_in`."""
-        stretches = self._stretches_in(window)
-        by_start = groupby(stretches, lambda around: around.window.start // STRETCH_NS)
-        return ([*together] for _, together in by_start)
+    def _stretches_in(self, window: TimeWindow) -> Iterator[list[TimeWindow]]:
+        """Yields the stretches of a window in which there may be messages, the newest first.
 
-    def _stretches_in(self, window: TimeWindow) -> Iterator[_Surroundings]:
-        """Yields the stretches of a window in which there may be messages, the newest first."""
+        Those of each `STRETCH_NS` together.
+        """
         if not self._topics:
             return
-        whole = window.widened(AROUND_NS)
         if self._view.memory.scanner.store is not None:
-            reach = whole.widened(SIGHTS_NS)
+            reach = window.widened(AROUND_NS + SIGHTS_NS)
             self._scans = [
                 open_scan(self._view, topic, reach, copies=topic not in self._topics)
                 for topic in self._needed
             ]
-        bags = self._bags_in(window.aligned(SIGHTS_NS).widened(AROUND_NS))
-        firsts, lasts = _ends_of(bags)
-        latest = np.maximum.accumulate(lasts)
-        asked = [bag for bag in bags if bag.start < whole.stop and bag.end >= whole.start]
-        for number in reversed(_numbers_of(self._view, self._topics, asked)):
-            stretch = _window(number)
-            if not stretch.intersect(window).empty:
-                self._view.bags.check_deadline()
-                near = stretch.widened(AROUND_NS)
-                begin, end = latest.searchsorted(near.start), firsts.searchsorted(near.stop)
-                reaching = [bag for bag in bags[begin:end] if bag.end >= near.start]
-                yield self._around(stretch, reaching)
+        is_asked = (self._firsts < window.stop) & (self._lasts >= window.start)
+        spans = self._firsts[is_asked], self._lasts[is_asked]
+        stretches = map(_window, reversed(_numbers_of(self._view, self._topics, *spans)))
+        asked = (stretch for stretch in stretches if not stretch.intersect(window).empty)
+        for _, together in groupby(asked, lambda stretch: stretch.start // STRETCH_NS):
+            yield [*together]
 
     def _parts_around(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the parts that what is seen in a window follows from; None where not they alone.
@@ -268,18 +274,6 @@ class Watching:
             numbers.update(parts)
         return tuple(sorted(numbers))
 
-    def _bags_in(self, window: TimeWindow) -> list[BagFile]:
-        """Returns the bags in a window.
-
-        Without those of carried messages that nothing is seen by: they reach over all of the
-        history.
-        """
-        return [
-            bag
-            for bag in self._view.timeline.overlapping(window)
-            if not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
-        ]
-
     def by_bag(self, bags: Sequence[BagFile]) -> Iterator[tuple[BagFile, str, Sights]]:
         """Yields the spots of the messages of each of some bags that count, in each stretch.
 
@@ -289,7 +283,8 @@ class Watching:
             QueryTimeoutError: while it is iterated, when the deadline has passed.
         """
         files = {bag.file for bag in bags}
-        for number in _numbers_of(self._view, self._topics, bags):
+        spans = np.array([(bag.start, bag.end) for bag in bags], np.int64).reshape(-1, 2).T
+        for number in _numbers_of(self._view, self._topics, *spans):
             window = _window(number)
             by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
             for rows in self._rows(window):
@@ -306,12 +301,16 @@ class Watching:
             self._session_of[bag.recording] = self._sessions.of(bag.recording)
         return self._session_of[bag.recording]
 
-    def _around(self, window: TimeWindow, bags: Sequence[BagFile]) -> _Surroundings:
-        of_recordings: dict[str, BagFile] = {}
-        for bag in bags:
-            of_recordings.setdefault(folder_of(bag), bag)
+    def _around(self, window: TimeWindow) -> _Surroundings:
+        self._view.bags.check_deadline()
+        near = window.widened(AROUND_NS)
+        begin, end = self._latest.searchsorted(near.start), self._firsts.searchsorted(near.stop)
+        reaching = begin + np.flatnonzero(self._lasts[begin:end] >= near.start)
+        _, firsts = np.unique(self._folder_of[reaching], return_index=True)
+        rows = self._bags[reaching[np.sort(firsts)]].tolist()
+        of_recordings = [self._view.timeline.bags[row] for row in rows]
         first_bags: dict[Session, BagFile] = {}
-        for bag in of_recordings.values():
+        for bag in of_recordings:
             first_bags.setdefault(self._session(bag), bag)
         is_alone = len(first_bags) == 1
         sessions = [
@@ -321,7 +320,7 @@ class Watching:
         ]
         if not is_alone:
             sessions.sort(key=lambda lending: (min(lending.session), lending.slices or ()))
-        return _Surroundings(window, bags, [*of_recordings.values()], sessions)
+        return _Surroundings(window, of_recordings, sessions)
 
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
@@ -343,22 +342,27 @@ class Watching:
             return session
         return self._sessions.lending_to(bag.recording, max(bag.start, window.start))
 
-    def _joined(self, together: Sequence[_Surroundings]) -> list[SeenStretch[Session]] | None:
+    def _joined(self, together: Sequence[TimeWindow]) -> list[SeenStretch[Session]] | None:
         """Returns what was seen in the stretches of a `STRETCH_NS`, as that of one; see `Seen`.
 
         None where it is not over, or does not follow from parts alone.
         """
-        start = together[-1].window.start // STRETCH_NS * STRETCH_NS
-        is_over = start + STRETCH_NS <= self._newest
-        parts = self._parts_around(TimeWindow(start, start + STRETCH_NS)) if is_over else None
+        start = together[-1].start // STRETCH_NS * STRETCH_NS
+        whole = TimeWindow(start, start + STRETCH_NS)
+        parts = self._parts_around(whole) if whole.stop <= self._newest else None
         if parts is None:
             return None
-        in_time = chain.from_iterable(around.sessions for around in reversed(together))
-        sessions = sorted(dict.fromkeys(session for session, *_ in in_time), key=min)
+        around = self._around(whole)
+        surroundings = [around]
+        if not all(self._sessions.has_all_kinds(session) for session, *_ in around.sessions):
+            # Who lends to whom differs from one stretch to the next.
+            surroundings = [*map(self._around, together)]
+        of_all = chain.from_iterable(around.sessions for around in surroundings)
+        sessions = sorted(dict.fromkeys(session for session, *_ in of_all), key=min)
         numbers = {session: number for number, session in enumerate(sessions)}
         follows_from = [
             (around.window.start, self._digest(around), [numbers[s] for s, *_ in around.sessions])
-            for around in together
+            for around in surroundings
         ]
         digest = _hashed(follows_from)
 
@@ -368,7 +372,7 @@ class Watching:
                 topics = [of_topic.topics for of_topic in stretch.sights]
                 return numbers[stretch.session], stretch.frame_id, topics
 
-            seen = [part for around in reversed(together) for part in self._seen_in(around)]
+            seen = [part for stretch in reversed(together) for part in self._seen_in(stretch)]
             by_kind = groupby(sorted(seen, key=kind), kind)
             return Joined([Seen(tuple(_as_one(of[0], [*alike]) for of, alike in by_kind))])
 
@@ -376,14 +380,15 @@ class Watching:
         [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
         return seen.of(sessions)
 
-    def _seen_in(self, around: _Surroundings) -> list[SeenStretch[Session]]:
+    def _seen_in(self, stretch: TimeWindow) -> list[SeenStretch[Session]]:
         """Returns what each session saw in a stretch; from the cache where it is there."""
+        around = self._around(stretch)
         return self._seen(around).of([lending.session for lending in around.sessions])
 
     def _seen(self, around: _Surroundings) -> Seen:
         scanner = self._view.memory.scanner
-        is_open = any(bag.state is BagState.ACTIVE for bag in around.bags)
-        if is_open:
+        bags = self._view.timeline.overlapping(around.window.widened(AROUND_NS))
+        if any(bag.state is BagState.ACTIVE for bag in bags):
             return self._read(around)
         digest = self._digest(around)
         parts = self._parts_around(around.window)
@@ -399,14 +404,14 @@ class Watching:
         if self._may_be_repeated:
             return self._read(around)
         # Parts, as these, are of certain recordings.
-        key = (around.window.start, digest, tuple(bag.identity for bag in around.bags))
+        key = (around.window.start, digest, tuple(bag.identity for bag in bags))
         cached = scanner.caches.sights.get(key)
         if cached is not None:
             return cast("Seen", cached)
         before = self._view.notes.added
         seen = self._read(around)
         if self._view.notes.added == before:
-            size = seen.memory_bytes + 100 * len(around.bags)
+            size = seen.memory_bytes + 100 * len(bags)
             scanner.caches.sights.put(key, seen, size)
         return seen
 
@@ -430,21 +435,13 @@ class Watching:
             )
             for session, lender, slices in around.sessions
         ]
-        before, digest = self._digested
-        # Mostly they are those of the stretch before, object by object.
-        if before != (statics, sessions):
-            limits = self._view.limits
-            transforms = [
-                [
-                    (static.parent, static.child, static.transform, time)
-                    for static, time in of_session
-                ]
-                for of_session in statics
-            ]
-            settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
-            digest = _hashed((VERSION, settings, transforms, sessions))
-            self._digested = (statics, sessions), digest
-        return digest
+        limits = self._view.limits
+        transforms = [
+            [(static.parent, static.child, static.transform, time) for static, time in of_session]
+            for of_session in statics
+        ]
+        settings = (limits.map_frame, self._view.pose_topic, limits.tf_topics, limits.tf_clock)
+        return _hashed((VERSION, settings, transforms, sessions))
 
     def _read(self, around: _Surroundings) -> Seen:
         """Returns what was seen, by the messages."""
@@ -509,21 +506,18 @@ def _window(number: int) -> TimeWindow:
     return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
 
 
-def _ends_of(bags: Sequence[BagFile]) -> tuple[IntArray, IntArray]:
-    """Returns the log times of the first and the last message of bags."""
-    starts, ends = [bag.start for bag in bags], [bag.end for bag in bags]
-    return np.array(starts, np.int64), np.array(ends, np.int64)
+def _numbers_of(view: View, topics: Sequence[str], starts: IntArray, ends: IntArray) -> list[int]:
+    """Returns the numbers of the stretches in which bags may have messages of some topics.
 
-
-def _numbers_of(view: View, topics: Sequence[str], bags: Sequence[BagFile]) -> list[int]:
-    """Returns the numbers of the stretches in which bags may have messages of some topics."""
-    first, last = (times // SIGHTS_NS for times in _ends_of(bags))
+    Of each bag the log times of its first and last message are given.
+    """
+    first, last = starts // SIGHTS_NS, ends // SIGHTS_NS
     sizes = last - first + 1
     is_odd = sizes > _MANY
     numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
-    for nth in np.flatnonzero(is_odd).tolist():
+    for start, end in zip(starts[is_odd].tolist(), ends[is_odd].tolist(), strict=True):
         # Its times are odd: centuries may lie between two messages.
-        window = TimeWindow(bags[nth].start, bags[nth].end).widened(1)
+        window = TimeWindow(start, end).widened(1)
         for topic in topics:
             numbers += [rows.times // SIGHTS_NS for rows in scan(view, topic, window)]
     distinct: list[int] = np.unique(np.concatenate(numbers)).tolist()
