@@ -6,6 +6,7 @@ The same as `SchemaExtractor.pose` and `twist` give for each message, rounded al
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -68,10 +69,15 @@ class PoseColumns:
             return None
         if not columns.axes:
             raise NoPoseError
+        read = partial(_read, _RoundedRows(table, index), columns, times)
         try:
-            return _read(_RoundedRows(table, index), columns, times)
+            return read() if index is not None else table.remember("poses", read, _bytes_of)
         except UnknownShapeError:
             return None
+
+
+def _bytes_of(poses: Poses) -> int:
+    return 1000 + 76 * len(poses)
 
 
 class NoPoseError(Exception):
