@@ -76,6 +76,8 @@ _MOST_MULTIPLES: Final = {4: float(1 << 24), 8: float(1 << 46)}
 _DECIMALS: Final = (1, 10, 100, 1_000, 10_000, 100_000)
 """Steps, as `Step.per_unit`, that values of a relative exactness often have anyway."""
 _SAMPLE: Final = 16
+_LOOKED_AT: Final = 512
+"""Numbers of a column, about, by which it is arranged."""
 
 
 class _Bits(NamedTuple):
@@ -309,7 +311,7 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 
 
 def _arranged(column: _Whole) -> Packed:
-    """Returns a column arranged so that its numbers have the fewer bits on average."""
+    """Returns a column arranged so that its numbers have the fewer bits, by some of them."""
     flat = column.numbers - _wrapped(column.least)
     name, head, left = "flat", b"", flat
     if column.greatest - column.least >= _FAR_APART:
@@ -317,7 +319,8 @@ def _arranged(column: _Whole) -> Packed:
     else:
         slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
         delta = np.diff(flat) - slope
-        if _bits_of(delta) < _bits_of(flat - flat.mean()):
+        step = max(1, len(flat) // _LOOKED_AT)
+        if _bits_of(delta[::step]) < _bits_of(flat[::step] - flat.mean()):
             name, head, left = "delta", struct.pack("<q", slope[0]), (delta << 1) ^ (delta >> 63)
     greatest = int(left.view(np.uint64).max(initial=0))
     width = 8 if name == "plain" else (greatest.bit_length() + 7) // 8
@@ -385,7 +388,9 @@ def from_planes(data: bytes, start: int, count: int, width: int) -> Numbers:
 
 
 def _pack_texts(column: Texts) -> Packed | _Whole:
-    column = _in_use(column)
+    if not np.bincount(column.codes, minlength=len(column.words)).all():
+        # Words of deleted rows must not stay in the file.
+        column = column.rows(np.arange(len(column)))
     codes, words = column.codes, column.words
     zone = Zone(words=folded(words))
     if not words:
@@ -396,15 +401,6 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
     if len(words) == 1:
         return Packed("text constant", len(codes), 0.0, zone, head)
     return _Whole("text", 0.0, zone, head, codes.astype(np.int64), 0, len(words) - 1)
-
-
-def _in_use(column: Texts) -> Texts:
-    """Returns a column without the words that no row has.
-
-    Words of deleted rows must not stay in the file.
-    """
-    is_used = np.bincount(column.codes, minlength=len(column.words)) > 0
-    return column if is_used.all() else column.rows(np.arange(len(column)))
 
 
 def folded(words: Collection[str]) -> str | None:
@@ -430,19 +426,12 @@ def _is_small(text: str) -> bool:
 
 
 def _unpack_texts(arrangement: str, count: int, data: bytes) -> Texts:
-    words, end = _words(data)
+    several, size = struct.unpack_from("<II", data or bytes(8))
+    begin = 8 + 4 * several
+    text = data[begin : begin + size].decode("utf-8", "surrogatepass")
+    ends = np.cumsum(np.frombuffer(data, "<u4", several, 8 * bool(data)), dtype=np.int64).tolist()
+    words = tuple(text[at:stop] for at, stop in zip([0, *ends], ends, strict=False))
     if arrangement == "constant":
         return Texts(np.broadcast_to(np.uint32(0), count), words)
-    return Texts(_whole_numbers(arrangement, count, 0, data[end:]).astype(np.uint32), words)
-
-
-def _words(data: bytes) -> tuple[tuple[str, ...], int]:
-    """The words, and where they end."""
-    if not data:
-        return (), 0
-    count, size = struct.unpack_from("<II", data)
-    begin = 8 + 4 * count
-    text = data[begin : begin + size].decode("utf-8", "surrogatepass")
-    ends = np.cumsum(np.frombuffer(data, "<u4", count, 8), dtype=np.int64).tolist()
-    words = tuple(text[at:stop] for at, stop in zip([0, *ends], ends, strict=False))
-    return words, begin + size
+    codes = _whole_numbers(arrangement, count, 0, data[begin + size :])
+    return Texts(codes.astype(np.uint32), words)

@@ -71,13 +71,11 @@ class PoseColumns:
             raise NoPoseError
         read = partial(_read, _RoundedRows(table, index), columns, times)
         try:
-            return read() if index is not None else table.remember("poses", read, _bytes_of)
+            if index is not None:
+                return read()
+            return table.remember("poses", read, lambda poses: 1000 + 76 * len(poses))
         except UnknownShapeError:
             return None
-
-
-def _bytes_of(poses: Poses) -> int:
-    return 1000 + 76 * len(poses)
 
 
 class NoPoseError(Exception):

@@ -390,17 +390,14 @@ def _noises(bends: Floats, begins: Ints, stops: Ints) -> Floats:
     By a median, since a stopping robot bends once; 0 where there is no bend.
     """
     counts = stops - begins
-    groups = np.repeat(np.arange(counts.size), counts)
-    before = np.cumsum(counts) - counts
-    rows = np.arange(groups.size) - np.repeat(before - begins, counts)
-    values = bends[rows]
-    values = values[np.lexsort((values, groups))]
-    has_bends = counts > 0
-    middles = values[before[has_bends] + (counts[has_bends] - 1) // 2]
-    deviations = np.zeros(counts.size)
+    middles = np.zeros(counts.size)
+    # Most slots have as many: their rows are sorted at once.
+    for count in np.unique(counts[counts > 0]).tolist():
+        which, middle = np.flatnonzero(counts == count), (count - 1) // 2
+        rows = bends[begins[which][:, None] + np.arange(count)]
+        middles[which] = np.partition(rows, middle, axis=1)[:, middle]
     # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-    deviations[has_bends] = np.sqrt(middles / 6 / 0.6)
-    return deviations
+    return np.sqrt(middles / 6 / 0.6)
 
 
 def standstills_of(parts: Sequence[Blocks]) -> tuple[Standstill, ...]:
