@@ -16,7 +16,6 @@ What whole numbers stand for a value:
     rounded     a float's sign, exponent and first 19 bits of its mantissa (20 with the one that is
                 not stored: a relative 2**-20), of negative ones complemented: ordered as the values
     bits        likewise all bits: exact, but for the sign of a zero and what a NaN carries
-    float32     `bits` of the float32 that equals the float64
 
 How n whole numbers are arranged, once the least is subtracted. `^` is one little-endian number of 8
 bytes; `#` are so many planes of as many bytes as numbers: the lowest byte of every number, then the
@@ -152,11 +151,10 @@ def unpack(codec: str, count: int, least: float | None, data: bytes) -> Column:
         return (_whole_numbers(arrangement, count, first, data) / per_unit).astype(
             dtype, copy=False
         )
-    stored = np.dtype(np.float32) if form == "float32" else dtype
     is_rounded = form == "rounded"
-    lowest = int(_ordered(np.array([least], stored), rounded=is_rounded)[0])
+    lowest = int(_ordered(np.array([least], dtype), rounded=is_rounded)[0])
     whole = _whole_numbers(arrangement, count, lowest, data)
-    return _from_ordered(whole, stored, rounded=is_rounded).astype(dtype, copy=False)
+    return _from_ordered(whole, dtype, rounded=is_rounded).astype(dtype, copy=False)
 
 
 class _Codecs(threading.local):
@@ -196,20 +194,13 @@ def decompressed(data: bytes) -> bytes:
 
 
 class _Whole(NamedTuple):
-    """A column as whole numbers, not all equal, that are yet to be arranged."""
+    """A column as whole numbers, the least of them 0, that are yet to be arranged."""
 
     form: str
     error: float
     zone: Zone
-    head: bytes
     numbers: IntArray
-    least: int
-    greatest: int
-
-    @classmethod
-    def of(cls, form: str, error: float, zone: Zone, numbers: IntArray) -> _Whole:
-        """Returns signed numbers without a head."""
-        return cls(form, error, zone, b"", numbers, int(numbers.min()), int(numbers.max()))
+    head: bytes = b""
 
 
 def _pack_integers(column: Numbers) -> Packed | _Whole:
@@ -218,8 +209,7 @@ def _pack_integers(column: Numbers) -> Packed | _Whole:
     if least == greatest:
         return Packed(f"{name} constant", len(column), 0.0, zone, b"")
     # Unsigned ones of 2**63 and more wrap around, here and back.
-    numbers = column.reshape(-1).astype(np.int64)
-    return _Whole(f"{name} whole", 0.0, zone, b"", numbers, least, greatest)
+    return _Whole(f"{name} whole", 0.0, zone, column.reshape(-1).astype(np.int64) - _wrapped(least))
 
 
 # Floats
@@ -241,13 +231,13 @@ def _pack_floats(column: Numbers, step: Step) -> Packed | _Whole:
         back = (multiples / per_unit).astype(column.dtype, copy=False)
         errors = np.abs(back.astype(np.float64, copy=False) - values)
         if not step.relative or _are_small(errors, values):
-            whole = multiples.astype(np.int64)
-            return _Whole.of(f"{name} /{per_unit}", float(errors.max()), zone, whole)
+            whole = (multiples - multiples.min()).astype(np.int64)
+            return _Whole(f"{name} /{per_unit}", float(errors.max()), zone, whole)
     if step.relative:
         whole = _ordered(column, rounded=True)
         errors = np.abs(_from_ordered(whole, column.dtype, rounded=True) - values)
         if _are_small(errors, values):
-            return _Whole.of(f"{name} rounded", float(errors.max()), zone, whole)
+            return _Whole(f"{name} rounded", float(errors.max()), zone, whole - whole.min())
     return _exactly(column, zone)  # tiny numbers have no bits to spare
 
 
@@ -264,13 +254,8 @@ def _are_small(errors: Floats, values: Floats) -> bool:
 
 
 def _exactly(column: Numbers, zone: Zone) -> _Whole:
-    stored, form = column, "bits"
-    if stored.itemsize == 8:
-        with np.errstate(over="ignore"):
-            short = stored.astype(np.float32)
-        if np.array_equal(short, stored, equal_nan=True):
-            stored, form = short, "float32"
-    return _Whole.of(f"{column.dtype.name} {form}", 0.0, zone, _ordered(stored))
+    whole = _ordered(column)
+    return _Whole(f"{column.dtype.name} bits", 0.0, zone, whole - whole.min())
 
 
 def _zone_of(values: Floats) -> Zone:
@@ -312,9 +297,9 @@ def _from_ordered(whole: IntArray, dtype: np.dtype[np.generic[object]], *, round
 
 def _arranged(column: _Whole) -> Packed:
     """Returns a column arranged so that its numbers have the fewer bits, by some of them."""
-    flat = column.numbers - _wrapped(column.least)
-    name, head, left = "flat", b"", flat
-    if column.greatest - column.least >= _FAR_APART:
+    flat = left = column.numbers
+    name, head = "flat", b""
+    if int(flat.view(np.uint64).max()) >= _FAR_APART:
         name = "plain"
     else:
         slope = np.rint((flat[-1:] - flat[:1]) / (len(flat) - 1)).astype(np.int64)
@@ -400,7 +385,7 @@ def _pack_texts(column: Texts) -> Packed | _Whole:
     head = struct.pack("<II", len(words), len(text)) + lengths.tobytes() + text
     if len(words) == 1:
         return Packed("text constant", len(codes), 0.0, zone, head)
-    return _Whole("text", 0.0, zone, head, codes.astype(np.int64), 0, len(words) - 1)
+    return _Whole("text", 0.0, zone, codes.astype(np.int64), head)
 
 
 def folded(words: Collection[str]) -> str | None:
@@ -412,11 +397,7 @@ def folded(words: Collection[str]) -> str | None:
         whole = "\n".join(dict.fromkeys(word.casefold() for word in words))
         if _is_small(whole):
             return whole
-    names: set[str] = set()
-    for word in words:
-        names.update(letters_of(word.casefold()))
-        if len(names) > MOST_WORDS_BYTES // 2:
-            return None
+    names = {name for word in words for name in letters_of(word.casefold())}
     in_part = "\n".join([IN_PART, *sorted(names)])
     return in_part if _is_small(in_part) else None
 

@@ -298,11 +298,6 @@ class Table:
             bags=None if bags is None else bags[positions],
         )
 
-    def sorted(self) -> Table:
-        """Returns the rows by log time, ties by bag and place."""
-        order = order_of(self.log_times, self.bag_numbers, self.places)
-        return self if order is None else self.rows(order)
-
     def without_columns(self, reason: str) -> Table:
         """Returns the times of the rows alone, and why there is no more."""
         return replace(self, columns={}, elements={}, left_out={"": reason})
@@ -333,7 +328,7 @@ def joined(tables: Sequence[Table]) -> Table:
     if len(tables) == 1:
         return first
     is_hashed = any(table.payload_hashes is not None for table in tables)
-    return Table(
+    whole = Table(
         first.channel,
         np.concatenate([table.log_times for table in tables]),
         np.concatenate([table.publish_times for table in tables]),
@@ -343,7 +338,9 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate([*map(_hashes, tables)]) if is_hashed else None,
         first.definition,
         np.concatenate([table.bag_numbers for table in tables]),
-    ).sorted()
+    )
+    order = order_of(whole.log_times, whole.bag_numbers, whole.places)
+    return whole if order is None else whole.rows(order)
 
 
 def _hashes(table: Table) -> IntArray:
