@@ -72,8 +72,9 @@ class Coverage:
         for covered in self.segments:
             span = covered.segment.spans.get(topic) if covered.missing else None
             if span is not None and window.overlaps(*span):
-                files = {bag.file for bag in covered.missing}
-                for extent in covered.segment.extents(topic, window):
+                missing = (bag for bag in covered.missing if window.overlaps(bag.start, bag.end))
+                files = {bag.file for bag in missing}
+                for extent in covered.segment.extents(topic, window) if files else ():
                     if extent.bag.file in files:
                         yield extent
 

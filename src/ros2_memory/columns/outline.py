@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple, cast
 import numpy as np
 
 from ros2_memory.columns.fragments import FragmentKind
-from ros2_memory.columns.table import IN_PART, SPACES, Numbers, Table, Texts, letters_of
+from ros2_memory.columns.table import IN_PART, Numbers, Table, Texts, letters_of, words_of
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -65,9 +65,7 @@ class Letters(NamedTuple):
         """Returns the letters of texts; None where they are too many."""
         number_of: dict[frozenset[str], int] = {}
         spelling = [
-            number_of.setdefault(
-                frozenset(text.casefold().translate(SPACES).split()), len(number_of)
-            )
+            number_of.setdefault(frozenset(words_of(text.casefold())), len(number_of))
             for text in texts.words
         ]
         words = sorted(frozenset().union(*number_of))

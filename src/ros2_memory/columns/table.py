@@ -44,8 +44,8 @@ IN_PART: Final = "LETTERS"
 """Begins the words of a zone that are no whole texts, but the rows of letters in them.
 
 No casefolded text begins so."""
-SPACES: Final = {code: " " for code in range(128) if not chr(code).isalpha()}
-"""For `str.translate`: what of ASCII is no letter becomes a space."""
+_SPACES: Final = bytes(code if code > 127 or chr(code).isalpha() else 32 for code in range(256))
+"""For `bytes.translate`, which is faster than that of `str`."""
 _LETTERS: Final = re.compile(r"[^\W\d_]+")
 UNHASHED: Final = -1
 """In place of the hash of a payload that was not hashed."""
@@ -110,7 +110,13 @@ class Zone(NamedTuple):
 def letters_of(text: str) -> list[str]:
     """Returns the rows of letters in a text, each as long as it goes on."""
     # The expression takes four times as long.
-    return text.translate(SPACES).split() if text.isascii() else _LETTERS.findall(text)
+    return words_of(text) if text.isascii() else _LETTERS.findall(text)
+
+
+def words_of(text: str) -> list[str]:
+    """Returns what lies between spaces and what of ASCII is no letter."""
+    spaced = text.encode("utf-8", "surrogatepass").translate(_SPACES)
+    return spaced.decode("utf-8", "surrogatepass").split()
 
 
 def may_be_in(words: str, text: str) -> bool:
@@ -297,11 +303,6 @@ class Table:
             bags=None if bags is None else bags[positions],
         )
 
-    def sorted(self) -> Table:
-        """Returns the rows by log time, ties by bag and place."""
-        order = order_of(self.log_times, self.bag_numbers, self.places)
-        return self if order is None else self.rows(order)
-
     def without_columns(self, reason: str) -> Table:
         """Returns the times of the rows alone, and why there is no more."""
         return replace(self, columns={}, elements={}, left_out={"": reason})
@@ -332,7 +333,7 @@ def joined(tables: Sequence[Table]) -> Table:
     if len(tables) == 1:
         return first
     is_hashed = any(table.payload_hashes is not None for table in tables)
-    return Table(
+    whole = Table(
         first.channel,
         np.concatenate([table.log_times for table in tables]),
         np.concatenate([table.publish_times for table in tables]),
@@ -342,7 +343,9 @@ def joined(tables: Sequence[Table]) -> Table:
         np.concatenate([*map(_hashes, tables)]) if is_hashed else None,
         first.define,
         np.concatenate([table.bag_numbers for table in tables]),
-    ).sorted()
+    )
+    order = order_of(whole.log_times, whole.bag_numbers, whole.places)
+    return whole if order is None else whole.rows(order)
 
 
 def _hashes(table: Table) -> IntArray:

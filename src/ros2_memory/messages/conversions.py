@@ -238,6 +238,7 @@ def summaries_of(table: FieldTable) -> Mapping[str, Callable[[object, object], o
     return _SUMMARIES.get(table.type, _NONE)
 
 
+_NUMBERS: Final = (int, float, np.number)  # as a tuple: a union is made anew with each call
 _XYZ: Final = attrgetter("x", "y", "z")
 _XYZW: Final = attrgetter("x", "y", "z", "w")
 
@@ -269,7 +270,9 @@ def xyzw(node: object) -> Quaternion | None:
 
 def number(node: object) -> float | None:
     """Returns a number as a float; None for anything else, and for what no float can hold."""
-    if isinstance(node, bool) or not isinstance(node, int | float | np.number):
+    if type(node) is float:
+        return node
+    if isinstance(node, bool) or not isinstance(node, _NUMBERS):
         return None
     try:
         return float(node)

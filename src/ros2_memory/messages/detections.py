@@ -38,6 +38,7 @@ POSITIONS: Final = (
     ("bbox3d", "center", "position"),
     (),  # x, y and z of the object itself
 )
+_SCORED: Final = frozenset(SCORES)
 _SHOWN: Final = frozenset({"box", "z"}.union(*(path[:1] for path in POSITIONS)))
 """What has a score and one of these is something that was seen, and named as such things are."""
 _NAMED_IN_TYPES: Final = {
@@ -84,7 +85,7 @@ def naming(fields: Collection[str]) -> Iterator[str]:
     if NOT_LABELLED.isdisjoint(fields):
         yield from LABELS
         yield from (name for own, name in _NAMED_IN_TYPES.items() if own.issubset(fields))
-        if any(name in fields for name in SCORES) and not _SHOWN.isdisjoint(fields):
+        if not (_SCORED.isdisjoint(fields) or _SHOWN.isdisjoint(fields)):
             yield from ("name", "category", "id")
 
 
@@ -102,8 +103,10 @@ def _walked(
     value: JsonValue, frame: str, depth: int, least: float | None, detections: list[Detection]
 ) -> JsonValue:
     """Appends the detections in a value; returns it without those of a score below `least`."""
-    if depth == 0 or not isinstance(value, str | list | dict):
+    if depth == 0:
         return value
+    if isinstance(value, dict):
+        return _walked_object(value, _frame(value) or frame, depth, least, detections)
     if isinstance(value, str):
         if not looks_like_json(value):  # most are names
             return value
@@ -118,7 +121,7 @@ def _walked(
             for element in value
         ]
         return value if all(map(is_, parts, value)) else parts
-    return _walked_object(value, _frame(value) or frame, depth, least, detections)
+    return value
 
 
 def _walked_object(
@@ -183,11 +186,9 @@ def _label(value: dict[str, JsonValue]) -> str | None:
 
 def _best_result(results: JsonValue) -> dict[str, JsonValue] | None:
     """Returns the hypothesis of the highest score; the first of several."""
-    objects = (
-        [result for result in results if isinstance(result, dict)]
-        if isinstance(results, list)
-        else []
-    )
+    if not isinstance(results, list):
+        return None
+    objects = [result for result in results if isinstance(result, dict)]
     return max(objects, key=_rank, default=None)
 
 
@@ -223,6 +224,8 @@ def _placed(
     All zeros means that nobody filled it in.
     """
     for value, path in product(objects, POSITIONS):
+        if path and path[0] not in value:
+            continue
         node: JsonValue = value
         frame = outer
         for name in path:

@@ -71,8 +71,6 @@ _ROWS: Final = """
     FROM messages NOT INDEXED ORDER BY rowid
 """
 _ROWS_AT_ONCE: Final = 1 << 16
-_ROWS_OF_SPAN: Final = 64
-"""Of so many rows, if they are short, the first and last time alone are kept: as of a chunk."""
 # Without payloads, so that sorting needs no memory for them; they are read row by row.
 _ASCENDING: Final = """
     SELECT timestamp, rowid, topic_id FROM messages

@@ -168,8 +168,12 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
         positions: x, y and z (m) of each as a row; at least one.
     """
     points = positions - positions[0]
+    # What is the same everywhere, as z mostly is, adds nothing.
+    varies = points.any(axis=0)
+    varies[0] = True
+    points = points[:, varies]
     plain = np.sqrt(row_sums(np.diff(points, axis=0) ** 2))
-    total = math.fsum(plain.tolist())
+    total = float(plain.sum())
     apart = np.diff(seconds)
     if len(points) < FEWEST:
         speed_mps = _sparse_speed(plain, apart)
@@ -181,28 +185,28 @@ def measured(seconds: Floats, positions: Vectors) -> Measured:
     if np.median(apart) > _DENSE_S:
         stationary &= _scatters(points, places, noise)
         lengths, as_plain = plain, ~stationary
-    x, y, z = positions[0].tolist()
     averaged = min(2 * _MEAN_SPAN + 1, len(points))
     reach = _LEFT * math.sqrt(2 / averaged) * row_maxima(noise)
-    moved, steps, inside_m = lengths.copy(), lengths.copy(), list[float]()
+    moved, steps, inside_m = lengths.copy(), lengths.copy(), 0.0
     before = after = None
     for begin, end in _runs(stationary):
         if end - begin < min(_STATIONARY_STEPS, len(plain)):
             continue
-        creep = _creep(places[begin : end + 1], reach[begin : end + 1], (x, y, z))
+        run = slice(begin, end + 1)
+        creep = _creep(places[run], reach[run], positions[0], varies)
         moved[begin:end] = 0.0
         steps[begin:end] = creep.length_m / (end - begin)
         before = creep if begin == 0 else before
         after = creep if end == len(plain) else after
         if begin > 0 and end < len(plain):
-            inside_m.append(creep.length_m)
+            inside_m += creep.length_m
     spread = np.sqrt(row_sums(noise**2))
     head, tail = (
         End(float(moved[at]), float(spread[at]), bool(as_plain[at]), creep)
         for at, creep in ((0, before), (-1, after))
     )
     return Measured(
-        total if as_plain.all() else math.fsum([*moved.tolist(), *inside_m]),
+        total if as_plain.all() else float(moved.sum()) + inside_m,
         total,
         head,
         tail,
@@ -216,8 +220,7 @@ def _noise(points: Vectors) -> Vectors:
     """Returns the standard deviation of each axis at each position."""
     roots = np.sqrt(np.abs(np.diff(points, _ORDER, axis=0)))
     means = _moving_mean(roots, _NOISE_SPAN) ** 2 / (_ROOT_MEAN * _GROWTH)
-    at = np.clip(np.arange(len(points)) - _ORDER // 2, 0, len(means) - 1)
-    return means[at]
+    return _extended(means, _ORDER // 2, len(points))
 
 
 def _steps(points: Vectors, plain: Floats, noise: Vectors) -> tuple[Floats, Flags, Flags]:
@@ -270,8 +273,7 @@ def _slopes(points: Vectors, width: int) -> Vectors:
     weights = np.arange(width) - (width - 1) / 2
     weights /= weights @ weights
     fits = np.column_stack([np.correlate(axis, weights, "valid") for axis in points.T])
-    at = np.clip(np.arange(len(points) - 1) - (width // 2 - 1), 0, len(fits) - 1)
-    return fits[at]
+    return _extended(fits, width // 2 - 1, len(points) - 1)
 
 
 def _moving_mean(rows: Vectors, span: int) -> Vectors:
@@ -279,8 +281,17 @@ def _moving_mean(rows: Vectors, span: int) -> Vectors:
     width = min(2 * span + 1, len(rows))
     sums = np.zeros((len(rows) + 1, rows.shape[1]))
     np.cumsum(rows, axis=0, out=sums[1:])
-    means = (sums[width:] - sums[:-width]) / width
-    return means[np.clip(np.arange(len(rows)) - span, 0, len(means) - 1)]
+    return _extended((sums[width:] - sums[:-width]) / width, span, len(rows))
+
+
+def _extended(rows: Vectors, before: int, count: int) -> Vectors:
+    """Returns so many rows: the first also so often before them, the last at their end."""
+    extended = np.empty((count, rows.shape[1]))
+    extended[:before] = rows[0]
+    inner = extended[before : before + len(rows)]
+    inner[:] = rows[: len(inner)]
+    extended[before + len(rows) :] = rows[-1]
+    return extended
 
 
 def _runs(marks: Flags) -> list[list[int]]:
@@ -290,8 +301,11 @@ def _runs(marks: Flags) -> list[list[int]]:
     return runs
 
 
-def _creep(places: Vectors, reach: Floats, origin: Vector3) -> Creep:
-    """Returns which of the places a robot left: was farther from than its noise explains."""
+def _creep(places: Vectors, reach: Floats, origin: Floats, varies: Flags) -> Creep:
+    """Returns which of the places a robot left: was farther from than its noise explains.
+
+    They are relative to an origin, along the axes that vary.
+    """
     left_at, begin, count = [0], 0, _AHEAD
     while begin < len(places):
         ahead = slice(begin, begin + count)
@@ -301,8 +315,9 @@ def _creep(places: Vectors, reach: Floats, origin: Vector3) -> Creep:
         if off.size:
             left_at.append(ahead.start + int(off[0]))
             begin, count = left_at[-1], _AHEAD
-    x, y, z = origin
-    left = [(float(a) + x, float(b) + y, float(c) + z) for a, b, c in places[left_at]]
+    whole = np.tile(origin, (len(left_at), 1))
+    whole[:, varies] += places[left_at]
+    left = [(x, y, z) for x, y, z in whole.tolist()]
     middle_m = math.fsum(math.dist(here, there) for here, there in pairwise(left[1:]))
     second = left[1] if len(left) > 1 else None
     return Creep(left[0], second, middle_m, left[-1], float(reach.max()))
@@ -333,7 +348,7 @@ def _sparse_speed(lengths: Floats, apart: Floats) -> float | None:
     """Returns the highest median speed of eight steps that take a second or longer, if any do."""
     if len(lengths) < SPEED_STEPS:
         return None
-    long = sliding_window_view(apart, SPEED_STEPS).sum(axis=1) >= SPEED_WINDOW_S - _SLACK_S
+    long = np.convolve(apart, np.ones(SPEED_STEPS), "valid") >= SPEED_WINDOW_S - _SLACK_S
     if not long.any():
         return None
     windows = sliding_window_view(lengths / np.maximum(apart, _JITTER_S), SPEED_STEPS)[long]

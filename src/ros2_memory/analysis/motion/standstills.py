@@ -308,16 +308,14 @@ class _Bends(NamedTuple):
         """
         begins = self.edges[firsts]
         counts = self.edges[stops] - begins
-        groups = np.repeat(np.arange(counts.size), counts)
-        before = np.cumsum(counts) - counts
-        rows = np.arange(groups.size) - np.repeat(before - begins, counts)
-        values = self.squares[rows]
-        values = values[np.lexsort((values, groups))]
-        has_bends = counts > 0
-        middles = values[before[has_bends] + (counts[has_bends] - 1) // 2]
-        deviations = np.zeros(counts.size)
+        middles = np.zeros(counts.size)
+        # Most ranges have as many: their rows are sorted at once.
+        for count in np.unique(counts[counts > 0]).tolist():
+            which, middle = np.flatnonzero(counts == count), (count - 1) // 2
+            rows = self.squares[begins[which][:, None] + np.arange(count)]
+            middles[which] = np.partition(rows, middle, axis=1)[:, middle]
         # The median of chi-squared is 0.45 of its mean for noise on one axis, 0.79 on three.
-        deviations[has_bends] = np.sqrt(middles / 6 / 0.6)
+        deviations: Floats = np.sqrt(middles / 6 / 0.6)
         return deviations
 
 
