@@ -15,9 +15,10 @@ import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Activity, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
-from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, joined_numbers, numbers_of
+from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
+from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
 from ros2_memory.index.split_order import (
     Series,
@@ -30,7 +31,7 @@ from ros2_memory.index.split_order import (
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -134,30 +135,24 @@ def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
 class Segment:
     """Some consecutive bags of a timeline; never without any."""
 
-    def __init__(self, bags: Sequence[BagFile]) -> None:
-        self.bags = tuple(bags)
+    def __init__(self, bags: Iterable[BagFile] | BagRows) -> None:
+        self.bags = bags if isinstance(bags, BagRows) else BagRows(bags)
         self.first = in_time(self.bags[0])
         self._known_recordings: dict[str, dict[Path, TopicTotals]] = {}
 
     @cached_property
-    def starts(self) -> NDArray[np.int64]:
-        """Log time of the first message in each bag."""
-        return np.array([bag.start for bag in self.bags], np.int64)
-
-    @cached_property
-    def ends(self) -> NDArray[np.int64]:
-        """Log time of the last message in each bag."""
-        return np.array([bag.end for bag in self.bags], np.int64)
-
-    @cached_property
     def latest(self) -> Ns:
         """Log time of the last message in any of the bags."""
-        return int(self.ends.max())
+        return int(self.bags.ends.max())
+
+    @cached_property
+    def newest(self) -> BagFile:
+        """The bag that ends last."""
+        return self.bags[int(self.bags.ends.argmax())]
 
     def overlapping(self, window: TimeWindow) -> list[BagFile]:
         """Returns the bags whose span overlaps a window, in order."""
-        is_inside = (self.starts < window.stop) & (self.ends >= window.start)
-        return [self.bags[row] for row in np.flatnonzero(is_inside).tolist()]
+        return [*self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))]
 
     @cached_property
     def recorded(self) -> Segment | None:
@@ -171,54 +166,42 @@ class Segment:
 
     def _without(self, is_left_out: Callable[[str], bool], name: str) -> Segment | None:
         """Returns the bags but for some that lie in a folder of a name, if they are there."""
-        if not any(f"/{folder}".endswith(f"/{name}") for folder in self.folders):
+        if not any(f"/{folder}".endswith(f"/{name}") for folder in self.bags.folders):
             return self
-        rest = [bag for bag in self.bags if not is_left_out(bag.file)]
-        if len(rest) == len(self.bags):
-            return self
-        return Segment(rest) if rest else None
+        return self.without(map(is_left_out, self.bags.files()))
+
+    def without(self, are_left_out: Iterable[bool]) -> Segment | None:
+        """Returns the bags but for some: itself where that are all; None where none is left."""
+        rest = self.bags.some(~np.fromiter(are_left_out, np.bool_, len(self.bags)))
+        if rest is self.bags:
+            return self  # what it remembers serves the next timeline
+        return None if rest is None else Segment(rest)
 
     @cached_property
     def disk_use(self) -> tuple[int, int]:
         """The bytes of the bags, and how many of them a crash left open."""
-        left_open = [bag.state is BagState.INCOMPLETE for bag in self.bags]
-        return sum([bag.size for bag in self.bags]), sum(left_open)
-
-    @cached_property
-    def numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
-        """The folders of the bags, and for each bag the position of its folder among them."""
-        series, positions, _ = self.split_names
-        number_of: dict[str, int] = {}
-        folders = [path[: path.rfind("/")] for path in series]
-        numbers = [number_of.setdefault(folder, len(number_of)) for folder in folders]
-        return [*number_of], np.array(numbers, np.uint16)[positions]
+        left_open = self.bags.are(BagState.INCOMPLETE)
+        return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
     def split_names(self) -> SplitNames:
         """What the names of the bags say."""
-        return split_names_of(self.bags)
-
-    @cached_property
-    def folders(self) -> frozenset[str]:
-        """The folders of the bags."""
-        folders, _ = self.numbered_folders
-        return frozenset(folders)
+        return split_names_of(self.bags.files())
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, numbers = self.numbered_folders
-        spans = _spans_of(len(folders), numbers, self.starts, self.ends)
-        return dict(zip(folders, spans, strict=True))
+        bags = self.bags
+        spans = _spans_of(len(bags.folders), bags.folder_of, bags.starts, bags.ends)
+        return dict(zip(bags.folders, spans, strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        folders, numbers = self.numbered_folders
         messages = self._numbers(self._headers)[:, :, 0].sum(axis=0)
-        columns = (np.bincount(numbers), np.bincount(numbers, messages))
+        columns = (np.bincount(self.bags.folder_of), np.bincount(self.bags.folder_of, messages))
         rows = zip(*(column.astype(np.int64).tolist() for column in columns), strict=True)
-        return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
+        return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
@@ -228,11 +211,9 @@ class Segment:
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
         """The bags that are not readable as a whole, or that contradict themselves."""
-        return tuple(
-            bag
-            for bag in self.bags
-            if bag.summary.schema.remarks or bag.state is BagState.INCOMPLETE
-        )
+        bags = self.bags
+        has_remarks = bags.with_schema(attrgetter("remarks"))
+        return tuple(bags.at(has_remarks | bags.are(BagState.INCOMPLETE)))
 
     @cached_property
     def set_back(self) -> tuple[StepBack, ...]:
@@ -246,33 +227,16 @@ class Segment:
     @cached_property
     def schemas(self) -> tuple[SummarySchema, ...]:
         """The different schemas of the summaries; mostly one."""
-        schemas = [bag.summary.schema for bag in self.bags]
-        return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
-
-    @cached_property
-    def _joined(self) -> list[tuple[SummarySchema, NDArray[np.uint16], bytes]]:
-        """The schemas, the positions of the bags of each, and the numbers of these, joined."""
-        bags_of: dict[int, list[int]] = {}
-        for nth, bag in enumerate(self.bags):
-            bags_of.setdefault(id(bag.summary.schema), []).append(nth)
-        return [
-            (
-                schema,
-                np.array(bags, np.uint16),
-                joined_numbers([self.bags[nth].summary for nth in bags]),
-            )
-            for schema, bags in zip(self.schemas, bags_of.values(), strict=True)
-        ]
+        return tuple({id(alike.schema): alike.schema for alike in self.bags.summaries}.values())
 
     @cached_property
     def _headers(self) -> tuple[TopicHeader, ...]:
         """All topics, each type of one by itself."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
 
-    def _bags_with(self, name: str) -> list[BagFile]:
-        """Returns the bags of whose schemas an attribute is not empty: mostly none."""
-        odd = {id(schema) for schema in self.schemas if getattr(schema, name)}
-        return [bag for bag in self.bags if id(bag.summary.schema) in odd] if odd else []
+    def _bags_with(self, name: str) -> Iterator[BagFile]:
+        """Yields the bags of whose schemas an attribute is not empty: mostly none."""
+        return self.bags.at(self.bags.with_schema(attrgetter(name)))
 
     @cached_property
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
@@ -308,8 +272,7 @@ class Segment:
         column = self.column(topic)
         if column is None:
             return {}
-        _, folder_numbers = self.numbered_folders
-        numbers, paths = folder_numbers[column.bags], self._recording_paths
+        numbers, paths = self.bags.folder_of[column.bags], self._recording_paths
         spans = _spans_of(len(paths), numbers, column.firsts, column.lasts)
         counts = np.zeros(len(paths), np.int64)
         np.add.at(counts, numbers, column.messages)
@@ -321,11 +284,10 @@ class Segment:
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
-        """The recordings of the bags, in the order in which their folders are numbered."""
+        """The recordings of the bags, in the order of their folders."""
         # A path for each bag of a week would take longer than all else.
-        _, folder_numbers = self.numbered_folders
-        _, rows = np.unique(folder_numbers, return_index=True)
-        return [self.bags[row].recording for row in rows.tolist()]
+        _, rows = np.unique(self.bags.folder_of, return_index=True)
+        return [bag.recording for bag in self.bags.at(rows)]
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic in a window, in order, once for each type."""
@@ -333,9 +295,8 @@ class Segment:
         if column is None:
             return
         is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
-        bags, firsts, lasts, _ = (values[is_inside].tolist() for values in column)
-        for row, first, last in zip(bags, firsts, lasts, strict=True):
-            yield TopicExtent(self.bags[row], first, last)
+        rows, firsts, lasts, _ = (values[is_inside] for values in column)
+        yield from map(TopicExtent, self.bags.at(rows), firsts.tolist(), lasts.tolist())
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
@@ -350,7 +311,7 @@ class Segment:
     def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
         """Returns count (0 where it has none), first and last by topic of one type, and bag."""
         numbers = np.zeros((len(headers), len(self.bags), 3), np.int64)
-        for schema, bags, joined in self._joined:
+        for schema, bags, joined in self.bags.summaries:
             at = {header: position for position, header in enumerate(schema.topics)}
             rows = [row for row, header in enumerate(headers) if header in at]
             if rows:
@@ -395,12 +356,11 @@ class Segment:
         """By topic, when the bags hold it and how often."""
         topics = sorted(self.types)
         numbers = self._numbers_by_topic()
-        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)
+        lengths = (numbers[:, :, 0] > 0) @ (self.bags.ends - self.bags.starts)
         # Between absences a bag is as many: what follows each comes behind all bags.
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
-        has_absences = bool(self._bags_with("absences"))
-        for row, bag in enumerate(self.bags if has_absences else ()):
-            for topic, pauses in bag.summary.schema.absences:
+        for row in np.flatnonzero(self.bags.with_schema(attrgetter("absences"))).tolist():
+            for topic, pauses in self.bags[row].summary.schema.absences:
                 nth = topics.index(topic)
                 count, _, last = numbers[nth, row].tolist()
                 for start, end, sent in reversed(pauses):

@@ -22,6 +22,7 @@ from ros2_memory.core.model import BagFile, SetAside, TimeWindow
 from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.spans import united, without
 from ros2_memory.core.timebase import MAX_NS, Ns
+from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.clock_faults import ClockFault, Dating, check_dates, dated_segments
 from ros2_memory.index.holes import Pause, Rhythm, pauses_between
 from ros2_memory.index.split_order import (
@@ -77,7 +78,7 @@ class Snapshot:
     older: Ns | None = None
 
     @property
-    def bags(self) -> tuple[BagFile, ...]:
+    def bags(self) -> Sequence[BagFile]:
         """What answers queries: bags that are closed, or left open by a crash, and not empty.
 
         In the order (start, end, path). The bag of carried latched messages is not among them, but
@@ -162,9 +163,10 @@ class Snapshot:
         """First log time after the newest gap of more than `LONGEST_OFF_NS`; None without a bag."""
         begin = reach = None
         for segment in self._dated_segments:
-            spans = [(segment.bags[0].start, segment.latest)]
-            if segment.latest - segment.bags[0].start > LONGEST_OFF_NS:
-                spans = [(bag.start, bag.end) for bag in segment.bags]
+            bags, (first, *_) = segment.bags, segment.first
+            spans = [(first, segment.latest)]
+            if segment.latest - first > LONGEST_OFF_NS:
+                spans = [*zip(bags.starts.tolist(), bags.ends.tolist(), strict=True)]
             for start, end in spans:
                 if reach is None or start - reach > LONGEST_OFF_NS:
                     begin = start
@@ -210,7 +212,7 @@ class Snapshot:
         for segment in self._dated_segments:
             if newest is not None:
                 # Bags of other parts may last into this one.
-                pauses += pauses_between([newest, segment.bags[0]])
+                pauses += pauses_between(BagRows([newest, segment.bags[0]]))
                 reach = newest.end
                 pauses += (
                     pause._replace(start=max(pause.start, reach))
@@ -221,8 +223,8 @@ class Snapshot:
                 pauses += segment.pauses
             for pause in segment.pauses_within:
                 pauses += self._shared_parts(pause)
-            last = max(segment.bags, key=lambda bag: bag.end)
-            newest = last if newest is None or last.end > newest.end else newest
+            if newest is None or segment.latest > newest.end:
+                newest = segment.newest
         return sorted(pauses, key=lambda pause: (pause.start, pause.end))
 
     def _shared_parts(self, pause: Pause) -> Iterator[Pause]:
@@ -285,5 +287,5 @@ class Snapshot:
 
     def _neighbours(self, aside: SetAside) -> Neighbours:
         folder = str(aside.path.parent)
-        segments = (segment for segment in self.timeline.segments if folder in segment.folders)
+        segments = (segment for segment in self.timeline.segments if folder in segment.bags.folders)
         return neighbours(str(aside.path), segments)
