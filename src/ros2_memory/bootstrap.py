@@ -42,14 +42,14 @@ from ros2_memory.core.timebase import WallClock, ns_from_unix
 from ros2_memory.retention.policy import GB, RetentionLimits
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from ros2_memory.analysis.conditions import Condition
     from ros2_memory.bag_dir.own_recordings import OwnRecordings
     from ros2_memory.columns.fill import Progress
     from ros2_memory.columns.scanner import Caches
     from ros2_memory.columns.store import ColumnStore
-    from ros2_memory.core.model import BagFile, JsonValue
+    from ros2_memory.core.model import JsonValue
     from ros2_memory.core.regions import Place, Region
     from ros2_memory.extract import SchemaExtractor
     from ros2_memory.fleet.robots import Fleet
@@ -451,16 +451,13 @@ def build_memory(
     reader = BagDirReader(shared.reader, bag_dir)
     columns = build_columns(settings, reader)
 
-    def known_files(paths: Iterable[str]) -> dict[str, BagFile]:
-        return {} if columns is None else columns.known_files(bag_dir, paths)
-
     index = IndexManager(
         bag_dir,
         reader,
         clock,
         refresh_s=settings.reader.index_refresh_s,
         split_duration_s=settings.recording.split_duration_s,
-        known=known_files,
+        known=list if columns is None else partial(columns.known_bags, bag_dir),
         include_active=settings.reader.include_active,
         trusts_mtime=not isinstance(settings.recorder, NullRecorderNode),
         only=settings.data.recording,

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final, NamedTuple
 import numpy as np
 
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
+from ros2_memory.index.bag_rows import Bags
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -58,12 +59,10 @@ class Coverage:
         self.segments = tuple(segments)
         self.missing = tuple(chain.from_iterable(covered.missing for covered in segments))
         numbers = [covered.numbers for covered in segments]
-        begins = np.cumsum([0, *map(len, numbers)])
         all_numbers = np.concatenate(numbers) if numbers else np.empty(0, np.int64)
         order = np.argsort(all_numbers, kind="stable")
         self._of_parts: dict[int, IntArray] = {}
-        self._bags: dict[int, BagFile] = {}
-        self._begins: IntArray = begins
+        self._bags = Bags(covered.segment.bags for covered in segments)
         self._order: IntArray = order[np.searchsorted(all_numbers[order], 0) :]
         self._numbers: IntArray = all_numbers[self._order]
 
@@ -102,22 +101,17 @@ class Coverage:
 
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
-        if number not in self._bags:
-            at = int(self._numbers.searchsorted(number))
-            if at == self._numbers.size or self._numbers[at] != number:
-                return None
-            nth = int(self._order[at])
-            segment = int(np.searchsorted(self._begins, nth, side="right")) - 1
-            bags = self.segments[segment].segment.bags
-            self._bags[number] = bags[nth - int(self._begins[segment])]
-        return self._bags[number]
+        at = int(self._numbers.searchsorted(number))
+        if at == self._numbers.size or self._numbers[at] != number:
+            return None
+        return self._bags[int(self._order[at])]
 
     def unhashed(self) -> list[BagFile]:
         """Returns the stored bags of which copies cannot be recognised."""
         return [
-            covered.segment.bags[nth]
+            bag
             for covered in self.segments
-            for nth in np.flatnonzero((covered.numbers >= 0) & ~covered.hashed).tolist()
+            for bag in covered.segment.bags.at((covered.numbers >= 0) & ~covered.hashed)
         ]
 
 
@@ -169,20 +163,14 @@ class Covering:
             )
         }
         unknown = [segment for segment in timeline.segments if id(segment) not in remembered]
-        bags = [bag for segment in unknown for bag in segment.bags]
-        rows = self.store.rows_of(bags, self._root, state.deletion)
-        begin = 0
-        for segment in unknown:
-            end = begin + len(segment.bags)
-            remembered[id(segment)] = self._covered_segment(segment, rows[begin:end])
-            begin = end
+        rows = self.store.rows_of([segment.bags for segment in unknown], self._root, state.deletion)
+        for segment, of_segment in zip(unknown, rows, strict=True):
+            remembered[id(segment)] = self._covered_segment(segment, of_segment)
         return [remembered[id(segment)] for segment in timeline.segments]
 
     def _covered_segment(self, segment: Segment, rows: IntArray) -> CoveredSegment:
         """Returns what is known of a segment, of whose bags `rows_of` returns these rows."""
-        closed = BagState.CLOSED
-        is_closed = np.fromiter((bag.state is closed for bag in segment.bags), np.bool_)
-        is_stored: NDArray[np.bool_] = is_closed & (rows >= 0)
-        missing = tuple(segment.bags[nth] for nth in np.flatnonzero(~is_stored).tolist())
+        is_stored: NDArray[np.bool_] = segment.bags.are(BagState.CLOSED) & (rows >= 0)
+        missing = tuple(segment.bags.at(~is_stored))
         numbers = np.where(is_stored, (rows >> 1) + self.store.offset, -1)
         return CoveredSegment(segment, numbers, is_stored & (rows & 1 > 0), missing)

@@ -7,13 +7,13 @@ import time
 from collections import defaultdict
 from dataclasses import dataclass
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.bag_dir.handover_file import sure_handover
 from ros2_memory.bag_dir.layout import ERASING_FILE, HANDOVER_FILE
 from ros2_memory.columns.decode import Group, undecoded
-from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore
+from ros2_memory.columns.store import LONG_NS, BagKey, ColumnStore, relative
 from ros2_memory.columns.writing import PART_NS, ReadBag
 from ros2_memory.core.errors import BagError
 from ros2_memory.core.large_reads import LargeReads
@@ -142,10 +142,9 @@ class Filling:
         """Returns how much is stored. Any thread may ask."""
         coverage = self._scanner.coverage(timeline)
         missing = () if coverage is None else coverage.missing
-        closed = sum(bag.state is BagState.CLOSED for bag in timeline.bags)
         return Progress(
-            closed,
-            closed - sum(bag.state is BagState.CLOSED for bag in missing),
+            timeline.closed,
+            timeline.closed - sum(bag.state is BagState.CLOSED for bag in missing),
             len(self.waiting(timeline)),
             sum(map(self._is_refused, [*self._refused])),
         )
@@ -214,7 +213,8 @@ class Filling:
 
         Then the disk of the bags is more likely missing than empty.
         """
-        present = {self._key(bag).path for bag in timeline.bags}
+        files = chain.from_iterable(segment.bags.files() for segment in timeline.segments)
+        present = {relative(file, str(self._bag_dir)) for file in files}
         if not present:
             return
         absent = (path for path in self.store.paths() if path not in present)
@@ -415,7 +415,7 @@ def is_settled(bag: BagFile, bag_dir: Path, now: Ns) -> bool:
     except OSError:
         return False
     return (
-        stamp.is_of(bag)
+        stamp.content == (bag.size, bag.mtime_ns, bag.sidecar_ns)
         and settled(stamp.mtime_ns, now)
         and settled(stamp.sidecar_ns, now)
         and not (bag_dir / ERASING_FILE).exists()

@@ -18,7 +18,7 @@ from __future__ import annotations
 import json
 import os
 from functools import partial
-from itertools import accumulate, pairwise, repeat
+from itertools import accumulate, islice, pairwise
 from operator import attrgetter
 from sys import intern
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar
@@ -46,11 +46,13 @@ from ros2_memory.columns.zones import Zones
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, Ns
+from ros2_memory.index.bag_rows import BagRows
+from ros2_memory.index.timeline import SEGMENT_BAGS
 from ros2_memory.storage.base import Channel, Definition, IntArray, Schema
 
 if TYPE_CHECKING:
     import sqlite3
-    from collections.abc import Callable, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from pathlib import Path
 
     from ros2_memory.columns.fragments import FragmentKey
@@ -159,14 +161,6 @@ class PartHead(NamedTuple):
     is_whole: bool
 
 
-class _Known(NamedTuple):
-    """The bags that the index has as they are stored, and the rows of these; see `rows_of`."""
-
-    deletion: int
-    bags: tuple[BagFile, ...]
-    rows: IntArray
-
-
 class ColumnStore(Database):
     """Stores the columns of bags, and finds them again.
 
@@ -196,7 +190,6 @@ class ColumnStore(Database):
         self._definitions = definitions
         self._topics: dict[int, Topic] = {}
         self._layouts = Layouts()
-        self._known: _Known | None = None
         self._renewals = 0
 
     # Reading
@@ -231,70 +224,63 @@ class ColumnStore(Database):
         first, last = self._asked(lambda rows: rows.fetchone(), unknown, query, before.bag)
         return TimeWindow(first or 0, 0 if last is None else last + 1)
 
-    def known_files(self, bag_dir: Path, paths: Iterable[str]) -> dict[str, BagFile]:
-        """Returns which bags of some whole paths are stored, as they were indexed, by their paths.
+    def known_bags(self, bag_dir: Path) -> list[BagRows]:
+        """Returns the bags that are stored, as they were indexed, in order of time."""
 
-        `rows_of` returns their rows the next time without a look at the file.
-        """
-        root = f"{bag_dir}{os.sep}"
-        files = {path: path for path in paths}  # a week would take 8 MB more with its own
-
-        def ask(connection: sqlite3.Connection) -> dict[str, BagFile]:
+        def ask(connection: sqlite3.Connection) -> list[BagRows]:
             schemas = {
                 number: SummarySchema.from_json(topics)
                 for number, topics in connection.execute("SELECT id, topics FROM summary")
             }
             rows = connection.execute(
                 "SELECT path, size, mtime_ns, summary, counts, first_ns, last_ns, sidecar_ns,"
-                f" iif(definitions IN ('', ?), {_ROW}, -1) FROM bag WHERE size >= 0",
+                f" iif(definitions IN ('', ?), {_ROW}, -1) FROM bag WHERE size >= 0"
+                " ORDER BY first_ns, last_ns, path",
                 (self._definitions,),
             )
-            bags: dict[str, BagFile] = {}
-            numbers: list[int] = []
-            closed, summary_of = BagState.CLOSED, BagSummary.decoded
-            for path, size, mtime, schema, counts, first, last, sidecar, row in rows:
-                file = files.get(root + path)
-                if file is not None:
-                    summary = summary_of(schemas[schema], counts)
-                    bags[file] = BagFile(file, size, mtime, closed, summary, first, last, sidecar)
-                    numbers.append(row)
-            stored = np.array(numbers, np.int64)
-            self._known = _Known(self._deletion(connection), (*bags.values(),), stored)
-            return bags
+            root, closed, summary_of = f"{bag_dir}{os.sep}", BagState.CLOSED, BagSummary.decoded
+            deletion, parts = self._deletion(connection), list[BagRows]()
+            while some := rows.fetchmany(SEGMENT_BAGS):
+                bags = (
+                    BagFile(
+                        root + path, size, mtime, closed, summary_of(schemas[schema], counts), *span
+                    )
+                    for path, size, mtime, schema, counts, *span, _ in some
+                )
+                parts.append(BagRows(bags, (deletion, np.array([row[-1] for row in some]))))
+            return parts
 
-        return self.read(ask, {})
+        return self.read(ask, [])
 
     def _deletion(self, connection: sqlite3.Connection) -> int:
         [number] = connection.execute("SELECT max(id) FROM deletion").fetchone()
         return self.offset + int(number or 0)
 
-    def rows_of(self, bags: Sequence[BagFile], bag_dir: str, deletion: int) -> IntArray:
-        """Returns twice the number less the `offset` of each bag; -1 where it is not stored.
+    def rows_of(self, parts: Sequence[BagRows], bag_dir: str, deletion: int) -> Iterator[IntArray]:
+        """Yields twice the number less the `offset` of each bag; -1 where it is not stored.
 
         One more where copies of its messages can be recognised. `deletion` is that of the `state`
-        of the moment.
+        of the moment: what was loaded with it is taken over once.
         """
-        known, self._known = self._known, None
-        rows: dict[int, int] = {}
-        if known is not None and known.deletion == deletion:
-            rows = dict(zip(map(id, known.bags), known.rows.tolist(), strict=True))
-        found = np.fromiter(map(rows.get, map(id, bags), repeat(_UNKNOWN)), np.int64)
-        others = np.flatnonzero(found == _UNKNOWN)
-        if others.size:
-            keys = [
-                (relative(bag.file, bag_dir), *_stamps(bag))
-                for bag in map(bags.__getitem__, others.tolist())
-            ]
+        loaded = [bags.taken(deletion) for bags in parts]
+        keys = [
+            (relative(bag.file, bag_dir), *_stamps(bag))
+            for bags, rows in zip(parts, loaded, strict=True)
+            for bag in (bags if rows is None else ())
+        ]
+        stored: dict[Key, int] = {}
+        if keys:
             query = f"SELECT {_ROW}, {_KEY} FROM bag WHERE definitions IN ('', ?)"
             given = [self._definitions]
-            if others.size <= _FEW:
+            if len(keys) <= _FEW:
                 query += " AND path IN (SELECT value FROM json_each(?))"
                 given.append(json.dumps([path for path, *_ in keys]))
             stored = self._asked(
-                lambda read: {row[1:]: row[0] for row in read}, dict[Key, int](), query, *given
+                lambda read: {row[1:]: row[0] for row in read}, stored, query, *given
             )
-            found[others] = [stored.get(key, -1) for key in keys]
-        return found
+        asked = iter([stored.get(key, -1) for key in keys])
+        for bags, rows in zip(parts, loaded, strict=True):
+            yield np.fromiter(islice(asked, len(bags)), np.int64) if rows is None else rows
 
     def unmerged(self) -> frozenset[int]:
         """Returns the numbers of the bags whose parts are not those of whole ten minutes yet."""
@@ -580,7 +566,7 @@ class ColumnStore(Database):
                 "UPDATE bag SET sidecar_ns = ?1 WHERE sidecar_ns <> ?1 AND path = ?2 AND size = ?3"
                 " AND mtime_ns = ?4 AND counts = ?5"
                 " AND summary = (SELECT id FROM summary WHERE topics = ?6)",
-                (key.sidecar_ns, *key[:3], bag.summary.packed, bag.summary.schema.to_json()),
+                (key.sidecar_ns, *key[:3], bag.summary.data, bag.summary.schema.to_json()),
             )
             self._renewals += 1
             return cursor.rowcount > 0

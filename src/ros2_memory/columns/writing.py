@@ -278,7 +278,7 @@ def insert_bag(connection: sqlite3.Connection, to_store: ReadBag, definitions: s
     cursor = connection.execute(
         "INSERT INTO bag (path, size, mtime_ns, sidecar_ns, first_ns, last_ns, messages, hashed,"
         " definitions, summary, counts) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-        (*key, _messages_of(bag), hashed, definitions, summary, bag.summary.packed),
+        (*key, _messages_of(bag), hashed, definitions, summary, bag.summary.data),
     )
     return int(cursor.lastrowid or 0)
 

@@ -12,7 +12,6 @@ import struct
 import sys
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
-from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple, Self, TypeAlias
 
 import numpy as np
@@ -20,7 +19,7 @@ import numpy as np
 from ros2_memory.core.timebase import NS_PER_S, Ns
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Collection, Iterable, Sequence
 
     from numpy.typing import NDArray
 
@@ -150,20 +149,12 @@ DOUBTS: Final = (
 """Beginnings of notes on files that contradict themselves, and were read from end to end."""
 
 
-def joined_numbers(summaries: Sequence[BagSummary]) -> bytes:
-    """Returns the numbers of summaries that share one schema, packed where all are."""
-    stored = [summary._numbers for summary in summaries]
-    if len({*map(len, stored)}) > 1:
-        stored = [summary.numbers for summary in summaries]
-    return b"".join(stored)
-
-
 def numbers_of(
     schema: SummarySchema, joined: bytes, summaries: int, positions: Sequence[int]
 ) -> IntArray:
-    """Returns count, first and last of some topics of a schema, of so many joined summaries.
+    """Returns count, first and last of some topics, of the joined `data` of so many summaries.
 
-    Of the shape (positions, summaries, 3).
+    These share the schema, and the size of their data. Of the shape (positions, summaries, 3).
     """
     size = len(joined) // summaries
     if size == schema.numbers.size:
@@ -210,12 +201,13 @@ class BagSummary:
 
     Attributes:
         schema: the summary without its numbers.
+        data: the numbers, in about half of their bytes where they fit.
     """
 
-    __slots__ = ("_numbers", "schema")
+    __slots__ = ("data", "schema")
 
     schema: SummarySchema
-    _numbers: bytes
+    data: bytes
 
     def __init__(
         self,
@@ -234,35 +226,28 @@ class BagSummary:
         self.schema = shared_schema(
             SummarySchema(tuple(headers), silent, complete, notes, set_back, pauses, absences)
         )
-        numbers = (part for topic in topics for part in (topic.count, topic.first, topic.last))
-        self._numbers = self.schema.numbers.pack(*numbers)
+        numbers = [part for topic in topics for part in (topic.count, topic.first, topic.last)]
+        self.data = _packed(self.schema, numbers)
 
     @classmethod
-    def decoded(cls, schema: SummarySchema, numbers: bytes) -> Self:
-        """Returns the summary of these numbers, packed or not, as many as the schema has."""
+    def of_numbers(cls, schema: SummarySchema, numbers: Sequence[int]) -> Self:
+        """Returns the summary of count, first and last of each topic of a schema."""
+        return cls.decoded(schema, _packed(schema, numbers))
+
+    @classmethod
+    def decoded(cls, schema: SummarySchema, data: bytes) -> Self:
+        """Returns the summary of a schema whose `data` are these."""
         summary = cls.__new__(cls)
         summary.schema = schema
-        summary._numbers = numbers
+        summary.data = data
         return summary
-
-    @property
-    def numbers(self) -> bytes:
-        """Count, first and last of each topic, in the order of the schema."""
-        if not self._is_packed:
-            return self._numbers
-        numbers = map(self._numbers_at, range(len(self.schema.topics)))
-        return self.schema.numbers.pack(*chain.from_iterable(numbers))
-
-    @property
-    def _is_packed(self) -> bool:
-        return len(self._numbers) != self.schema.numbers.size
 
     def _numbers_at(self, position: int) -> tuple[int, int, int]:
         """Returns count, first and last of the topic at a position, without unpacking others."""
-        if not self._is_packed:
-            count, first, last = _NUMBERS.unpack_from(self._numbers, position * _NUMBERS.size)
+        packed = self.data
+        if len(packed) == self.schema.numbers.size:
+            count, first, last = _NUMBERS.unpack_from(packed, position * _NUMBERS.size)
             return count, first, last
-        packed = self._numbers
         at = _BASE.size + position * _TOPIC_BYTES
         begin, end = at + _COUNT_BYTES, at + _COUNT_BYTES + _TIME_BYTES
         (base,) = _BASE.unpack_from(packed)
@@ -270,26 +255,6 @@ class BagSummary:
         first = base + int.from_bytes(packed[begin:end], "little")
         last = base + int.from_bytes(packed[end : end + _TIME_BYTES], "little")
         return count, first, last
-
-    def pack(self) -> None:
-        """Takes about half of the memory from now on, and some microseconds for each look."""
-        self._numbers = self.packed
-
-    @property
-    def packed(self) -> bytes:
-        """The numbers in about half of the bytes, where they fit; `decoded` takes them, too."""
-        numbers = self._unpacked()
-        base = min(numbers[1::3], default=0)
-        parts = [_BASE.pack(base)]
-        try:
-            for at in range(0, len(numbers), 3):
-                count, first, last = numbers[at : at + 3]
-                parts.append(count.to_bytes(_COUNT_BYTES, "little"))
-                parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
-                parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
-        except OverflowError:
-            return self.numbers
-        return b"".join(parts) if numbers else b""
 
     def replaced(
         self,
@@ -313,16 +278,12 @@ class BagSummary:
     @property
     def topics(self) -> tuple[TopicSummary, ...]:
         """Each topic under each of its types, computed again."""
-        return tuple(
-            _topic_of(header, numbers)
-            for header, numbers in zip(
-                self.schema.topics, _NUMBERS.iter_unpack(self.numbers), strict=True
-            )
-        )
+        return tuple(map(self.at, range(len(self.schema.topics))))
 
     def at(self, position: int) -> TopicSummary:
         """Returns the topic at a position of the schema."""
-        return _topic_of(self.schema.topics[position], self._numbers_at(position))
+        topic, type_name, encoding, latched = self.schema.topics[position]
+        return TopicSummary(topic, type_name, encoding, *self._numbers_at(position), latched)
 
     def of(self, topic: str) -> tuple[TopicSummary, ...]:
         """Returns one topic under each of its types."""
@@ -359,7 +320,7 @@ class BagSummary:
     @property
     def count(self) -> int:
         """Messages on all topics."""
-        return sum(self._unpacked()[0::3])
+        return sum(count for count, _, _ in self._numbers())
 
     @property
     def empty(self) -> bool:
@@ -369,29 +330,37 @@ class BagSummary:
     @property
     def start(self) -> Ns:
         """Log time of the earliest message. Only for a bag that is not empty."""
-        return min(self._unpacked()[1::3])
+        return min(first for _, first, _ in self._numbers())
 
     @property
     def end(self) -> Ns:
         """Log time of the latest message (inclusive). Only for a bag that is not empty."""
-        return max(self._unpacked()[2::3])
+        return max(last for _, _, last in self._numbers())
 
-    def _unpacked(self) -> tuple[int, ...]:
-        return self.schema.numbers.unpack(self.numbers)
+    def _numbers(self) -> Iterable[tuple[int, int, int]]:
+        return map(self._numbers_at, range(len(self.schema.topics)))
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, BagSummary):
             return NotImplemented
-        return self.numbers == other.numbers and self.schema == other.schema
+        return self.data == other.data and self.schema == other.schema
 
     def __hash__(self) -> int:
-        return hash((self.schema, self.numbers))
+        return hash((self.schema, self.data))
 
     def __repr__(self) -> str:
         return f"BagSummary(topics={self.topics!r}, schema={self.schema!r})"
 
 
-def _topic_of(header: TopicHeader, numbers: tuple[int, ...]) -> TopicSummary:
-    topic, type_name, encoding, latched = header
-    count, first, last = numbers
-    return TopicSummary(topic, type_name, encoding, count, first, last, latched)
+def _packed(schema: SummarySchema, numbers: Sequence[int]) -> bytes:
+    """Returns count, first and last of each topic in about half of the bytes, where they fit."""
+    base = min(numbers[1::3], default=0)
+    parts = [_BASE.pack(base)] if numbers else []
+    try:
+        for count, first, last in zip(*[iter(numbers)] * 3, strict=True):
+            parts.append(count.to_bytes(_COUNT_BYTES, "little"))
+            parts.append((first - base).to_bytes(_TIME_BYTES, "little"))
+            parts.append((last - base).to_bytes(_TIME_BYTES, "little"))
+    except OverflowError:
+        return schema.numbers.pack(*numbers)
+    return b"".join(parts)

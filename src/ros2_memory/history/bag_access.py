@@ -83,7 +83,7 @@ class BagAccess:
         coverage = self.memory.scanner.coverage(self.snapshot.timeline)
         if coverage is None:
             return ""
-        bags = sum(bag.state is BagState.CLOSED for bag in self.snapshot.timeline.bags)
+        bags = self.snapshot.timeline.closed
         missing = sum(bag.state is BagState.CLOSED for bag in coverage.missing)
         if missing * 100 <= bags:
             return ""

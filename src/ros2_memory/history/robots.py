@@ -435,7 +435,7 @@ def _overlapping_pairs(view: View, topic: str, window: TimeWindow) -> Iterator[P
             # One that a wrong clock dated spans years, mostly without a bag.
             near = view.timeline.segments_in(span.widened(COPY_HORIZON_NS))
             is_there = until <= last or any(
-                str(other) in some.folders and other in some.recordings(topic) for some in near
+                str(other) in some.bags.folders and other in some.recordings(topic) for some in near
             )
             if is_there and window.overlaps(span.start, span.stop - 1):
                 shortest = min(last - first, until - since)

@@ -6,11 +6,9 @@ One bag may lie there in two forms, `x.mcap` and its compressed `x.mcap.zstd`, o
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
-
-import numpy as np
+from typing import TYPE_CHECKING, NamedTuple
 
 from ros2_memory.bag_dir.layout import other_form
 from ros2_memory.bag_dir.state_files import read_superseded
@@ -18,7 +16,8 @@ from ros2_memory.core.errors import BagVanishedError
 from ros2_memory.core.model import COMPRESSED, PLAIN_KINDS
 from ros2_memory.index.copied_files import alike_among, is_copy
 from ros2_memory.index.file_state import Classification, FileNotes, FileState, ScanContext, classify
-from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree, settled
+from ros2_memory.index.scan import BAG_DIR_SETTING, YOUNG_NS, ScanResult, Stamp, Tree
+from ros2_memory.index.segment import Segment
 from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 
@@ -27,18 +26,8 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile, SetAside
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.index.bag_rows import BagRows
     from ros2_memory.storage.base import BagReader
-
-PATROL: Final = 256
-"""Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
-
-Unchanged: TypeAlias = "dict[str, tuple[BagFile, int, Ns]]"
-"""By path, the bag, the inode and the ctime of closed files that do not change any more, or not
-since their columns were stored.
-
-Those are most of a week, so no more is kept of them. Should a file change, the notes on it are made
-as if it had been read, and it is classified again.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,13 +36,13 @@ class KnownBags:
 
     Attributes:
         counted: classifications of files, of all forms and links of a bag only the one that counts.
-            Those in `unchanged` are left out.
         hidden: files whose other form counts.
-        files: notes on all files.
+        files: notes on files. There are neither notes on closed files that do not change any more,
+            or not since their columns were stored, nor classifications of them.
         named: recordings that the last heartbeat names as being written.
         now: when the directory was scanned.
-        saved: all files in saved moments, whether they count there or not.
-        unchanged: closed bags of which only rows are kept; each counts.
+        tree: the stamps of all files.
+        timeline: the bags of all files.
     """
 
     counted: Mapping[str, Classification]
@@ -61,8 +50,13 @@ class KnownBags:
     files: Mapping[str, FileNotes]
     named: Collection[str]
     now: Ns
-    saved: Mapping[str, Stamp] = field(default_factory=dict)
-    unchanged: Unchanged = field(default_factory=dict)
+    tree: Tree
+    timeline: Timeline
+
+    @property
+    def saved(self) -> Mapping[str, Stamp]:
+        """All files in saved moments, whether they count there or not."""
+        return self.tree.saved
 
 
 class TableChange(NamedTuple):
@@ -71,21 +65,24 @@ class TableChange(NamedTuple):
     `is_new`: whether anything has changed, even if no bag. The first scan changes everything.
     """
 
-    removed: list[BagFile]
-    added: list[BagFile]
+    removed: Sequence[BagFile]
+    added: Sequence[BagFile]
     is_new: bool
 
 
 class BagTable:
     """The known files of one bag directory. Not for several threads at once.
 
+    Of closed files that do not change any more, which are most of a week, only their bags and their
+    stamps are kept. Should one change, the notes on it are made as if it had been read, and it is
+    classified again.
+
     Args:
         bag_dir: the directory.
         reader: reads its bags.
-        known: returns those of some paths that are closed files which were read earlier, by path:
-            they are not read again while they are unchanged.
+        known: returns closed files which were read earlier, in order of time: they are not read
+            again while they are unchanged.
         only: the name of the one recording that counts; see `scan.Tree`.
-        packs: whether the summaries of bags that will not change are packed.
         setting: the one that names the directory, for sentences.
     """
 
@@ -94,23 +91,19 @@ class BagTable:
         bag_dir: Path,
         reader: BagReader,
         *,
-        known: Callable[[Iterable[str]], Mapping[str, BagFile]] | None,
+        known: Callable[[], Iterable[BagRows]] = list,
         only: Sequence[str] = (),
-        packs: bool = False,
         setting: str = BAG_DIR_SETTING,
     ) -> None:
-        self._packs = packs
         self._reader = reader
         self._known = known
         self._bag_dir = bag_dir
         self._tree = Tree(bag_dir, only, setting=setting)
-        self._unchanged: Unchanged = {}
         self._files: dict[str, FileNotes] = {}
         self._classified: dict[str, Classification] = {}
         self._counted: dict[str, Classification] = {}
         self._hidden: set[str] = set()
         self._watched: set[str] = set()
-        self._patrol: list[str] = []
         self._scanned: ScanResult | None = None
         self._timeline = Timeline()
         self._compared: dict[tuple[BagFile, BagFile], bool] = {}
@@ -120,25 +113,26 @@ class BagTable:
 
         Where it raises, some of what the scan has found is lost: then a new table is needed.
         """
-        patrol = self._next_patrol() if patrolling else ()
-        scanned = self._tree.scan(context.now, [*self._watched, *patrol])
+        before = self._timeline
+        scanned = self._tree.scan(context.now, self._watched, patrolling=patrolling)
         self._reactivate_changed(scanned, context)
-        is_first = not (self._files or self._unchanged)
-        known = self._known(scanned.stamps) if self._known is not None and is_first else {}
-        unchanged = self._take_known(scanned.stamps, known, context)
+        is_first = not (self._files or self._timeline.segments)
+        known = self._take_known(scanned.stamps, context) if is_first else {}
+        unchanged: list[BagFile] | None = [] if is_first else None
         changed = self._drop(scanned.gone) | self._examine(
-            scanned.stamps, known, context, unchanged if is_first else None
+            scanned.stamps, known, context, unchanged
         )
         hidden_before = frozenset(self._hidden)
         removed, counted = self._update_counted(changed | hidden_before, context)
         changed |= hidden_before - self._hidden
-        added = [*_by_start(unchanged), *counted]
+        added: Sequence[BagFile] = [*(unchanged or ()), *counted]
         self._timeline = self._timeline.changed(removed, added)
-        self._keep_rows_of_settled(context)
-        is_new = bool(changed or unchanged) or not scanned.is_like(self._scanned)
+        self._drop_settled(context)
+        is_new = bool(changed) or self._timeline is not before
+        is_new |= not scanned.is_like(self._scanned)
         # Without the stamps, of which the first scan has one for each file.
-        self._scanned = replace(scanned, stamps={}, gone=set())
-        return TableChange(removed, added, is_new)
+        self._scanned = replace(scanned, stamps={}, before={}, gone=set())
+        return TableChange(removed, self._timeline.bags if is_first else added, is_new)
 
     def snapshot(self, now: Ns) -> Snapshot:
         """Returns what is known since the last scan."""
@@ -181,22 +175,14 @@ class BagTable:
     def _superseded(self) -> Iterable[BagFile]:
         """Returns the bags in whose place thinned days answer."""
         superseded = read_superseded(self._bag_dir)
-        days = {name: self._bag_named(name) for name in superseded.days}
+        days = {str(self._bag_dir / name): name for name in superseded.days}
         whole = {
-            name
-            for name, day in days.items()
-            if day is not None and (day.size, day.mtime_ns) == superseded.days[name]
+            days[day.file]
+            for day in self._timeline.named(days)
+            if (day.size, day.mtime_ns) == superseded.days[days[day.file]]
         }
-        names = (name for name, day in superseded.bags.items() if day in whole)
-        return filter(None, map(self._bag_named, names))
-
-    def _bag_named(self, name: str) -> BagFile | None:
-        """Returns the bag at a path below the bag directory, if that answers."""
-        path = str(self._bag_dir / name)
-        if path in self._unchanged:
-            return self._unchanged[path][0]
-        classification = self._counted.get(path)
-        return None if classification is None else classification.bag
+        names = [name for name, day in superseded.bags.items() if day in whole]
+        return self._timeline.named({str(self._bag_dir / name) for name in names})
 
     def known(self, named: Collection[str], now: Ns) -> KnownBags:
         """Returns what retention considers; `named` are recordings that are being written."""
@@ -206,45 +192,21 @@ class BagTable:
             self._files,
             named,
             now,
-            self._tree.saved,
-            self._unchanged,
+            self._tree,
+            self._timeline,
         )
 
-    def _next_patrol(self) -> list[str]:
-        if not self._patrol:
-            self._patrol = [*self._files, *self._unchanged]
-        following = self._patrol[-PATROL:]
-        del self._patrol[-PATROL:]
-        return [path for path in following if path in self._files or path in self._unchanged]
-
     def _reactivate_changed(self, scanned: ScanResult, context: ScanContext) -> None:
-        """Reactivates files that have gone, changed, or got another form."""
-        if not self._unchanged:
-            return
-        for path, stamp in [*scanned.stamps.items()]:
-            before = self._stamp(path)
-            if before and settled(stamp.mtime_ns, context.now) and stamp == before:
-                del scanned.stamps[path]
-            else:
-                self._reactivate(path, context)
-                self._reactivate(other_form(path), context)
-        for path in scanned.gone:
-            self._reactivate(path, context)
-
-    def _reactivate(self, path: str, context: ScanContext) -> None:
-        """Makes of an unchanged file what would be known had it been read."""
-        stamp = self._stamp(path)
-        if stamp is not None:
-            bag, *_ = self._unchanged.pop(path)
-            notes = self._files[path] = FileNotes.first(path, stamp, context.now)
+        """Notes what is known of files that have gone, changed, or got another form."""
+        new = [path for path in scanned.stamps if path not in self._files]
+        paths = {*new, *map(other_form, new), *scanned.gone} - self._files.keys()
+        for bag in self._timeline.named(paths):
+            path = bag.file
+            before = scanned.before.get(path) or self._tree.stamp(path)
+            notes = self._files[path] = FileNotes.first(path, before, context.now)
             notes.restore(bag.summary)
             classification = Classification(FileState.CLOSED, bag)
             self._classified[path] = self._counted[path] = classification
-
-    def _stamp(self, path: str) -> Stamp | None:
-        """Returns the stamp of an unchanged file; None for any other."""
-        bag, inode, ctime = self._unchanged.get(path, (None, 0, 0))
-        return bag and Stamp(bag.size, bag.mtime_ns, ctime, inode, bag.sidecar_ns)
 
     def _drop(self, paths: Iterable[str]) -> set[str]:
         """Drops the state of files; returns those that were classified."""
@@ -256,13 +218,12 @@ class BagTable:
                 forgotten.add(path)
         return forgotten
 
-    def _keep_rows_of_settled(self, context: ScanContext) -> None:
-        """Keeps no more than a row of bags that will not change."""
+    def _drop_settled(self, context: ScanContext) -> None:
+        """Drops what is known of files that will not change, but for their bags and stamps."""
         for path in [*self._files]:
             classification = self._counted.get(path)
             if classification is not None and self._is_settled(path, classification, context):
-                self._add_unchanged(path, classification)
-                del self._classified[path], self._counted[path]
+                del self._files[path], self._classified[path], self._counted[path]
 
     def _is_settled(self, path: str, classification: Classification, context: ScanContext) -> bool:
         """Returns whether a bag is closed and old, and has no other form or link."""
@@ -279,41 +240,41 @@ class BagTable:
             and other_form(path) not in self._files
         )
 
-    def _add_unchanged(self, path: str, classification: Classification) -> None:
-        if classification.bag is not None:
-            if self._packs:
-                classification.bag.summary.pack()
-            stamp = self._files.pop(path).stamp
-            self._unchanged[path] = classification.bag, stamp.inode, stamp.ctime_ns
-
-    def _take_known(
-        self, stamps: dict[str, Stamp], known: Mapping[str, BagFile], context: ScanContext
-    ) -> list[BagFile]:
-        """Takes those files out of `stamps` that need no look, and returns their bags.
+    def _take_known(self, stamps: dict[str, Stamp], context: ScanContext) -> dict[str, BagFile]:
+        """Takes those files out of `stamps` that need no look, and has the timeline hold them.
 
         They are as they were when they were read, have messages and an end, and are not young.
+        Returns the other ones that are as they were, by path.
         """
-        if not known:
-            return []
         last = context.now - max(context.three_splits, YOUNG_NS)
         kinds = tuple(kind for kind in PLAIN_KINDS if self._reader.reads(Path(f"bag{kind}")))
         compressed = {path for path in stamps if path.endswith(COMPRESSED)}
-        bags = []
-        for path, bag in known.items():
-            stamp = stamps.get(path)
-            if (
-                stamp is not None
-                and stamp.is_of(bag)
-                and stamp.mtime_ns < last
-                and path.endswith(kinds)
-                and (schema := bag.summary.schema).complete
-                and schema.topics
-                and not (compressed and other_form(path) in compressed)
+        others: dict[str, BagFile] = {}
+        segments: list[Segment] = []
+        for bags in self._known():
+            are_whole = bags.with_schema(lambda schema: schema.complete and schema.topics)
+            for row, (path, content) in enumerate(
+                zip(bags.files(), map(tuple, bags.contents.tolist()), strict=True)
             ):
-                self._unchanged[bag.file] = bag, stamp.inode, stamp.ctime_ns
-                bags.append(bag)
-                del stamps[path]
-        return bags
+                stamp = stamps.get(path)
+                if stamp is None or stamp.content != content:
+                    are_whole[row] = False
+                elif (
+                    not are_whole[row]
+                    or stamp.mtime_ns >= last
+                    or not path.endswith(kinds)
+                    or (compressed and other_form(path) in compressed)
+                ):
+                    are_whole[row] = False
+                    others[path] = bags[row]
+                else:
+                    del stamps[path]
+            taken = bags.some(are_whole)
+            if taken is not None:
+                segments.append(Segment(taken))
+        if segments:
+            self._timeline = Timeline(segments)
+        return others
 
     def _examine(
         self,
@@ -336,7 +297,7 @@ class BagTable:
             try:
                 classification = classify(notes, self._reader, context)
             except BagVanishedError:
-                self._tree.distrust(path)
+                self._tree.lose(path)
                 changed |= self._drop([path])
                 continue
             if notes.must_be_watched(classification, context):
@@ -350,7 +311,7 @@ class BagTable:
                 and classification.bag is not None
             ):
                 unchanged.append(classification.bag)
-                self._add_unchanged(path, classification)
+                del self._files[path]
             elif classification != self._classified.get(path):
                 self._classified[path] = classification
                 changed.add(path)
@@ -364,7 +325,7 @@ class BagTable:
         if notes is not None:
             return notes.update(stamp, context.now) or path in self._watched
         notes = self._files[path] = FileNotes.first(path, stamp, context.now)
-        if known is not None and notes.trusted and stamp.is_of(known):
+        if known is not None and notes.trusted:
             notes.restore(known.summary)
         return True
 
@@ -410,9 +371,3 @@ class BagTable:
 
 def _sorted_by_path(asides: Iterable[SetAside]) -> tuple[SetAside, ...]:
     return tuple(sorted(asides, key=lambda aside: aside.path))
-
-
-def _by_start(bags: list[BagFile]) -> list[BagFile]:
-    """Returns bags by start; by numpy, since sorting what is sorted takes no time later."""
-    starts = np.array([bag.start for bag in bags], np.int64)
-    return [bags[row] for row in np.argsort(starts, kind="stable").tolist()]

@@ -17,17 +17,18 @@ from __future__ import annotations
 from bisect import bisect_right
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from itertools import chain, takewhile
+from itertools import takewhile
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from ros2_memory.core.bag_summary import set_back_while_written
 from ros2_memory.core.model import BagFile, TimeWindow
 from ros2_memory.core.timebase import FUTURE_NS, MAX_NS, NS_PER_S, Ns, unix_from_ns
-from ros2_memory.index.segment import Segment, in_time
+from ros2_memory.index.segment import in_time
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Sequence
 
+    from ros2_memory.index.segment import Segment
     from ros2_memory.index.split_order import StepBack
     from ros2_memory.index.timeline import Timeline
 
@@ -149,12 +150,15 @@ def check_dates(
         ClockFault(bag, FaultyClock.AHEAD, bag.end - now)
         for segment in segments
         if segment.latest > limit
-        for bag in segment.bags
-        if bag.end > limit
+        for bag in segment.bags.at(segment.bags.ends > limit)
     ]
-    recorded = chain.from_iterable(segment.bags for segment in segments)
-    first = takewhile(lambda bag: bag.start < FIRST_BAGS_NS, recorded)
-    unset = [ClockFault(bag, FaultyClock.UNSET) for bag in first if bag.end <= limit]
+    unset = [
+        ClockFault(bag, FaultyClock.UNSET)
+        for segment in takewhile(lambda segment: segment.first[0] < FIRST_BAGS_NS, segments)
+        for bag in segment.bags.at(
+            (segment.bags.starts < FIRST_BAGS_NS) & (segment.bags.ends <= limit)
+        )
+    ]
     bags = sum(len(segment.bags) for segment in segments)
     note: str | None = None
     if len(ahead) == bags and bags:
@@ -170,7 +174,7 @@ def check_dates(
     dated = dated_segments(segments, dating.faults)
     return replace(
         dating,
-        earliest=dated[0].bags[0].start if dated else None,
+        earliest=dated[0].first[0] if dated else None,
         latest=max((segment.latest for segment in dated), default=None),
     )
 
@@ -208,13 +212,13 @@ def dated_segments(segments: Sequence[Segment], faults: Sequence[ClockFault]) ->
     firsts, files = [segment.first for segment in segments], {bag.file for bag in misdated}
     # Of the others, what they remember serves the next snapshot.
     touched = {bisect_right(firsts, in_time(bag)) - 1 for bag in misdated}
-    dated: list[Segment] = []
-    for nth, segment in enumerate(segments):
-        if nth not in touched:
-            dated.append(segment)
-        elif bags := [bag for bag in segment.bags if bag.file not in files]:
-            dated.append(Segment(bags))
-    return dated
+    dated = (
+        segment.without(file in files for file in segment.bags.files())
+        if nth in touched
+        else segment
+        for nth, segment in enumerate(segments)
+    )
+    return [*filter(None, dated)]
 
 
 def _seconds(at: Ns) -> str:

@@ -6,6 +6,7 @@ One of them counts. Messages of one folder are no copies of each other, so all w
 from __future__ import annotations
 
 import os
+from itertools import chain
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,8 +27,10 @@ def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
     """Yields bags with the folder, size and summary of one with a shorter name, behind that one."""
     starts = timeline.starts
     is_same = starts[1:] == starts[:-1]
-    rows = np.flatnonzero(np.append(is_same, False) | np.append(False, is_same))
-    suspects = [timeline.bags[row] for row in rows.tolist()]
+    are_suspects = np.append(is_same, False) | np.append(False, is_same)
+    edges = np.cumsum([len(segment.bags) for segment in timeline.segments])
+    of_segments = zip(timeline.segments, np.split(are_suspects, edges), strict=False)
+    suspects = chain.from_iterable(segment.bags.at(rows) for segment, rows in of_segments)
     originals: dict[tuple[str, int, int, int], BagFile] = {}
     for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
         original = originals.setdefault((folder_of(bag), bag.size, bag.start, bag.end), bag)

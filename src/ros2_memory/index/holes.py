@@ -11,14 +11,18 @@ from __future__ import annotations
 from itertools import chain
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.bag_dir.layout import is_thinned
-from ros2_memory.core.timebase import NS_PER_S, Ns
+from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
+from ros2_memory.core.timebase import MAX_NS, NS_PER_S, Ns
 from ros2_memory.index.split_order import split_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Iterator, Mapping
 
     from ros2_memory.core.model import BagFile
+    from ros2_memory.index.bag_rows import BagRows
 
 SHORTEST_GAP_NS: Final[Ns] = NS_PER_S
 """Between two recordings, where topics are frequent."""
@@ -46,6 +50,13 @@ class Pause(NamedTuple):
     def length(self) -> Ns:
         """How long it is, ns."""
         return self.end - self.start
+
+
+def pauses_between(bags: BagRows) -> Iterator[Pause]:
+    """Yields the pauses between bags, which are in order of time and may overlap."""
+    reach = np.minimum(np.maximum.accumulate(bags.ends), MAX_NS - SHORTEST_PAUSE_NS)
+    for row in np.flatnonzero(bags.starts[1:] > reach[:-1] + SHORTEST_PAUSE_NS).tolist():
+        yield pause_between(bags[int(bags.ends[: row + 1].argmax())], bags[row + 1])
 
 
 def pause_between(before: BagFile, after: BagFile) -> Pause:

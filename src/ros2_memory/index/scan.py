@@ -13,6 +13,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import numpy as np
+
 from ros2_memory.bag_dir.layout import (
     HANDOVER_FILE,
     LOST_AND_FOUND,
@@ -20,13 +22,18 @@ from ros2_memory.bag_dir.layout import (
     MOMENTS_FOLDER,
     bag_kind,
 )
-from ros2_memory.core.model import BagFile, SetAside
+from ros2_memory.core.model import SetAside
 from ros2_memory.core.timebase import NS_PER_S, Ns
 from ros2_memory.index.recordings import paths_named
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
+    from numpy.typing import NDArray
+
+
+PATROL: Final = 256
+"""Closed files checked in each scan, in turn: one overwritten in place changes no directory."""
 
 YOUNG_NS: Final[Ns] = 2 * NS_PER_S
 """Two changes within one tick of the file system share an mtime: a young one proves nothing."""
@@ -71,13 +78,10 @@ class Stamp(NamedTuple):
         """What changes when other messages count: size, mtime and mtime of the sidecar."""
         return self.size, self.mtime_ns, self.sidecar_ns
 
-    def is_of(self, bag: BagFile) -> bool:
-        """Returns whether a bag is as it was when it was read."""
-        return (
-            self.mtime_ns == bag.mtime_ns
-            and self.size == bag.size
-            and self.sidecar_ns == bag.sidecar_ns
-        )
+
+_UNSEEN: Final = Stamp(-1, 0, 0, 0)
+_ROW: Final = np.dtype([("size", "i8"), ("mtime", "i8"), ("ctime", "i8"), ("inode", "u8")])
+"""The stamp of a file in a directory, whose sidecar is that of all."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +89,9 @@ class ScanResult:
     """What one scan found. Paths are strings, as `os.scandir` gives them: there are so many.
 
     Attributes:
-        stamps: every bag file of the directories that were listed, and the watched files.
+        stamps: the bag files that are new, have changed, or may change without a trace; and the
+            watched ones.
+        before: how those were when they were last looked at, and those that are gone.
         gone: the files that are not known any more.
         damaged: directories that cannot be listed, and bag names that are no files; in no order.
         links: symbolic links; in no order.
@@ -95,6 +101,7 @@ class ScanResult:
     """
 
     stamps: dict[str, Stamp] = field(default_factory=dict)
+    before: dict[str, Stamp] = field(default_factory=dict)
     gone: set[str] = field(default_factory=set)
     damaged: list[SetAside] = field(default_factory=list)
     links: list[SetAside] = field(default_factory=list)
@@ -111,24 +118,48 @@ class ScanResult:
 
 @dataclass(slots=True)
 class _Folder:
-    """A directory as it was last listed. `linked` are inodes of files with several hard links."""
+    """A directory as it was last listed: of its bags, the names and their stamps, one by one.
 
+    Attributes:
+        linked: inodes of files with several hard links.
+        newer: stamps of bags that were looked at since, by path.
+    """
+
+    path: str
     mtime_ns: Ns
     trusted: bool
     device: int = 0
     folders: list[str] = field(default_factory=list)
-    files: list[str] = field(default_factory=list)
-    inodes: list[int] = field(default_factory=list)
-    linked: set[int] = field(default_factory=set)
+    names: str = ""
+    rows: NDArray[np.void] = field(default_factory=lambda: np.empty(0, _ROW))
+    linked: frozenset[int] = frozenset()
+    newer: dict[str, Stamp] = field(default_factory=dict)
     links: list[Path] = field(default_factory=list)
     odd: list[SetAside] = field(default_factory=list)
     sidecar_ns: Ns = 0
     has_metadata: bool = False
 
-    def find_sidecar(self, path: str) -> None:
+    @property
+    def stamps(self) -> dict[str, Stamp]:
+        """Of all bags, by path."""
+        if not self.names:
+            return self.newer
+        paths = (f"{self.path.rstrip('/')}/{name}" for name in self.names.split("/"))
+        rows = (
+            Stamp(size, mtime, ctime, inode, self.sidecar_ns)
+            for size, mtime, ctime, inode in self.rows.tolist()
+        )
+        return dict(zip(paths, rows, strict=True)) | self.newer
+
+    def keep(self, stamps: dict[str, Stamp]) -> None:
+        """Has the directory hold these bags."""
+        self.names = "/".join([path.rpartition("/")[2] for path in stamps])
+        self.rows = np.array([stamp[:-1] for stamp in stamps.values()], _ROW)
+
+    def find_sidecar(self) -> None:
         """Looks up the `handover.json` in the directory."""
         try:
-            status = os.lstat(f"{path}/{HANDOVER_FILE}")
+            status = os.lstat(f"{self.path}/{HANDOVER_FILE}")
         except FileNotFoundError:
             return
         except OSError:
@@ -136,12 +167,17 @@ class _Folder:
             return
         self.sidecar_ns = 0 if stat.S_ISLNK(status.st_mode) else status.st_mtime_ns
 
-    def enter(self, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
-        """Adds what the directory has under a name."""
+    def enter(
+        self, entry: os.DirEntry[str], stamps: dict[str, Stamp], before: Mapping[str, Stamp]
+    ) -> None:
+        """Adds what the directory has under a name: of a bag, its stamp to `stamps`.
+
+        Of one that cannot be looked at that is the one from `before`.
+        """
         kind = bag_kind(entry.name)
         # Nearly all entries are bags: they are checked first.
         if kind and entry.is_file(follow_symlinks=False):
-            self._enter_bag(entry, stamps)
+            self._enter_bag(entry, stamps, before)
         elif entry.is_symlink():
             if not entry.name.startswith("."):
                 self.links.append(Path(entry.path))
@@ -153,8 +189,9 @@ class _Folder:
         elif kind:
             self.odd.append(SetAside(Path(entry.path), "not a regular file"))
 
-    def _enter_bag(self, entry: os.DirEntry[str], stamps: dict[str, Stamp]) -> None:
-        inode = 0
+    def _enter_bag(
+        self, entry: os.DirEntry[str], stamps: dict[str, Stamp], before: Mapping[str, Stamp]
+    ) -> None:
         try:
             status = entry.stat(follow_symlinks=False)
         except FileNotFoundError:
@@ -164,13 +201,11 @@ class _Folder:
             self.odd.append(SetAside(Path(entry.path), reason))
             # A known file is not gone because of that.
             self.trusted = False
+            stamps[entry.path] = before.get(entry.path, _UNSEEN)
         else:
-            inode = status.st_ino
             stamps[entry.path] = Stamp.of(status, self.sidecar_ns)
             if status.st_nlink > 1:
-                self.linked.add(inode)
-        self.files.append(entry.path)
-        self.inodes.append(inode)
+                self.linked |= {status.st_ino}
 
 
 class Tree:
@@ -202,13 +237,16 @@ class Tree:
         self._device: int | None = None  # of the disk that bags were last found on
         self._moments = f"{self._root.rstrip('/')}/{MOMENTS_FOLDER}/"
         self._second_links: set[str] = set()
+        self._unpatrolled: list[str] = []
+        self._patrol: list[str] = []
         self.saved: dict[str, Stamp] = {}
 
-    def scan(self, now: Ns, watched: Iterable[str]) -> ScanResult:
+    def scan(self, now: Ns, watched: Iterable[str], *, patrolling: bool = False) -> ScanResult:
         """Returns what is new, changed or gone since the last scan, and the `watched` files.
 
-        `now` decides which mtimes are too young to be trusted. Raises nothing: a directory that
-        cannot be listed is part of the result, and its known files count as being there.
+        `now` decides which mtimes are too young to be trusted; `patrolling` also looks at some
+        files of directories that did not change. Raises nothing: a directory that cannot be listed
+        is part of the result, and its known files count as being there.
         """
         before, self._folders = self._folders, {}
         result = ScanResult()
@@ -221,7 +259,7 @@ class Tree:
         if (
             problem is None
             and self._only
-            and not any(folder.files or folder.odd for folder in folders)
+            and not any(folder.names or folder.odd for folder in folders)
         ):
             problem = f"no bag is named {self._only[-1]} (data.recording)"
         if problem is not None:
@@ -230,9 +268,14 @@ class Tree:
         for path, folder in before.items():
             after = self._folders.get(path)
             if after is not folder:
-                result.gone.update(set(folder.files).difference(after.files if after else ()))
+                there = {} if after is None else after.stamps
+                gone = {file: stamp for file, stamp in folder.stamps.items() if file not in there}
+                result.before.update(gone)
+                result.gone.update(gone)
         for file in watched:
             self._look_up(file, result)
+        for file in self._next_patrol() if patrolling else ():
+            self._look_up(file, result, settled_at=now)
         for file in result.gone & self.saved.keys():
             del self.saved[file]
         moments = self._moments
@@ -260,23 +303,48 @@ class Tree:
         # A folder that was listed before a file got its second link does not show that.
         linked = {inode for folder in self._folders.values() for inode in folder.linked}
         links: dict[tuple[int, int], list[str]] = {}
-        for folder in self._folders.values():
-            if linked.isdisjoint(folder.inodes):
+        for folder in self._folders.values() if linked else ():
+            if linked.isdisjoint(folder.rows["inode"].tolist()):
                 continue
-            for path, inode in zip(folder.files, folder.inodes, strict=True):
-                if inode in linked:
-                    links.setdefault((folder.device, inode), []).append(path)
+            for path, stamp in folder.stamps.items():
+                if stamp.inode in linked:
+                    links.setdefault((folder.device, stamp.inode), []).append(path)
         second: set[str] = set()
         for paths in links.values():
             paths.sort(key=lambda path: (path.startswith(self._moments), path.count("/"), path))
             second.update(paths[1:])
         return second
 
-    def distrust(self, path: str) -> None:
-        """Has the folder of a file listed again in the next scan, whatever its mtime."""
+    @property
+    def stamps(self) -> Iterator[tuple[str, Stamp]]:
+        """The path and the stamp of each file that a scan returned, but for second links."""
+        for folder in self._folders.values():
+            for path, stamp in folder.stamps.items():
+                if path not in self._second_links:
+                    yield path, stamp
+
+    def stamp(self, path: str) -> Stamp:
+        """Returns the stamp of a file that a scan returned."""
+        folder = self._folders.get(_folder_of(path))
+        return _UNSEEN if folder is None else folder.stamps.get(path, _UNSEEN)
+
+    def lose(self, path: str) -> None:
+        """Has the next scan return a file if it is there, whatever the mtime of its folder."""
         folder = self._folders.get(_folder_of(path))
         if folder is not None:
+            folder.newer[path] = _UNSEEN
             folder.trusted = False
+
+    def _next_patrol(self) -> list[str]:
+        """Returns the next known files, in turn."""
+        if not self._patrol:
+            self._unpatrolled = self._unpatrolled or [*self._folders]
+            while self._unpatrolled and len(self._patrol) < PATROL:
+                folder = self._folders.get(self._unpatrolled.pop())
+                self._patrol += () if folder is None else folder.stamps
+        following = self._patrol[-PATROL:]
+        del self._patrol[-PATROL:]
+        return following
 
     def _unmounted(self) -> str | None:
         """Returns what is wrong where the root is on another disk than bags were, and has none.
@@ -284,7 +352,7 @@ class Tree:
         A mount point looks like this when its disk has been unmounted.
         """
         device = self._folders[self._root].device
-        if any(folder.files for folder in self._folders.values()):
+        if any(folder.names for folder in self._folders.values()):
             self._device = device
         return None if self._device in {None, device} else _OTHER_DISK
 
@@ -304,7 +372,7 @@ class Tree:
         while waiting:
             path = waiting.pop()
             try:
-                folder = self._visit(path, before.get(path), now, result.stamps)
+                folder = self._visit(path, before.get(path), now, result)
             except OSError as error:
                 if path == self._root:
                     return error
@@ -329,9 +397,7 @@ class Tree:
             )
         return None
 
-    def _visit(
-        self, path: str, known: _Folder | None, now: Ns, stamps: dict[str, Stamp]
-    ) -> _Folder:
+    def _visit(self, path: str, known: _Folder | None, now: Ns, result: ScanResult) -> _Folder:
         """Returns the folder as it is known if nothing came or went, else as it is listed now.
 
         Its mtime is read first: what changes during the listing is then found by the next scan.
@@ -343,28 +409,43 @@ class Tree:
         mtime_ns, device = status.st_mtime_ns, status.st_dev
         if known and known.trusted and (known.mtime_ns, known.device) == (mtime_ns, device):
             return known
-        folder = _Folder(mtime_ns, trusted=settled(mtime_ns, now), device=device)
-        folder.find_sidecar(path)
+        folder = _Folder(path, mtime_ns, trusted=settled(mtime_ns, now), device=device)
+        folder.find_sidecar()
+        before, stamps = {} if known is None else known.stamps, dict[str, Stamp]()
         with os.scandir(path) as entries:
             for entry in entries:
                 if not self._named or all(
                     is_inside(entry.path) or path.startswith(f"{entry.path}/")
                     for path, is_inside in self._named
                 ):
-                    folder.enter(entry, stamps)
+                    folder.enter(entry, stamps, before)
+        folder.keep(stamps)
+        for file, stamp in stamps.items():
+            known_stamp = before.get(file, _UNSEEN)
+            is_looked_at = stamp is not known_stamp
+            if is_looked_at and (stamp != known_stamp or not settled(stamp.mtime_ns, now)):
+                result.stamps[file], result.before[file] = stamp, known_stamp
         return folder
 
-    def _look_up(self, path: str, result: ScanResult) -> None:
+    def _look_up(self, path: str, result: ScanResult, settled_at: Ns | None = None) -> None:
         if path in result.stamps or path in result.gone:
             return
-        folder = self._folders.get(_folder_of(path))
+        folder, before = self._folders.get(_folder_of(path)), self.stamp(path)
         try:
-            result.stamps[path] = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
+            stamp = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
         except OSError as error:
             # Its folder looks unchanged, and may soon look the same with the file back in it.
             if _is_gone(error):
                 result.gone.add(path)
-            self.distrust(path)
+                result.before[path] = before
+                self.lose(path)
+            elif folder is not None:
+                folder.trusted = False
+            return
+        if settled_at is None or stamp != before or not settled(stamp.mtime_ns, settled_at):
+            result.stamps[path], result.before[path] = stamp, before
+            if folder is not None and stamp != before:
+                folder.newer[path] = stamp
 
 
 def _is_gone(error: OSError) -> bool:

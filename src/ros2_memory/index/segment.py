@@ -16,11 +16,11 @@ import numpy as np
 
 from ros2_memory.analysis.silences import SHORTEST_NS, Pacing, Spacing
 from ros2_memory.bag_dir.layout import CARRY_FOLDER, MEMORY_FOLDER, is_carried, is_thinned
-from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, joined_numbers, numbers_of
+from ros2_memory.core.bag_summary import SummarySchema, TopicHeader, numbers_of
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
-from ros2_memory.core.pauses import SHORTEST_PAUSE_NS
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
-from ros2_memory.index.holes import Pause, pause_between
+from ros2_memory.index.bag_rows import BagRows
+from ros2_memory.index.holes import Pause, pauses_between
 from ros2_memory.index.split_order import (
     Series,
     SplitNames,
@@ -32,7 +32,7 @@ from ros2_memory.index.split_order import (
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -137,29 +137,23 @@ def in_time(bag: BagFile) -> tuple[Ns, Ns, str]:
 class Segment:
     """Some consecutive bags of a timeline; never without any."""
 
-    def __init__(self, bags: Sequence[BagFile]) -> None:
-        self.bags = tuple(bags)
+    def __init__(self, bags: Iterable[BagFile] | BagRows) -> None:
+        self.bags = bags if isinstance(bags, BagRows) else BagRows(bags)
         self.first = in_time(self.bags[0])
-
-    @cached_property
-    def starts(self) -> NDArray[np.int64]:
-        """Log time of the first message in each bag."""
-        return np.fromiter(map(attrgetter("start"), self.bags), np.int64)
-
-    @cached_property
-    def ends(self) -> NDArray[np.int64]:
-        """Log time of the last message in each bag."""
-        return np.fromiter(map(attrgetter("end"), self.bags), np.int64)
 
     @cached_property
     def latest(self) -> Ns:
         """Log time of the last message in any of the bags."""
-        return int(self.ends.max())
+        return int(self.bags.ends.max())
+
+    @cached_property
+    def newest(self) -> BagFile:
+        """The bag that ends last."""
+        return self.bags[int(self.bags.ends.argmax())]
 
     def overlapping(self, window: TimeWindow) -> list[BagFile]:
         """Returns the bags whose span overlaps a window, in order."""
-        is_inside = (self.starts < window.stop) & (self.ends >= window.start)
-        return [self.bags[row] for row in np.flatnonzero(is_inside).tolist()]
+        return [*self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))]
 
     @cached_property
     def recorded(self) -> Segment | None:
@@ -173,53 +167,40 @@ class Segment:
 
     def _without(self, is_left_out: Callable[[str], bool], name: str) -> Segment | None:
         """Returns the bags but for some that lie in a folder of a name, if they are there."""
-        if not any(f"/{folder}".endswith(f"/{name}") for folder in self.folders):
+        if not any(f"/{folder}".endswith(f"/{name}") for folder in self.bags.folders):
             return self
-        rest = [bag for bag in self.bags if not is_left_out(bag.file)]
-        if len(rest) == len(self.bags):
-            return self
-        return Segment(rest) if rest else None
+        return self.without(map(is_left_out, self.bags.files()))
+
+    def without(self, are_left_out: Iterable[bool]) -> Segment | None:
+        """Returns the bags but for some: itself where that are all; None where none is left."""
+        rest = self.bags.some(~np.fromiter(are_left_out, np.bool_, len(self.bags)))
+        if rest is self.bags:
+            return self  # what it remembers serves the next timeline
+        return None if rest is None else Segment(rest)
 
     @cached_property
     def disk_use(self) -> tuple[int, int]:
         """The bytes of the bags, and how many of them a crash left open."""
-        left_open = [bag.state is BagState.INCOMPLETE for bag in self.bags]
-        return sum([bag.size for bag in self.bags]), sum(left_open)
-
-    @cached_property
-    def numbered_folders(self) -> tuple[list[str], NDArray[np.uint16]]:
-        """The folders of the bags, and for each bag the position of its folder among them."""
-        series, positions, _ = self.split_names
-        number_of: dict[str, int] = {}
-        folders = [path[: path.rfind("/")] for path in series]
-        numbers = [number_of.setdefault(folder, len(number_of)) for folder in folders]
-        return [*number_of], np.array(numbers, np.uint16)[positions]
+        left_open = self.bags.are(BagState.INCOMPLETE)
+        return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
     def split_names(self) -> SplitNames:
         """What the names of the bags say."""
-        return split_names_of(self.bags)
-
-    @cached_property
-    def folders(self) -> frozenset[str]:
-        """The folders of the bags."""
-        folders, _ = self.numbered_folders
-        return frozenset(folders)
+        return split_names_of(self.bags.files())
 
     @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
-        folders, _ = self.numbered_folders
         _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
-        return dict(zip(folders, zip(firsts, lasts, strict=True), strict=True))
+        return dict(zip(self.bags.folders, zip(firsts, lasts, strict=True), strict=True))
 
     @cached_property
     def tallies(self) -> dict[str, Tally]:
         """By folder, the tally of the bags in it."""
-        folders, numbers = self.numbered_folders
         messages = self._by_folder[:, :, 0].sum(axis=0)
-        rows = zip(np.bincount(numbers).tolist(), messages.tolist(), strict=True)
-        return {folder: Tally(*row) for folder, row in zip(folders, rows, strict=True)}
+        rows = zip(np.bincount(self.bags.folder_of).tolist(), messages.tolist(), strict=True)
+        return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
 
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
@@ -229,14 +210,9 @@ class Segment:
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
         """The bags that are not readable as a whole, or that contradict themselves."""
-        odd = {id(schema) for schema in self.schemas if schema.remarks}
-        if not odd and BagState.INCOMPLETE not in map(attrgetter("state"), self.bags):
-            return ()
-        return tuple(
-            bag
-            for bag in self.bags
-            if id(bag.summary.schema) in odd or bag.state is BagState.INCOMPLETE
-        )
+        bags = self.bags
+        has_remarks = bags.with_schema(attrgetter("remarks"))
+        return tuple(bags.at(has_remarks | bags.are(BagState.INCOMPLETE)))
 
     @cached_property
     def set_back(self) -> tuple[StepBack, ...]:
@@ -250,33 +226,16 @@ class Segment:
     @cached_property
     def schemas(self) -> tuple[SummarySchema, ...]:
         """The different schemas of the summaries; mostly one."""
-        schemas = [*map(attrgetter("summary.schema"), self.bags)]
-        return tuple(dict(zip(map(id, schemas), schemas, strict=True)).values())
-
-    @cached_property
-    def _joined(self) -> list[tuple[SummarySchema, NDArray[np.uint16], bytes]]:
-        """The schemas, the positions of the bags of each, and the numbers of these, joined."""
-        summaries = [*map(attrgetter("summary"), self.bags)]
-        ids = np.fromiter(map(id, map(attrgetter("schema"), summaries)), np.int64)
-        rows = [np.flatnonzero(ids == id(schema)) for schema in self.schemas]
-        return [
-            (
-                schema,
-                bags.astype(np.uint16),
-                joined_numbers([summaries[nth] for nth in bags.tolist()]),
-            )
-            for schema, bags in zip(self.schemas, rows, strict=True)
-        ]
+        return tuple({id(alike.schema): alike.schema for alike in self.bags.summaries}.values())
 
     @cached_property
     def _headers(self) -> tuple[TopicHeader, ...]:
         """All topics, each type of one by itself."""
         return tuple(dict.fromkeys(chain.from_iterable(schema.topics for schema in self.schemas)))
 
-    def _bags_with(self, name: str) -> list[BagFile]:
-        """Returns the bags of whose schemas an attribute is not empty: mostly none."""
-        odd = {id(schema) for schema in self.schemas if getattr(schema, name)}
-        return [bag for bag in self.bags if id(bag.summary.schema) in odd] if odd else []
+    def _bags_with(self, name: str) -> Iterator[BagFile]:
+        """Yields the bags of whose schemas an attribute is not empty: mostly none."""
+        return self.bags.at(self.bags.with_schema(attrgetter(name)))
 
     @cached_property
     def totals(self) -> dict[str, dict[str, TopicTotals]]:
@@ -312,18 +271,16 @@ class Segment:
     @cached_property
     def _by_folder(self) -> NDArray[np.int64]:
         """Count, first and last by topic of one type, and folder."""
-        folders, numbers = self.numbered_folders
-        numbers = numbers[self._order]
+        numbers = self.bags.folder_of[self._order]
         order = np.argsort(numbers, kind="stable")
-        begins = np.searchsorted(numbers[order], np.arange(len(folders)))
+        begins = np.searchsorted(numbers[order], np.arange(len(self.bags.folders)))
         return _added(self._numbers(self._headers)[:, order], begins, axis=1)
 
     @cached_property
     def _recording_paths(self) -> list[Path]:
-        """The recordings of the bags, in the order in which their folders are numbered."""
+        """The recordings of the bags, in the order of their folders."""
         # A path for each bag of a week would take longer than all else.
-        folders, _ = self.numbered_folders
-        return [Path(folder or "/") for folder in folders]
+        return [Path(folder or "/") for folder in self.bags.folders]
 
     def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
         """Yields the bags that hold the topic in a window, in order, once for each type."""
@@ -331,9 +288,8 @@ class Segment:
         if column is None:
             return
         is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
-        bags, firsts, lasts, _ = (values[is_inside].tolist() for values in column)
-        for row, first, last in zip(bags, firsts, lasts, strict=True):
-            yield TopicExtent(self.bags[row], first, last)
+        rows, firsts, lasts, _ = (values[is_inside] for values in column)
+        yield from map(TopicExtent, self.bags.at(rows), firsts.tolist(), lasts.tolist())
 
     def column(self, topic: str) -> TopicColumn | None:
         """Returns what the bags hold of a topic; None where nothing."""
@@ -348,11 +304,11 @@ class Segment:
     def _numbers(self, headers: Sequence[TopicHeader]) -> NDArray[np.int64]:
         """Returns count, first and last by topic of one type, and bag; `_NONE` without messages.
 
-        The bags are in the order of `_joined`.
+        The bags are in the order of `_order`.
         """
         numbers = np.empty((len(headers), len(self.bags), 3), np.int64)
         end = 0
-        for schema, bags, joined in self._joined:
+        for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
             at = {header: position for position, header in enumerate(schema.topics)}
             rows = [row for row, header in enumerate(headers) if header in at]
@@ -364,8 +320,8 @@ class Segment:
 
     @cached_property
     def _order(self) -> NDArray[np.uint16]:
-        """The positions of the bags in the order of `_joined`."""
-        return np.concatenate([bags for _, bags, _ in self._joined])
+        """The positions of the bags as `_numbers` has them."""
+        return np.concatenate([alike.rows for alike in self.bags.summaries])
 
     @cached_property
     def types(self) -> dict[str, frozenset[str]]:
@@ -409,11 +365,11 @@ class Segment:
         if len(headers) > len(topics):
             names = [header.topic for header in headers]
             numbers = _added(numbers, [*map(names.index, topics)], axis=0)
-        lengths = (numbers[:, :, 0] > 0) @ (self.ends - self.starts)[self._order]
+        lengths = (numbers[:, :, 0] > 0) @ (self.bags.ends - self.bags.starts)[self._order]
         parts: list[tuple[int, tuple[int, Ns, Ns]]] = []
-        order = self._order.tolist() if self._bags_with("absences") else ()
-        for row, bag in enumerate(map(self.bags.__getitem__, order)):
-            for topic, pauses in bag.summary.schema.absences:
+        has_absences = self.bags.with_schema(attrgetter("absences"))[self._order]
+        for row in np.flatnonzero(has_absences).tolist():
+            for topic, pauses in self.bags[int(self._order[row])].summary.schema.absences:
                 nth = topics.index(topic)
                 count, _, last = numbers[nth, row].tolist()
                 for start, end, sent in reversed(pauses):
@@ -437,14 +393,7 @@ class Segment:
     @cached_property
     def pauses(self) -> tuple[Pause, ...]:
         """The pauses between the bags."""
-        ends = self.ends
-        later = np.flatnonzero(
-            self.starts[1:] - np.maximum.accumulate(ends)[:-1] > SHORTEST_PAUSE_NS
-        )
-        return tuple(
-            pause_between(self.bags[int(ends[: nth + 1].argmax())], self.bags[nth + 1])
-            for nth in later.tolist()
-        )
+        return tuple(pauses_between(self.bags))
 
     @cached_property
     def pauses_within(self) -> tuple[Pause, ...]:

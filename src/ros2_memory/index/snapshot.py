@@ -78,7 +78,7 @@ class Snapshot:
     older: Ns | None = None
 
     @property
-    def bags(self) -> tuple[BagFile, ...]:
+    def bags(self) -> Sequence[BagFile]:
         """What answers queries: bags that are closed, or left open by a crash, and not empty.
 
         In the order (start, end, path). The bag of carried latched messages is not among them, but
@@ -177,9 +177,10 @@ class Snapshot:
         """First log time after the newest gap of more than `LONGEST_OFF_NS`; None without a bag."""
         begin = reach = None
         for segment in self._dated_segments:
-            spans = [(segment.bags[0].start, segment.latest)]
-            if segment.latest - segment.bags[0].start > LONGEST_OFF_NS:
-                spans = [(bag.start, bag.end) for bag in segment.bags]
+            bags, (first, *_) = segment.bags, segment.first
+            spans = [(first, segment.latest)]
+            if segment.latest - first > LONGEST_OFF_NS:
+                spans = [*zip(bags.starts.tolist(), bags.ends.tolist(), strict=True)]
             for start, end in spans:
                 if reach is None or start - reach > LONGEST_OFF_NS:
                     begin = start
@@ -237,8 +238,8 @@ class Snapshot:
                 pauses += segment.pauses
             for pause in segment.pauses_within:
                 pauses += self._shared_parts(pause)
-            last = segment.bags[int(segment.ends.argmax())]
-            newest = last if newest is None or last.end > newest.end else newest
+            if newest is None or segment.latest > newest.end:
+                newest = segment.newest
         return sorted(pauses, key=lambda pause: (pause.start, pause.end))
 
     def _shared_parts(self, pause: Pause) -> Iterator[Pause]:
@@ -301,5 +302,5 @@ class Snapshot:
 
     def _neighbours(self, aside: SetAside) -> Neighbours:
         folder = str(aside.path.parent)
-        segments = (segment for segment in self.timeline.segments if folder in segment.folders)
+        segments = (segment for segment in self.timeline.segments if folder in segment.bags.folders)
         return neighbours(str(aside.path), segments)

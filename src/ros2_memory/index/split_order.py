@@ -101,18 +101,18 @@ def split_of(file: str) -> SplitName | None:
     return None if series == stem else SplitName(series, int(stem[len(series) :]))
 
 
-def split_names_of(bags: Iterable[BagFile]) -> SplitNames:
-    """Returns what the names of bags say."""
+def split_names_of(files: Iterable[str]) -> SplitNames:
+    """Returns what the names of bags say, which are paths."""
     position_of: dict[Series, int] = {}
     rows: list[tuple[int, int]] = []
     following, position, series, number, suffix = "", 0, "", 0, ""
-    for bag in bags:
+    for file in files:
         # Mostly the bag after one is the next split.
-        if bag.file == following:
+        if file == following:
             number += 1
         else:
-            series, number = split_of(bag.file) or (bag.file, -1)
-            suffix = bag.file[len(stem_of(bag.file)) :]
+            series, number = split_of(file) or (file, -1)
+            suffix = file[len(stem_of(file)) :]
             position = position_of.setdefault(series, len(position_of))
         rows.append((position, number))
         following = f"{series}{number + 1}{suffix}"
@@ -136,7 +136,7 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
     order = np.lexsort((numbers, positions))
     order = order[numbers[order] >= 0]
     # Few splits begin before the one before them has ended.
-    late = np.flatnonzero(segment.ends[order[:-1]] > segment.starts[order[1:]])
+    late = np.flatnonzero(bags.ends[order[:-1]] > bags.starts[order[1:]])
     edges = np.searchsorted(positions[order], np.arange(len(all_series) + 1))
     late_edges = np.searchsorted(late, edges).tolist()
 
@@ -147,7 +147,7 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
 
     def split(series: Series, at: int) -> Split:
         row = order[at]
-        bag, number = bags[row], int(numbers[row])
+        bag, number = bags[int(row)], int(numbers[row])
         return Split(int(stem_of(bag.file).removeprefix(series)) if are_ranks else number, bag)
 
     ranges: dict[Series, SplitRange] = {}

@@ -19,6 +19,7 @@ from ros2_memory.core.memo import Memo
 from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.spans import COPY_HORIZON_NS, Spans, overlap_spans, united, without
 from ros2_memory.core.timebase import MIN_NS, NS_PER_S, Ns
+from ros2_memory.index.bag_rows import Bags
 from ros2_memory.index.segment import (
     Pace,
     Segment,
@@ -33,7 +34,7 @@ from ros2_memory.index.segment import (
 from ros2_memory.index.unreadable_span import MAX_FILE_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Collection, Iterable, Iterator, Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -95,6 +96,15 @@ class Timeline:
         """For each segment the latest log time in it and all before it: ascending."""
         return list(accumulate((segment.latest for segment in self.segments), max))
 
+    def named(self, files: Collection[str]) -> list[BagFile]:
+        """Returns the bags of these paths that are in it."""
+        folders, found = {file.rpartition("/")[0] for file in files}, list[BagFile]()
+        for segment in self.segments:
+            if not folders.isdisjoint(segment.bags.folders):
+                paths = segment.bags.files()
+                found += segment.bags.at([row for row, path in enumerate(paths) if path in files])
+        return found
+
     def _position(self, bag: BagFile) -> int:
         return max(bisect_right(self._firsts, in_time(bag)) - 1, 0)
 
@@ -123,28 +133,30 @@ class Timeline:
         return self._recordings[topic]
 
     @cached_property
-    def bags(self) -> tuple[BagFile, ...]:
+    def bags(self) -> Bags:
         """All bags, in order."""
-        return tuple(chain.from_iterable(segment.bags for segment in self.segments))
+        return Bags(segment.bags for segment in self.segments)
 
     @property
     def starts(self) -> NDArray[np.int64]:
         """Log time of the first message in each of all bags."""
-        return np.concatenate([np.empty(0, np.int64), *(part.starts for part in self.segments)])
+        return np.concatenate(
+            [np.empty(0, np.int64), *(part.bags.starts for part in self.segments)]
+        )
 
     @property
     def ends(self) -> NDArray[np.int64]:
         """Log time of the last message in each of all bags."""
-        return np.concatenate([np.empty(0, np.int64), *(part.ends for part in self.segments)])
+        return np.concatenate([np.empty(0, np.int64), *(part.bags.ends for part in self.segments)])
 
     @property
     def folders(self) -> tuple[list[str], NDArray[np.int64]]:
         """The folders of all bags, and for each bag the position of its folder among them."""
         number_of: dict[str, int] = {}
         numbers = [np.empty(0, np.int64)]
-        for names, of_segment in (segment.numbered_folders for segment in self.segments):
-            numbered = [number_of.setdefault(name, len(number_of)) for name in names]
-            numbers.append(np.array(numbered)[of_segment])
+        for bags in (segment.bags for segment in self.segments):
+            numbered = [number_of.setdefault(name, len(number_of)) for name in bags.folders]
+            numbers.append(np.array(numbered)[bags.folder_of])
         return [*number_of], np.concatenate(numbers)
 
     @cached_property
@@ -157,19 +169,19 @@ class Timeline:
         return tuple(filter(None, (segment.recorded for segment in self.segments))) or self.segments
 
     @cached_property
-    def recorded(self) -> tuple[BagFile, ...]:
+    def recorded(self) -> Bags:
         """The bags of `recorded_segments`."""
-        return tuple(chain.from_iterable(segment.bags for segment in self.recorded_segments))
+        return Bags(segment.bags for segment in self.recorded_segments)
 
     @cached_property
     def thinned(self) -> tuple[BagFile, ...]:
         """The days of which only some messages stayed, in order."""
-        segments = [
-            segment
+        bags = chain.from_iterable(
+            segment.bags
             for segment in self.segments
-            if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in segment.folders)
-        ]
-        return tuple(bag for segment in segments for bag in segment.bags if is_thinned(bag.file))
+            if any(folder.endswith(f"/{MEMORY_FOLDER}") for folder in segment.bags.folders)
+        )
+        return tuple(bag for bag in bags if is_thinned(bag.file))
 
     @cached_property
     def thinned_times(self) -> Spans:
@@ -187,6 +199,12 @@ class Timeline:
         """The bytes of the recorded bags, and how many of them a crash left open."""
         parts = [segment.disk_use for segment in self.recorded_segments]
         return sum(size for size, _ in parts), sum(left_open for _, left_open in parts)
+
+    @property
+    def closed(self) -> int:
+        """How many of the bags are closed."""
+        closed = (segment.bags.are(BagState.CLOSED).sum() for segment in self.segments)
+        return sum(map(int, closed))
 
     @cached_property
     def types(self) -> dict[str, tuple[str, ...]]:
@@ -224,7 +242,7 @@ class Timeline:
     def pace(self, topic: str, recording: Path) -> Pace:
         """Returns how often a recording has messages of a topic; it must hold some."""
         folder = str(recording)
-        segments = [segment for segment in self.segments if folder in segment.folders]
+        segments = [segment for segment in self.segments if folder in segment.bags.folders]
         totals = filter(None, (segment.recordings(topic).get(recording) for segment in segments))
         extents = (segment.folder_spans[folder] for segment in segments)
         return Pace(reduce(TopicTotals.__or__, totals), *reduce(wider, extents))
@@ -267,7 +285,7 @@ class Timeline:
         """
         faulty = []
         for segment in self.segments:
-            for bag in segment.faulty if segment.bags[0].start < window.stop else ():
+            for bag in segment.faulty if segment.first[0] < window.stop else ():
                 is_cut = bag.state is BagState.INCOMPLETE
                 is_late = bag.end < bag.mtime_ns <= bag.end + MAX_FILE_NS
                 if window.overlaps(bag.start, bag.mtime_ns if is_cut and is_late else bag.end):
@@ -292,11 +310,10 @@ class Timeline:
         segment = next(
             segment for segment in self.segments if type_name in segment.types.get(topic, ())
         )
-        return next(
-            bag
-            for bag in segment.bags
-            if any(topic_summary.type == type_name for topic_summary in bag.summary.of(topic))
+        holds = segment.bags.with_schema(
+            lambda schema: any(header[:2] == (topic, type_name) for header in schema.topics)
         )
+        return segment.bags[int(holds.argmax())]
 
 
 def _segments_of(bags: Iterable[BagFile]) -> list[Segment]:

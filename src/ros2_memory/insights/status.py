@@ -225,8 +225,9 @@ def missing_data(view: View) -> Iterator[str]:
         bags = counted(misdated, "bag is", "bags are")
         yield f"{bags} dated by a wrong clock; data_time_range has the details"
     yield from describe_absent(view.memory.absent_splits(snapshot))
-    newest = max(snapshot.bags, key=lambda bag: bag.end, default=None)
-    if newest is not None and (alone := view.memory.reader.times_alone(newest.path)):
+    segments = snapshot.timeline.recorded_segments
+    newest = max(segments, key=lambda segment: segment.latest, default=None)
+    if newest is not None and (alone := view.memory.reader.times_alone(newest.newest.path)):
         topics = counted(len(alone), "topic")
         yield f"of {topics} there are only the times here: {listed(sorted(alone))}"
     if undecodable := {undecodable.topic for undecodable in undecodable_topics(view)}:

@@ -176,7 +176,7 @@ class RowMaker:
                 "map_frame": map_frame,
                 **driven,
                 "summary": bag.summary.schema.to_json(),
-                "counts": bag.summary.packed,
+                "counts": bag.summary.data,
                 "joined": "/".join(joined) or None,
             }
             made = {

@@ -156,7 +156,7 @@ def _index_families(snapshot: Snapshot, now: Ns) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "ros2_memory_kept_bytes",
         "Size of the bags that answer questions.",
-        sum(bag.size for bag in snapshot.bags),
+        snapshot.timeline.disk_use[0],
     )
     yield GaugeMetricFamily(
         "ros2_memory_index_age_seconds",

@@ -160,7 +160,6 @@ class Housekeeping:
             clock,
             refresh_s=REFRESH_S,
             split_duration_s=split_duration_s,
-            packs=True,
         )
         self._moments = MomentKeeper(bag_dir, moments_bytes, clock, self._own, rule_bytes)
         self._triggers = None if watch is None else watch(self._moments)

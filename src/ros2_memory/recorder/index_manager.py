@@ -20,16 +20,17 @@ from ros2_memory.bag_dir.handover_file import read_handover
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
 from ros2_memory.core.large_reads import LargeReads
 from ros2_memory.core.logging_setup import get_logger
-from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.model import BagState
 from ros2_memory.core.timebase import Clock, Ns, ms_since, ns_from_unix
 from ros2_memory.index.bag_table import BagTable, KnownBags, TableChange
 from ros2_memory.index.file_state import ScanContext
 from ros2_memory.index.scan import BAG_DIR_SETTING
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+    from collections.abc import Callable, Collection, Iterable, Iterator
     from pathlib import Path
 
+    from ros2_memory.index.bag_rows import BagRows
     from ros2_memory.index.snapshot import Snapshot
     from ros2_memory.storage.base import BagReader
 
@@ -48,8 +49,8 @@ class IndexManager:
         clock: the wall clock.
         refresh_s: how old a snapshot may become before a query has it renewed.
         split_duration_s: how long the recorder writes one file.
-        known: gives those of some paths that are closed files which were read earlier, by path. A
-            first scan does not read them again if they are unchanged.
+        known: gives closed files which were read earlier, in order of time. A first scan does not
+            read them again if they are unchanged.
         include_active: whether the readable part of a file that is being written answers, too. Not
             for programs that delete, repair or save bags, which work on finished files.
         trusts_mtime: whether a young file without an end is being written; else it may be a copy,
@@ -57,8 +58,6 @@ class IndexManager:
         only: the name of the one recording that counts (see `index.scan.Tree`); None: all.
         setting: the one that names the bag directory, for sentences.
         large: the turn to hold much of a bag, for which no scan waits.
-        packs: whether summaries are packed: who deletes bags looks at few of them, and who answers
-            looks at all.
 
     Attributes:
         bag_dir: the bag directory.
@@ -73,13 +72,12 @@ class IndexManager:
         *,
         refresh_s: float,
         split_duration_s: float,
-        known: Callable[[Iterable[str]], Mapping[str, BagFile]] | None = None,
+        known: Callable[[], Iterable[BagRows]] = list,
         include_active: bool = False,
         trusts_mtime: bool = True,
         only: str | None = None,
         setting: str = BAG_DIR_SETTING,
         large: LargeReads | None = None,
-        packs: bool = False,
     ) -> None:
         self._large = large or LargeReads()
         self._trusts_mtime = trusts_mtime
@@ -95,7 +93,6 @@ class IndexManager:
             bag_dir,
             reader,
             known=known,
-            packs=packs,
             setting=setting,
             only=() if only is None else (only,),
         )
@@ -139,7 +136,7 @@ class IndexManager:
         only = *self._new_table.keywords["only"], recording
         alone._new_table = partial(
             self._new_table,
-            known=lambda _: {bag.file: bag for bag in self.snapshot().bags},
+            known=lambda: [part.bags for part in self.snapshot().timeline.recorded_segments],
             only=only,
         )
         alone._table = alone._new_table()
@@ -233,7 +230,7 @@ class IndexManager:
 def _logged_figures(snapshot: Snapshot) -> tuple[object, ...]:
     """Returns what a line about a scan shows, but for what came and went."""
     return (
-        snapshot.bags,
+        snapshot.timeline.recorded_segments,
         *(map(len, (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty))),
         snapshot.problem,
     )

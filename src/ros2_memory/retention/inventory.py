@@ -202,7 +202,6 @@ class Inventory:
                 bags.append(bag)
             elif self._counts(state, bag) and not is_saved:
                 other_bytes += sum(file.size for file in bag.files)
-        self._drop_gone(known)
         other_bytes += sum(self._folder_at(path, known.now).size for path in recordings)
         saved = self._moment_files(known)
         return DirContents(
@@ -226,13 +225,28 @@ class Inventory:
             yield classification.state, bag
 
     def _settled(self, known: KnownBags) -> Iterator[tuple[FileState, StoredBag]]:
-        """Yields the bags of which the index keeps rows."""
-        rows = self._unchanged
-        for bag, inode, _ in known.unchanged.values():
-            stored, stamp = rows.get(bag.file), (inode, bag.size, bag.mtime_ns)
-            if stored is None or (stored.inode, stored.size, stored.written) != stamp:
-                stored = self._stored(bag.file, bag, bag.mtime_ns, (inode, bag.size), known.now)
-                rows[bag.file] = stored
+        """Yields the bags that the index has no notes on."""
+        before, self._unchanged, new = self._unchanged, {}, {}
+        for path, stamp in known.tree.stamps:
+            if path in known.files:
+                continue
+            stored = before.get(path)
+            if stored and (stored.inode, stored.size, stored.written) == (
+                stamp.inode,
+                stamp.size,
+                stamp.mtime_ns,
+            ):
+                self._unchanged[path] = stored
+            else:
+                new[path] = stamp
+        for bag in known.timeline.named(new):
+            file = (new[bag.file].inode, bag.size)
+            stored = self._stored(bag.file, bag, bag.mtime_ns, file, known.now)
+            self._unchanged[bag.file] = stored
+        if before.keys() - self._unchanged.keys():
+            left = {bag.recording for bag in self._unchanged.values()}
+            self._folders = {path: self._folders[path] for path in self._folders.keys() & left}
+        for stored in self._unchanged.values():
             yield FileState.CLOSED, stored
 
     def _stored(
@@ -287,13 +301,6 @@ class Inventory:
             if abs(now - status.st_mtime_ns) >= COMPLETE_AFTER_NS:
                 self._folders[path] = folder
         return folder
-
-    def _drop_gone(self, known: KnownBags) -> None:
-        if len(self._unchanged) > len(known.unchanged):
-            left = {path: bag for path, bag in self._unchanged.items() if path in known.unchanged}
-            recordings = self._folders.keys() & {bag.recording for bag in left.values()}
-            self._unchanged = left
-            self._folders = {path: self._folders[path] for path in recordings}
 
 
 def state_bytes_in(bag_dir: Path) -> int:

@@ -587,4 +587,4 @@ def summarize_channels(
             tuple((topic, found) for topic, found in noted.items() if found),
         )
     )
-    return BagSummary.decoded(schema, schema.numbers.pack(*numbers))
+    return BagSummary.of_numbers(schema, numbers)

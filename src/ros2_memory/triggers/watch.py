@@ -233,7 +233,7 @@ class Triggers:
         folders = {str(self._bag_dir / name): name for name in names[first:]}
         closed: dict[str, list[BagFile]] = {name: [] for name in folders.values()}
         for segment in snapshot.timeline.segments:
-            if folders.keys().isdisjoint(segment.folders):
+            if folders.keys().isdisjoint(segment.bags.folders):
                 continue
             for bag in segment.bags:
                 name = folders.get(str(bag.recording))

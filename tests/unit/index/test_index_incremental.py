@@ -199,7 +199,7 @@ def _without_growth(snapshot: Snapshot) -> Snapshot:
 
 def _views(snapshot: Snapshot) -> tuple[object, ...]:
     return (
-        snapshot.bags,
+        [*snapshot.bags],
         snapshot.earliest,
         snapshot.latest,
         snapshot.timeline.topics(),

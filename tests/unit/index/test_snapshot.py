@@ -91,7 +91,7 @@ def _assert_holds(timeline: Timeline, bags: list[BagFile], windows: list[tuple[i
     ordered = sorted(bags, key=lambda bag: (bag.start, bag.end, bag.path))
     held = [(bag, topic) for bag in ordered for topic in bag.summary.topics]
     names = sorted({topic.topic for _, topic in held})
-    assert timeline.bags == tuple(ordered)
+    assert [*timeline.bags] == ordered
     snapshot = Snapshot(timeline)
     assert snapshot.earliest == min((bag.start for bag in bags), default=None)
     assert snapshot.latest == max((bag.end for bag in bags), default=None)

@@ -67,7 +67,7 @@ def test_steps_are_those_between_neighbours_however_the_history_is_parted(
 )
 def test_the_names_of_bags_say_together_what_each_says_alone(names: list[str]) -> None:
     bags = [bag(name, 0, 1) for name in names]
-    series, positions, numbers = split_names_of(bags)
+    series, positions, numbers = split_names_of(bag.file for bag in bags)
     said = [(series[at], number) for at, number in zip(positions, numbers, strict=True)]
     assert said == [split_of(bag.file) or (bag.file, -1) for bag in bags]
 

@@ -18,7 +18,7 @@ from tests.support.plain_text_bags import PlainReader, plain
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ros2_memory.core.model import BagFile
+    from ros2_memory.index.bag_rows import BagRows
 
 S = 10**9
 NOW = 1_800_000_000 * S
@@ -31,7 +31,7 @@ class Start:
 
     def __init__(self, bag_dir: Path) -> None:
         self.bag_dir = bag_dir
-        self.known: dict[str, BagFile] = {}
+        self.known: list[BagRows] = []
         for split in range(6):
             plain(bag_dir / "rec" / f"rec_{split}.mcap", [split * 10, split * 10 + 9])
         self.age()
@@ -44,7 +44,7 @@ class Start:
     def remember(self) -> None:
         """Knows from then on all bags as they are."""
         index, _ = self.index(knowing=False)
-        self.known = {bag.file: bag for bag in index.refresh().bags}
+        self.known = [segment.bags for segment in index.refresh().timeline.segments]
 
     def index(self, *, knowing: bool = True) -> tuple[IndexManager, PlainReader]:
         """An index that has scanned nothing yet, and its reader."""
@@ -55,7 +55,7 @@ class Start:
             FixedClock(NOW),
             refresh_s=5.0,
             split_duration_s=10.0,
-            known=(lambda _: self.known) if knowing else None,
+            known=lambda: self.known if knowing else [],
         )
         return index, reader
 
@@ -83,14 +83,14 @@ def test_of_old_bags_an_index_keeps_rows_alone_and_of_young_ones_once_they_are_o
 ) -> None:
     young = start.bag_dir / "rec" / "rec_5.mcap"
     os.utime(young, ns=(NOW - 5 * S, NOW - 5 * S))
-    table = BagTable(start.bag_dir, PlainReader(*KINDS), known=None)
+    table = BagTable(start.bag_dir, PlainReader(*KINDS))
 
     def scan(now: int) -> tuple[set[str], int]:
         table.update(ScanContext(start.bag_dir, now, 30 * S), patrolling=True)
         known = table.known((), now)
         assert known.files.keys() == known.counted.keys()
         assert len(table.snapshot(now).bags) == 6
-        return {*known.files}, len(known.unchanged)
+        return {*known.files}, len({path for path, _ in known.tree.stamps} - known.files.keys())
 
     assert scan(NOW) == ({str(young)}, 5)
     assert scan(NOW + 60 * S) == (set(), 6)

@@ -1,0 +1,181 @@
+"""Bags in columns: a week has 60,000 of them, of which a question looks at few.
+
+What is known of a bag takes some 200 bytes so; a `BagFile`, which takes four times as much, is made
+when it is asked for.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from itertools import accumulate, chain
+from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, overload
+
+import numpy as np
+
+from ros2_memory.core.bag_summary import BagSummary, SummarySchema
+from ros2_memory.core.model import BagFile, BagState
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Hashable, Iterable, Iterator
+
+    from numpy.typing import NDArray
+
+    from ros2_memory.core.arrays import Flags, Ints, Which
+
+    Rows: TypeAlias = "Which | list[int]"
+
+_ALL: Final = slice(None)
+_STATES: Final = tuple(BagState)
+_Places: TypeAlias = "NDArray[np.uint16]"
+
+T = TypeVar("T", bound="Hashable")
+
+
+class Summaries(NamedTuple):
+    """The summaries of one schema whose data are of one size: the rows of their bags, and data."""
+
+    schema: SummarySchema
+    rows: _Places
+    data: bytes
+
+
+class BagRows:
+    """Some bags, in the order in which they are given: some hundreds, and one at least.
+
+    Args:
+        bags: the bags.
+        stored: the deletion of `ColumnStore.state` with which they were loaded, and their rows in
+            the store; see `taken`.
+
+    Attributes:
+        folders: where the bags lie, in the order of the bags.
+        folder_of: by row, which of these.
+        summaries: what the bags hold.
+    """
+
+    def __init__(self, bags: Iterable[BagFile], stored: tuple[int, Ints] | None = None) -> None:
+        files, sizes, mtimes, states, summaries, starts, ends, sidecars = zip(*bags, strict=True)
+        folders = [file.rpartition("/")[0] for file in files]
+        self.folders, self.folder_of = _numbered(folders)
+        names = [file[len(folder) :] for file, folder in zip(files, folders, strict=True)]
+        self._names = "".join(names)
+        self._edges = np.fromiter(accumulate(map(len, names), initial=0), np.uint32)
+        kinds, self._kind_of = _numbered((id(known.schema), len(known.data)) for known in summaries)
+        self._place_of = np.empty_like(self._kind_of)
+        self.summaries: list[Summaries] = []
+        for kind in range(len(kinds)):
+            rows = np.flatnonzero(self._kind_of == kind)
+            self._place_of[rows] = np.arange(rows.size)
+            data = b"".join([summaries[row].data for row in rows.tolist()])
+            alike = Summaries(summaries[int(rows[0])].schema, rows.astype(np.uint16), data)
+            self.summaries.append(alike)
+        numbers = sizes, mtimes, sidecars, starts, ends, [*map(_STATES.index, states)]
+        self._numbers: Ints = np.array(numbers, np.int64)
+        self._stored = stored
+
+    def taken(self, deletion: int) -> Ints | None:
+        """Returns, once, the rows in the store; None where others may be stored meanwhile."""
+        stored, self._stored = self._stored, None
+        return stored[1] if stored is not None and stored[0] == deletion else None
+
+    def some(self, rows: Flags) -> BagRows | None:
+        """Returns the bags of some rows: itself where that are all; None where there is none."""
+        if rows.all():
+            return self
+        stored = self._stored and (self._stored[0], self._stored[1][rows])
+        return BagRows(self.at(rows), stored) if rows.any() else None
+
+    @property
+    def sizes(self) -> Ints:
+        """Of the files, in bytes."""
+        return np.asarray(self._numbers[0])
+
+    @property
+    def contents(self) -> Ints:
+        """What changes when other messages of a file count: by bag, `Stamp.content`."""
+        return self._numbers[:3].T
+
+    @property
+    def starts(self) -> Ints:
+        """Log time of the first message in each bag."""
+        return np.asarray(self._numbers[3])
+
+    @property
+    def ends(self) -> Ints:
+        """Log time of the last message in each bag."""
+        return np.asarray(self._numbers[4])
+
+    def are(self, state: BagState) -> Flags:
+        """Returns which bags are in a state."""
+        return np.asarray(self._numbers[5] == _STATES.index(state))
+
+    def with_schema(self, is_wanted: Callable[[SummarySchema], object]) -> Flags:
+        """Returns the summaries of which bags have such a schema."""
+        are_wanted = np.array([bool(is_wanted(alike.schema)) for alike in self.summaries])
+        return np.asarray(are_wanted[self._kind_of])
+
+    def files(self, rows: Rows = _ALL) -> list[str]:
+        """Returns the paths of the bags, or of those of some rows."""
+        names, folders = self._names, self.folders
+        edges = (self._edges[:-1][rows].tolist(), self._edges[1:][rows].tolist())
+        of_rows = zip(self.folder_of[rows].tolist(), *edges, strict=True)
+        return [folders[folder] + names[begin:end] for folder, begin, end in of_rows]
+
+    def __len__(self) -> int:
+        return len(self._kind_of)
+
+    def __iter__(self) -> Iterator[BagFile]:
+        return self.at(_ALL)
+
+    def __getitem__(self, row: int) -> BagFile:
+        return next(self.at([row]))
+
+    def at(self, rows: Rows) -> Iterator[BagFile]:
+        """Yields the bags of some rows."""
+        kinds = [(schema, data, len(data) // len(of)) for schema, of, data in self.summaries]
+        for file, kind, place, (size, mtime, sidecar, start, end, state) in zip(
+            self.files(rows),
+            self._kind_of[rows].tolist(),
+            self._place_of[rows].tolist(),
+            self._numbers.T[rows].tolist(),
+            strict=True,
+        ):
+            schema, data, length = kinds[kind]
+            summary = BagSummary.decoded(schema, data[place * length : (place + 1) * length])
+            yield BagFile(file, size, mtime, _STATES[state], summary, start, end, sidecar)
+
+
+class Bags(Sequence[BagFile]):
+    """The bags in some `BagRows`, one after the other."""
+
+    def __init__(self, parts: Iterable[BagRows]) -> None:
+        self._parts = [*parts]
+        self._edges = [*accumulate(map(len, self._parts), initial=0)]
+
+    def __len__(self) -> int:
+        return self._edges[-1]
+
+    def __iter__(self) -> Iterator[BagFile]:
+        return chain.from_iterable(self._parts)
+
+    def __reversed__(self) -> Iterator[BagFile]:
+        return chain.from_iterable(reversed([*part]) for part in reversed(self._parts))
+
+    @overload
+    def __getitem__(self, at: int) -> BagFile: ...
+    @overload
+    def __getitem__(self, at: slice[int | None, int | None]) -> list[BagFile]: ...
+    def __getitem__(self, at: int | slice[int | None, int | None]) -> BagFile | list[BagFile]:
+        if isinstance(at, slice):
+            return [self[nth] for nth in range(len(self))[at]]
+        nth = range(len(self))[at]
+        part = bisect_right(self._edges, nth) - 1
+        return self._parts[part][nth - self._edges[part]]
+
+
+def _numbered(values: Iterable[T]) -> tuple[list[T], _Places]:
+    """Returns the different values, in their order, and for each one which of these it is."""
+    number_of: dict[T, int] = {}
+    numbers = [number_of.setdefault(value, len(number_of)) for value in values]
+    return [*number_of], np.array(numbers, np.uint16)
