@@ -106,7 +106,12 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         if not is_free[cell]:
             continue
         # The cells before it are claimed.
-        peak = _settled(centre[cell:], mass[cell:], is_free[cell:])
+        near = np.flatnonzero(
+            is_free[cell:] & (_away_squared(centre[cell:], centre[cell]) <= _PEAK_MM**2)
+        )
+        near += cell
+        # As `numpy.average`, which takes ten times as long for few rows.
+        peak = mass[near] @ centre[near] / mass[near].sum()
         is_claimed = is_free & (_away_squared(centre, peak) <= _CLAIM_MM**2)
         is_claimed[cell] = True
         weight = float(mass[is_claimed].sum())
@@ -130,14 +135,6 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         if count == _MAX_PLACES:
             break
     return peaks[:count]
-
-
-def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
-    """Returns where the peak is that the first of some cells lies at: the mean of those near it."""
-    near = np.flatnonzero(is_free & (_away_squared(centre, centre[0]) <= _PEAK_MM**2))
-    # As `numpy.average`, which takes ten times as long for few rows.
-    peak: Floats = mass[near] @ centre[near] / mass[near].sum()
-    return peak
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:
