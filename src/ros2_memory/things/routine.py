@@ -40,6 +40,8 @@ _AGES_H: Final = (1.5, 3.0, 6.0, 12.0, 24.0)
 _SIGMAS: Final = 2.0
 _LEAST_SHARE: Final = 0.05
 _MOST_PLACES: Final = 4
+_AT_ONCE: Final = 256
+"""Hours that are compared with all before them together."""
 
 
 class _HourlyPlaces(NamedTuple):
@@ -56,13 +58,13 @@ class _HourlyPlaces(NamedTuple):
 
     def shares(self, rows: Ints) -> Floats:
         """Returns how often it was at each place before each of some rows; none is impossible."""
-        return _normalised(self._before(rows) @ self._are_at() + 1.0 / self.size)
+        return _normalised(self._before(rows) @ self.are_at() + 1.0 / self.size)
 
     def around(self, rows: Ints, hours: Floats) -> Floats:
         """Returns how likely each place is at hours of the day, by what lies before some rows."""
         apart = np.abs((self.hours - hours[:, None] + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
         weights = np.exp(-((apart / _AROUND_H) ** 2) / 2) * self._before(rows)
-        return _normalised(weights @ self._are_at() + self.shares(rows))
+        return _normalised(weights @ self.are_at() + self.shares(rows))
 
     def still_there(self, rows: Ints, ages_h: Floats) -> Floats:
         """Returns how likely it is where it was seen so long before each of some rows."""
@@ -88,7 +90,8 @@ class _HourlyPlaces(NamedTuple):
         before: Flags = np.arange(len(self.hours)) < rows[:, None]
         return before
 
-    def _are_at(self) -> Floats:
+    def are_at(self) -> Floats:
+        """Returns whether it was at each place (column), by hour: 0 or 1."""
         are_at: Floats = (self.places[:, None] == np.arange(self.size)).astype(np.float64)
         return are_at
 
@@ -172,14 +175,16 @@ def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
 
     Of the first sightings, so many are `learned` from only.
     """
-    rows = np.arange(learned, len(hourly.hours))
-    places = hourly.places[rows]
-    stayed = np.where(places == hourly.places[rows - 1], 0.0, 2.0)
-    score, without_hours = (
-        ((likely - (places[:, None] == np.arange(hourly.size))) ** 2).sum(axis=1)
-        for likely in hourly.likely(rows, hourly.hours[rows])
-    )
-    gains = np.stack((stayed - score, without_hours - score), axis=1)
+    count, parts = len(hourly.hours), []
+    for begin in range(learned, count, _AT_ONCE):
+        rows = np.arange(begin, min(begin + _AT_ONCE, count))
+        stayed = 2.0 * (np.diff(hourly.places)[rows - 1] != 0)
+        score, without_hours = (
+            ((likely - hourly.are_at()[rows]) ** 2).sum(axis=1)
+            for likely in hourly.likely(rows, hourly.hours[rows])
+        )
+        parts.append(np.stack((stayed - score, without_hours - score), axis=1))
+    gains = np.concatenate(parts)
     mean = np.mean(gains, axis=0)
     error = np.std(gains, axis=0) / math.sqrt(len(gains))
     return bool((mean > _SIGMAS * error).all())
