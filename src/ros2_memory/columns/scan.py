@@ -309,9 +309,7 @@ class Scan:
     def _settled_stretches(self, beside: Ns) -> list[Stretch]:
         """Returns the stretches of which all rows are of whole parts; see `stretches`."""
         window, firsts, latest = self._request.window, self._firsts, self._latest
-        newest = max(
-            (segment.latest for segment in self._request.timeline.segments), default=MIN_NS
-        )
+        newest = self._request.timeline.latest
         starts = np.unique(firsts // STRETCH_NS)[::-1] * STRETCH_NS
         stops = starts + STRETCH_NS
         begin, end = np.searchsorted(firsts, starts), np.searchsorted(firsts, stops)

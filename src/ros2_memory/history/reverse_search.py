@@ -388,7 +388,7 @@ class CandidateRows:
     ) -> None:
         self.ruled_out = False
         self.has_looked = False
-        newest = max((part.latest for part in view.timeline.segments), default=MIN_NS)
+        newest = view.timeline.latest
         self._left: dict[str, Ns] = dict.fromkeys(topics, min(window.stop, newest + 1))
         # Of each table that is open: its newest time that is left, negative, and the older ones.
         self._ready: list[tuple[Ns, str, int, Iterator[Ns]]] = []

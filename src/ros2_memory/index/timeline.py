@@ -145,19 +145,24 @@ class Timeline:
         )
 
     @property
+    def latest(self) -> Ns:
+        """Log time of the last message in any of the bags; the earliest time without any."""
+        return max((segment.latest for segment in self.segments), default=MIN_NS)
+
+    @property
     def ends(self) -> NDArray[np.int64]:
         """Log time of the last message in each of all bags."""
         return np.concatenate([np.empty(0, np.int64), *(part.bags.ends for part in self.segments)])
 
     @property
-    def folders(self) -> tuple[list[str], NDArray[np.int64]]:
-        """The folders of all bags, and for each bag the position of its folder among them."""
+    def folder_numbers(self) -> NDArray[np.int64]:
+        """For each of all bags a number; those of one folder have the same."""
         number_of: dict[str, int] = {}
         numbers = [np.empty(0, np.int64)]
         for bags in (segment.bags for segment in self.segments):
             numbered = [number_of.setdefault(name, len(number_of)) for name in bags.folders]
             numbers.append(np.array(numbered)[bags.folder_of])
-        return [*number_of], np.concatenate(numbers)
+        return np.concatenate(numbers)
 
     @cached_property
     def recorded_segments(self) -> tuple[Segment, ...]:
@@ -264,7 +269,7 @@ class Timeline:
         """The half-open spans in which bags of different recordings may hold copies, in order."""
         if not self.segments:
             return []
-        folders, starts, ends = self.folders[1], self.starts, self.ends
+        folders, starts, ends = self.folder_numbers, self.starts, self.ends
         # Of bags of one recording that follow each other those count that begin while another one
         # goes on, and the one that reaches farthest.
         is_first = np.diff(folders, prepend=-1) != 0

@@ -470,8 +470,7 @@ def _lowest_bin(min_score: float) -> int:
 
 def _groups(observed: _Observations, keys: Sequence[str]) -> list[_Group]:
     """Returns the labels in each epoch that have detections that count."""
-    distinct = [*dict.fromkeys(keys)]
-    key_of_label = np.array([distinct.index(key) for key in keys], np.int64)
+    distinct, key_of_label = _numbered(keys)
     spots, unplaced = observed.sights.spots, observed.sights.unplaced
     width = len(distinct) + 1
     epoch = observed.sights.epochs[spots[:, Spot.SLICE]]
@@ -484,6 +483,12 @@ def _groups(observed: _Observations, keys: Sequence[str]) -> list[_Group]:
         rows = np.flatnonzero(group_of == number)
         groups.append(_Group(distinct[key], group_epoch, rows, without_place))
     return groups
+
+
+def _numbered(keys: Sequence[str]) -> tuple[list[str], Ints]:
+    """Returns the distinct keys, and the number of that of each label among them."""
+    distinct = [*dict.fromkeys(keys)]
+    return distinct, np.array([distinct.index(key) for key in keys], np.int64)
 
 
 def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
@@ -513,7 +518,9 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
         on_floor = places_of(x[floor], y[floor], observed.counts[rows[floor]], slices[floor])
         place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
-    several = _are_several(place, observed.groups[rows])
+    # Where slices have several spots of the label, these are things that stand together.
+    distinct = np.bincount(distinct_rows((place, observed.groups[rows]))[0][:, 0])
+    several = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
     counts = np.bincount(place, observed.counts[rows])
     ends = np.cumsum(np.bincount(place))
     by_place = np.split(rows[np.argsort(place, kind="stable")], ends[:-1])
@@ -522,13 +529,6 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
             group.places.append(rows_there)
         elif counts[number] >= _FEWEST:
             yield rows_there
-
-
-def _are_several(place: Ints, groups: Ints) -> Flags:
-    """Returns at which places slices have several spots of a label: things that stand together."""
-    distinct = np.bincount(distinct_rows((place, groups))[0][:, 0])
-    several: Flags = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
-    return several
 
 
 def _find_stays(groups: Sequence[_Group], observed: _Observations) -> None:
@@ -636,8 +636,7 @@ def _hosts(
     """
     beside_spots = (observed.sights.beside[:, name] for name in Beside)
     table, beside = _StayTable.of(stays), Tally.of(len(observed.counts), *beside_spots)
-    names = [*dict.fromkeys(keys)]
-    key_of_label = np.array([names.index(key) for key in keys], np.int64)
+    names, key_of_label = _numbered(keys)
     key = np.array([names.index(group.key) for group, _ in stays], np.int64)
     # The spots of all stays, as numbers in order, and how often these and those before count.
     sizes = [len(stay.spots) for _, stay in stays]
@@ -841,9 +840,11 @@ def _are_of_mover(group: _Group, linked: Sequence[Instance]) -> bool:
 
 def _names(sights: JoinedSights, labels: Labels) -> dict[str, str]:
     """Returns the name to show of each key, by how often each of its labels was detected."""
-    detections = np.zeros(len(sights.labels), np.int64)
-    np.add.at(detections, sights.spots[:, Spot.LABEL], sights.spots[:, Spot.N])
-    np.add.at(detections, sights.unplaced[:, Unplaced.LABEL], sights.unplaced[:, Unplaced.N])
+    tables = sights.spots, sights.unplaced  # a label and a number are the same columns of both
+    code, often = (
+        np.concatenate([table[:, at] for table in tables]) for at in (Spot.LABEL, Spot.N)
+    )
+    detections = np.bincount(code, often, len(sights.labels)).astype(np.int64)
     counts: dict[str, dict[str, int]] = {}
     for label, n in zip(sights.labels, detections.tolist(), strict=True):
         if n:

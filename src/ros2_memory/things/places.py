@@ -106,34 +106,35 @@ def _peaks(centre: Floats, mass: Floats, spots: _Spots) -> Floats:
         if not is_free[cell]:
             continue
         # The cells before it are claimed.
-        peak = _settled(centre[cell:], mass[cell:], is_free[cell:])
+        near = np.flatnonzero(
+            is_free[cell:] & (_away_squared(centre[cell:], centre[cell]) <= _PEAK_MM**2)
+        )
+        near += cell
+        # As `numpy.average`, which takes ten times as long for few rows.
+        peak = mass[near] @ centre[near] / mass[near].sum()
         is_claimed = is_free & (_away_squared(centre, peak) <= _CLAIM_MM**2)
         is_claimed[cell] = True
         weight = float(mass[is_claimed].sum())
         is_free[is_claimed] = False
-        # Peaks that are so heavy that one this light may be their noise.
         away, others = _away_squared(peaks[:count], peak), masses[:count]
-        is_halo = (away <= GATE_MM**2) & (others > weight / _HALO_SHARE)
-        is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
-        heavy = peaks[:count][is_halo | is_scatter]
-        if all(
-            weight >= _FEW
-            and spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2) > _OWN_SHARE
-            for other in heavy
-        ):
-            peaks[count], masses[count] = peak, weight
-            count += 1
+        is_near = away <= GATE_MM**2
+        if is_near.any():  # mostly it is not
+            # Peaks that are so heavy that one this light may be their noise.
+            is_halo = is_near & (others > weight / _HALO_SHARE)
+            is_scatter = (away <= _SCATTER_MM**2) & (others + weight < _FEW)
+            heavy = peaks[:count][is_halo | is_scatter]
+            if any(
+                weight < _FEW
+                or spots.share(is_claimed, _away_squared(centre, other) <= _CLAIM_MM**2)
+                <= _OWN_SHARE
+                for other in heavy
+            ):
+                continue
+        peaks[count], masses[count] = peak, weight
+        count += 1
         if count == _MAX_PLACES:
             break
     return peaks[:count]
-
-
-def _settled(centre: Floats, mass: Floats, is_free: Flags) -> Floats:
-    """Returns where the peak is that the first of some cells lies at: the mean of those near it."""
-    near = np.flatnonzero(is_free & (_away_squared(centre, centre[0]) <= _PEAK_MM**2))
-    # As `numpy.average`, which takes ten times as long for few rows.
-    peak: Floats = mass[near] @ centre[near] / mass[near].sum()
-    return peak
 
 
 def _density(cells: Ints, mass: Floats) -> Floats:

@@ -21,9 +21,7 @@ from ros2_memory.results import UsualPlace
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike
-
-    from ros2_memory.analysis.sights import Floats, Ints
+    from ros2_memory.analysis.sights import Flags, Floats, Ints
 
 
 _HOUR_NS: Final = 3600 * NS_PER_S
@@ -42,6 +40,8 @@ _AGES_H: Final = (1.5, 3.0, 6.0, 12.0, 24.0)
 _SIGMAS: Final = 2.0
 _LEAST_SHARE: Final = 0.05
 _MOST_PLACES: Final = 4
+_AT_ONCE: Final = 256
+"""Hours that are compared with all before them together."""
 
 
 class _HourlyPlaces(NamedTuple):
@@ -56,40 +56,48 @@ class _HourlyPlaces(NamedTuple):
     places: Ints
     size: int
 
-    def before(self, row: int) -> _HourlyPlaces:
-        """Returns those before a row."""
-        return _HourlyPlaces(self.hours[:row], self.places[:row], self.size)
+    def shares(self, rows: Ints) -> Floats:
+        """Returns how often it was at each place before each of some rows; none is impossible."""
+        return _normalised(self._before(rows) @ self.are_at() + 1.0 / self.size)
 
-    def shares(self) -> Floats:
-        """Returns how often it was at each place; none is impossible."""
-        return _normalised(np.bincount(self.places, minlength=self.size) + 1.0 / self.size)
+    def around(self, rows: Ints, hours: Floats) -> Floats:
+        """Returns how likely each place is at hours of the day, by what lies before some rows."""
+        apart = np.abs((self.hours - hours[:, None] + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
+        weights = np.exp(-((apart / _AROUND_H) ** 2) / 2) * self._before(rows)
+        return _normalised(weights @ self.are_at() + self.shares(rows))
 
-    def around(self, hour: float) -> Floats:
-        """Returns how likely each place is at an hour of the day."""
-        apart = np.abs((self.hours - hour + _DAY_H / 2) % _DAY_H - _DAY_H / 2)
-        weights = np.exp(-((apart / _AROUND_H) ** 2) / 2)
-        return _normalised(np.bincount(self.places, weights, self.size) + self.shares())
-
-    def still_there(self, age_h: float) -> float:
-        """Returns how likely it is where it was seen so long ago."""
+    def still_there(self, rows: Ints, ages_h: Floats) -> Floats:
+        """Returns how likely it is where it was seen so long before each of some rows."""
         ages = np.digitize(np.diff(self.hours), _AGES_H)
-        is_as_old = ages == np.digitize(age_h, _AGES_H)
-        stayed = np.diff(self.places)[is_as_old] == 0
-        return (float(stayed.sum()) + 1.0) / (len(stayed) + 2.0)
+        is_as_old = (ages == np.digitize(ages_h, _AGES_H)[:, None]) & self._before(rows)[:, 1:]
+        stayed = is_as_old & (np.diff(self.places) == 0)
+        likely: Floats = (stayed.sum(axis=1) + 1.0) / (is_as_old.sum(axis=1) + 2.0)
+        return likely
 
-    def likely(self, hour: float, *, by_hours: bool = True) -> Floats:
-        """Returns how likely each place is at a later hour."""
-        shares, last = self.shares(), int(self.places[-1])
-        stays = self.still_there(hour - float(self.hours[-1]))
-        others = 1.0 - shares[last]
-        prior = shares * ((1.0 - stays) / others if others > 0 else 0.0)
-        prior[last] = stays
-        return _normalised(prior * (self.around(hour) / shares) if by_hours else prior)
+    def likely(self, rows: Ints, hours: Floats) -> tuple[Floats, Floats]:
+        """Returns how likely each place is at later hours, by what lies before each of some rows.
+
+        And how likely without what is known of hours.
+        """
+        shares, nth, last = self.shares(rows), np.arange(len(rows)), self.places[rows - 1]
+        stays, others = self.still_there(rows, hours - self.hours[rows - 1]), 1 - shares[nth, last]
+        moves = np.divide(1 - stays, others, out=np.zeros(len(rows)), where=others > 0)
+        prior = shares * moves[:, None]
+        prior[nth, last] = stays
+        return _normalised(prior * (self.around(rows, hours) / shares)), _normalised(prior)
+
+    def _before(self, rows: Ints) -> Flags:
+        before: Flags = np.arange(len(self.hours)) < rows[:, None]
+        return before
+
+    def are_at(self) -> Floats:
+        """Returns whether it was at each place (column), by hour: 0 or 1."""
+        are_at: Floats = (self.places[:, None] == np.arange(self.size)).astype(np.float64)
+        return are_at
 
 
-def _normalised(weights: ArrayLike) -> Floats:
-    shares: Floats = np.asarray(weights, np.float64)
-    shares /= shares.sum()
+def _normalised(weights: Floats) -> Floats:
+    shares: Floats = weights / weights.sum(axis=1, keepdims=True)
     return shares
 
 
@@ -116,9 +124,10 @@ def usual_places(
         return None
     if not _has_routine(hourly, learned):
         return ()
-    likely = hourly.likely(max(_local_hour(now, offset), float(hours[-1])))
+    every = np.array([len(hours)])
+    [likely], _ = hourly.likely(every, np.array([max(_local_hour(now, offset), hours[-1])]))
     shares = np.bincount(places, minlength=hourly.size) / len(places)
-    by_hour = np.array([hourly.around(hour + 0.5) for hour in range(_DAY_H)])
+    by_hour = hourly.around(np.repeat(every, _DAY_H), np.arange(0.5, _DAY_H))
     is_known = np.isin(np.arange(_DAY_H), hours % _DAY_H // 1)
     best = np.where(is_known, by_hour.argmax(axis=1), -1)
     order = [place for place in np.argsort(-likely).tolist() if shares[place] >= _LEAST_SHARE]
@@ -166,20 +175,16 @@ def _has_routine(hourly: _HourlyPlaces, learned: int) -> bool:
 
     Of the first sightings, so many are `learned` from only.
     """
-    gains = []
-    for row in range(learned, len(hourly.hours)):
-        before, hour, place = hourly.before(row), float(hourly.hours[row]), int(hourly.places[row])
-        stayed = 0.0 if place == before.places[-1] else 2.0
-        score = _brier(before.likely(hour), place)
-        without_hours = _brier(before.likely(hour, by_hours=False), place)
-        gains.append((stayed - score, without_hours - score))
+    count, parts = len(hourly.hours), []
+    for begin in range(learned, count, _AT_ONCE):
+        rows = np.arange(begin, min(begin + _AT_ONCE, count))
+        stayed = 2.0 * (np.diff(hourly.places)[rows - 1] != 0)
+        score, without_hours = (
+            ((likely - hourly.are_at()[rows]) ** 2).sum(axis=1)
+            for likely in hourly.likely(rows, hourly.hours[rows])
+        )
+        parts.append(np.stack((stayed - score, without_hours - score), axis=1))
+    gains = np.concatenate(parts)
     mean = np.mean(gains, axis=0)
     error = np.std(gains, axis=0) / math.sqrt(len(gains))
     return bool((mean > _SIGMAS * error).all())
-
-
-def _brier(likely: Floats, place: int) -> float:
-    """Returns the squared error of how likely each place is, of something at one of them."""
-    off = likely.copy()
-    off[place] -= 1.0
-    return float((off**2).sum())

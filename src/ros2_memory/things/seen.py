@@ -17,7 +17,7 @@ import numpy as np
 
 from ros2_memory.analysis.frames import static_in
 from ros2_memory.analysis.sights import SLICE_NS
-from ros2_memory.bag_dir.layout import CARRY_FOLDER, is_carried
+from ros2_memory.bag_dir.layout import is_carried
 from ros2_memory.columns.fragments import FragmentKey, FragmentKind, Joined, joining
 from ros2_memory.columns.scan import STRETCH_NS
 from ros2_memory.columns.sights import packed, united
@@ -29,13 +29,13 @@ from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
-    from pathlib import Path
 
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.scan import Scan
     from ros2_memory.columns.units import Rows
     from ros2_memory.history.sessions import Session
     from ros2_memory.history.view import View
+    from ros2_memory.index.timeline import Timeline
     from ros2_memory.storage.base import IntArray
 
 
@@ -141,12 +141,12 @@ class _Surroundings(NamedTuple):
 
     Attributes:
         window: the stretch.
-        first_bags: of each recording that reaches into it, or nearly so.
+        folders: of the recordings that reach into it, or nearly so.
         sessions: those that the recordings are of, in the order of their names.
     """
 
     window: TimeWindow
-    first_bags: Sequence[BagFile]
+    folders: Sequence[str]
     sessions: Sequence[_Lending]
 
 
@@ -154,6 +154,15 @@ def may_have_detections(type_name: str) -> bool:
     """Returns whether messages of a type may hold detections, as far as its name tells."""
     names = {type_name, type_name.partition("/")[0]}
     return type_name == _TEXT or _NO_DETECTIONS.isdisjoint(names)
+
+
+def topics_with_detections(timeline: Timeline) -> list[str]:
+    """Returns the topics that may have detections."""
+    return [
+        topic
+        for topic in timeline.topics()
+        if any(map(may_have_detections, timeline.types_of(topic)))
+    ]
 
 
 class Watching:
@@ -167,39 +176,25 @@ class Watching:
         self._view = view
         self._placer = Placer(view)
         self._sessions = view.sessions
-        self._session_of: dict[Path, Session] = {}
         timeline = view.timeline
-        self._topics = [
-            topic
-            for topic in timeline.topics()
-            if any(map(may_have_detections, timeline.types_of(topic)))
-        ]
+        self._topics = topics_with_detections(timeline)
         limits = view.limits
         localisers = (topic for topic in timeline.topics() if LOCALISER in timeline.types_of(topic))
         topics = (*self._topics, view.pose_topic, *limits.tf_topics, *localisers)
         self._needed = tuple(dict.fromkeys(topics))
         self._scans: list[Scan] = []
         self._may_be_repeated = view.stream.may_be_repeated(self._topics)
-        self._bags = self._rows_of_bags()
-        self._folder_of = timeline.folders[1][self._bags]
+        rows = [
+            row
+            for row, bag in enumerate(timeline.bags)
+            # Carried messages that nothing is seen by reach over all of the history.
+            if not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
+        ]
+        self._bags = np.array(rows, np.int64)
+        self._folder_of = timeline.folder_numbers[self._bags]
         self._firsts, self._lasts = timeline.starts[self._bags], timeline.ends[self._bags]
         self._latest = np.maximum.accumulate(self._lasts)
-        self._newest = int(timeline.ends.max(initial=MIN_NS))
-
-    def _rows_of_bags(self) -> IntArray:
-        """Returns the positions of bags: not of carried messages that nothing is seen by.
-
-        Those reach over all of the history.
-        """
-        bags, (folders, folder_of) = self._view.timeline.bags, self._view.timeline.folders
-        carried = [nth for nth, folder in enumerate(folders) if folder.endswith(CARRY_FOLDER)]
-        may_be_carried = np.flatnonzero(np.isin(folder_of, carried)).tolist()
-        left_out = [
-            row
-            for row in may_be_carried
-            if is_carried(bags[row].file) and not any(map(bags[row].summary.of, self._needed))
-        ]
-        return np.delete(np.arange(len(folder_of)), np.array(left_out, np.int64))
+        self._newest = timeline.latest
 
     def newest_first(
         self, until: Ns = MAX_NS, most: float = math.inf
@@ -254,10 +249,27 @@ class Watching:
             ]
         is_asked = (self._firsts < window.stop) & (self._lasts >= window.start)
         spans = self._firsts[is_asked], self._lasts[is_asked]
-        stretches = map(_window, reversed(_numbers_of(self._view, self._topics, *spans)))
+        stretches = map(_window, reversed(self._numbers_of(*spans)))
         asked = (stretch for stretch in stretches if not stretch.intersect(window).empty)
         for _, together in groupby(asked, lambda stretch: stretch.start // STRETCH_NS):
             yield [*together]
+
+    def _numbers_of(self, starts: IntArray, ends: IntArray) -> list[int]:
+        """Returns the numbers of the stretches in which bags may have messages.
+
+        Of each bag the log times of its first and last message are given.
+        """
+        first, last = starts // SIGHTS_NS, ends // SIGHTS_NS
+        sizes = last - first + 1
+        is_odd = sizes > _MANY
+        numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
+        for start, end in zip(starts[is_odd].tolist(), ends[is_odd].tolist(), strict=True):
+            # Its times are odd: centuries may lie between two messages.
+            window = TimeWindow(start, end).widened(1)
+            for topic in self._topics:
+                numbers += [rows.times // SIGHTS_NS for rows in scan(self._view, topic, window)]
+        distinct: list[int] = np.unique(np.concatenate(numbers)).tolist()
+        return distinct
 
     def _parts_around(self, window: TimeWindow) -> tuple[int, ...] | None:
         """Returns the parts that what is seen in a window follows from; None where not they alone.
@@ -284,22 +296,17 @@ class Watching:
         """
         files = {bag.file for bag in bags}
         spans = np.array([(bag.start, bag.end) for bag in bags], np.int64).reshape(-1, 2).T
-        for number in _numbers_of(self._view, self._topics, *spans):
+        for number in self._numbers_of(*spans):
             window = _window(number)
             by_lender: dict[tuple[Session, Session], dict[BagFile, list[Rows]]] = {}
             for rows in self._rows(window):
                 for bag, positions in rows.bag_rows(files):
-                    session = self._session(bag)
+                    session = self._sessions.of(bag.recording)
                     lender = self._transforms_of(session, bag, window)
                     of_bags = by_lender.setdefault((session, lender), {})
                     of_bags.setdefault(bag, []).append(rows.some(positions))
             for lending, of_bags in by_lender.items():
                 yield from self._placer.spots_by_bag(window, *lending, of_bags)
-
-    def _session(self, bag: BagFile) -> Session:
-        if bag.recording not in self._session_of:
-            self._session_of[bag.recording] = self._sessions.of(bag.recording)
-        return self._session_of[bag.recording]
 
     def _around(self, window: TimeWindow) -> _Surroundings:
         self._view.bags.check_deadline()
@@ -307,11 +314,12 @@ class Watching:
         begin, end = self._latest.searchsorted(near.start), self._firsts.searchsorted(near.stop)
         reaching = begin + np.flatnonzero(self._lasts[begin:end] >= near.start)
         _, firsts = np.unique(self._folder_of[reaching], return_index=True)
-        rows = self._bags[reaching[np.sort(firsts)]].tolist()
-        of_recordings = [self._view.timeline.bags[row] for row in rows]
         first_bags: dict[Session, BagFile] = {}
-        for bag in of_recordings:
-            first_bags.setdefault(self._session(bag), bag)
+        folders = set[str]()
+        for row in self._bags[reaching[np.sort(firsts)]].tolist():
+            bag = self._view.timeline.bags[row]
+            first_bags.setdefault(self._sessions.of(bag.recording), bag)
+            folders.add(self._sessions.folder(bag.recording))
         is_alone = len(first_bags) == 1
         sessions = [
             lending
@@ -320,7 +328,7 @@ class Watching:
         ]
         if not is_alone:
             sessions.sort(key=lambda lending: (min(lending.session), lending.slices or ()))
-        return _Surroundings(window, of_recordings, sessions)
+        return _Surroundings(window, sorted(folders), sessions)
 
     def _lendings(
         self, session: Session, bag: BagFile, window: TimeWindow, *, is_alone: bool
@@ -426,11 +434,10 @@ class Watching:
             for _, lender, _ in around.sessions
             if lender
         ]
-        folders = sorted(map(self._sessions.folder, {bag.recording for bag in around.first_bags}))
         begin = window.start // SLICE_NS
         sessions = [
             (
-                [(folder in session, folder in lender) for folder in folders],
+                [(folder in session, folder in lender) for folder in around.folders],
                 [number - begin for number in slices or ()],
             )
             for session, lender, slices in around.sessions
@@ -504,21 +511,3 @@ def _window(number: int) -> TimeWindow:
     """Returns when a stretch is."""
     begin = number * SIGHTS_NS
     return TimeWindow(max(begin, MIN_NS), min(begin + SIGHTS_NS, MAX_NS))
-
-
-def _numbers_of(view: View, topics: Sequence[str], starts: IntArray, ends: IntArray) -> list[int]:
-    """Returns the numbers of the stretches in which bags may have messages of some topics.
-
-    Of each bag the log times of its first and last message are given.
-    """
-    first, last = starts // SIGHTS_NS, ends // SIGHTS_NS
-    sizes = last - first + 1
-    is_odd = sizes > _MANY
-    numbers = [in_ranges(first[~is_odd], sizes[~is_odd])]
-    for start, end in zip(starts[is_odd].tolist(), ends[is_odd].tolist(), strict=True):
-        # Its times are odd: centuries may lie between two messages.
-        window = TimeWindow(start, end).widened(1)
-        for topic in topics:
-            numbers += [rows.times // SIGHTS_NS for rows in scan(view, topic, window)]
-    distinct: list[int] = np.unique(np.concatenate(numbers)).tolist()
-    return distinct

@@ -45,7 +45,7 @@ from ros2_memory.history.reverse_search import (
 from ros2_memory.insights.silences import describe_silences
 from ros2_memory.places.pose_frames import axes_of
 from ros2_memory.things.labels import plain, singular
-from ros2_memory.things.seen import may_have_detections
+from ros2_memory.things.seen import topics_with_detections
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
@@ -110,15 +110,13 @@ def note_undecoded(view: View, window: TimeWindow) -> frozenset[str]:
     Returns these topics. Of each topic the first and the newest message are tried: where only some
     between them are broken, there is no note.
     """
-    timeline = view.timeline
     failures: list[UndecodableError] = []
-    for topic in timeline.topics():
-        if any(map(may_have_detections, timeline.types_of(topic))):
-            with suppress(NotInLakeError):
-                newest = view.stream.newest(topic, window)
-                first = None if newest is None else view.stream.first([topic], window)
-                for stored in filter(None, (newest, first)):
-                    view.bags.decode(stored, failures)
+    for topic in topics_with_detections(view.timeline):
+        with suppress(NotInLakeError):
+            newest = view.stream.newest(topic, window)
+            first = None if newest is None else view.stream.first([topic], window)
+            for stored in filter(None, (newest, first)):
+                view.bags.decode(stored, failures)
     reasons = {failure.topic: failure.reason for failure in failures}
     for topic, reason in reasons.items():
         view.notes.add_lack(Note(_UNDECODED, topic, reason))
