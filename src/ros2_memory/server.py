@@ -197,10 +197,9 @@ def _parts_of_one(
     server = build_server(settings, memory, telemetry, backfill.progress)
     every_s, page = settings.reader.index_refresh_s, None
     if settings.server.transport != "stdio" and settings.server.page:
-        from ros2_memory.serving.page.routes import page_routes, warm_up
+        from ros2_memory.serving.page.routes import page_routes
 
         page = page_routes(server.dispatcher, backfill.progress)
-        backfill.warm_up = partial(warm_up, server.dispatcher)
 
     async def background() -> None:
         """Keeps the index fresh and the store of columns full, until it is cancelled."""

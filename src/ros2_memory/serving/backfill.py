@@ -68,14 +68,12 @@ class Backfill:
         filling: fills the store of columns; None where there is none.
         helper: the command line of the program that stores a backlog (`ros2-memory index`);
             without it that is stored here.
-        warm_up: called once the store is full, until it returns that it is done.
         undecodable: by topic, why its messages cannot be decoded, as `precompute` last found.
     """
 
     memory: Memory
     filling: Filling | None
     helper: Sequence[str] = ()
-    warm_up: Callable[[], bool] | None = None
     undecodable: dict[str, str] = field(default_factory=dict)
     _of_others: list[Ns] | None = None
     _pruned_s: float = -math.inf
@@ -113,8 +111,6 @@ class Backfill:
         if (done or not self._is_precomputed) and len(waiting) <= BACKLOG:
             await in_thread(self.precompute)
             self._is_precomputed = True
-        if self.warm_up and len(waiting) <= BACKLOG and await in_thread(self.warm_up):
-            self.warm_up = None
         if due:
             await in_thread(self.prune)
             self._pruned_s = time.monotonic()

@@ -92,9 +92,6 @@ Those that may take long have threads of their own, so that a quick one never wa
 _QUERY_MARGIN_S: Final = 0.5
 """How much before the call its query times out, so that the client receives the query's error."""
 
-_IDLE_S: Final = 1.0
-"""How long nobody must have asked until work in advance begins."""
-_LONGEST_IN_ADVANCE_S: Final = 120.0
 _REPORTED_WAIT_S: Final = 0.5
 _LONG_S: Final = 0.1
 """An answer that took longer used so much memory that what is free of it goes back."""
@@ -151,8 +148,6 @@ class Dispatcher:
         self.quick = FairQueue("quick", QUICK_AT_ONCE)
         self.blocking = FairQueue("blocking", BLOCKING_AT_ONCE)
         self._stopping = threading.Event()
-        self._begun = self._ended = 0  # calls and looks
-        self._ended_s = -math.inf
 
     def stop(self) -> None:
         """Makes running queries time out, and begins no others, so that the program can end."""
@@ -226,20 +221,6 @@ class Dispatcher:
             return self._replies.error(error)
         return reply
 
-    def idle_call(self) -> Call | None:
-        """Returns a call for work in advance, which times out as soon as anybody asks.
-
-        None where somebody does, or did lately. May be called from any thread.
-        """
-        begun = self._begun
-        if begun != self._ended or time.monotonic() - self._ended_s < _IDLE_S:
-            return None
-
-        def monotonic() -> float:
-            return math.inf if self._stopping.is_set() or self._begun != begun else time.monotonic()
-
-        return Call(Deadline.after(_LONGEST_IN_ADVANCE_S, monotonic))
-
     @contextmanager
     def _running(self) -> Iterator[tuple[Call, str]]:
         """Yields a call or a look, and its correlation id; in the end ends what it may still do.
@@ -253,15 +234,12 @@ class Dispatcher:
             # Infinite when nobody waits for it any more.
             return math.inf if self._stopping.is_set() or over.is_set() else time.monotonic()
 
-        self._begun += 1
         correlation_id = uuid.uuid4().hex[:12]
         with structlog.contextvars.bound_contextvars(correlation_id=correlation_id):
             try:
                 yield Call(Deadline.after(timeout_s, monotonic)), correlation_id
             finally:
                 over.set()
-                self._ended += 1
-                self._ended_s = time.monotonic()
 
     def _report(self, done: Answered, name: str, given: Mapping[str, object]) -> None:
         """Logs a call that is over, and passes it to the observers."""

@@ -150,28 +150,6 @@ def test_a_bag_directory_that_is_gone_for_a_while_keeps_what_is_stored(tmp_path:
     assert stored(memory) == ["rec/rec_0.mcap"]
 
 
-async def test_a_warm_up_begins_with_a_full_store_and_ends_when_it_is_done(tmp_path: Path) -> None:
-    bag(tmp_path, 0)
-    _, backfill = storing(tmp_path)
-    begun: list[int] = []
-
-    def warm_up() -> bool:
-        begun.append(backfill.progress().waiting)
-        return len(begun) == 2
-
-    backfill.helper, backfill.warm_up = ["/no/such/program"], warm_up
-    with anyio.fail_after(30):
-        async with anyio.create_task_group() as tasks:
-            tasks.start_soon(keep_backfilled, backfill, 0.001)
-            while len(begun) < 2:
-                await anyio.lowlevel.checkpoint()
-            bag(tmp_path, 1)
-            while backfill.progress() != Progress(2, 2):
-                await anyio.lowlevel.checkpoint()
-            tasks.cancel_scope.cancel()
-    assert begun == [0, 0]
-
-
 @pytest.mark.parametrize("helper", [["/no/such/program"], [sys.executable, "-c", "exit(3)"]])
 async def test_a_backlog_is_worked_off_also_where_its_helper_fails(
     tmp_path: Path, helper: list[str]

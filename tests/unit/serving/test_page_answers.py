@@ -38,7 +38,6 @@ from ros2_memory.serving.page.routes import (
     moment_asked,
     page_routes,
     span_request,
-    warm_up,
     window_asked,
 )
 from ros2_memory.serving.page.span import MOST_POINTS, span_shown
@@ -415,18 +414,6 @@ def test_of_one_recording_only_its_own_moments_are_shown(tmp_path: Path) -> None
 
     assert sorted(labels(memory)) == ["of robin", "of wren"]
     assert labels(Recordings(memory).alone("wren")) == ["of wren"]
-
-
-async def test_a_warm_up_gives_way_to_a_question_and_goes_on_later(memory: Memory) -> None:
-    dispatcher = Dispatcher(memory, [], Replies(memory.index.bag_dir, 9_000), call_timeout_s=5)
-    call = dispatcher.idle_call()
-    assert call is not None
-    assert not call.deadline.expired()
-    await dispatcher.look(lambda _call: {})
-    assert call.deadline.expired()
-    # Somebody who asked may ask again at once.
-    assert dispatcher.idle_call() is None
-    assert not warm_up(dispatcher)
 
 
 async def test_a_tool_of_one_recording_answers_from_it_alone_and_one_that_writes_is_refused(

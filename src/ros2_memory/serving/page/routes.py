@@ -20,10 +20,8 @@ from typing import TYPE_CHECKING, Final, TypeAlias
 from starlette.responses import Response
 from starlette.routing import Route
 
-from ros2_memory.core.errors import InvalidArgumentsError, QueryTimeoutError
-from ros2_memory.core.logging_setup import get_logger
+from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
-from ros2_memory.history.view import View
 from ros2_memory.serving.page.drawn_path import Box, path_in_box
 from ros2_memory.serving.page.moment import moment_shown, sightings_shown, stretch_shown
 from ros2_memory.serving.page.recordings import Recordings
@@ -43,8 +41,6 @@ if TYPE_CHECKING:
 
     _Work: TypeAlias = Callable[[QueryParams, Memory, Call], JsonObject]
 
-log = get_logger(__name__)
-
 SPAN_PATH: Final = "/page/span"
 MOMENT_PATH: Final = "/page/moment"
 
@@ -53,8 +49,6 @@ _HEADERS: Final = {
     "x-content-type-options": "nosniff",
     "cross-origin-resource-policy": "same-origin",
 }
-_WEEK_S: Final = 7 * 86_400.0
-_MOST_TRIES: Final = 5
 _LEAST_PIXEL_M: Final = 1e-4
 """Positions are stored as finely."""
 _LONGEST_LABEL: Final = 200
@@ -124,35 +118,6 @@ def named(memory: Memory) -> JsonObject:
     folder = memory.index.bag_dir.resolve()
     is_robot = memory.limits.kept is not None
     return {"name": gethostname() if is_robot else folder.name, "folder": str(folder)}
-
-
-def warm_up(dispatcher: Dispatcher) -> bool:
-    """Looks at the newest week while nobody asks, so that the first look of a page is a second one.
-
-    And at the static transforms of the newest session, so that the first transform is, too.
-    Returns whether that is done. What was joined until somebody asked stays, so that the next time
-    goes on from there.
-    """
-    call, memory = dispatcher.idle_call(), dispatcher.memory
-    if call is None:
-        return False
-    request = SpanRequest(last_s=_WEEK_S, patient=True)
-    try:
-        view = View(memory, call)
-        for bag in view.snapshot.bags[-1:]:
-            view.sessions.static(view.sessions.of(bag.recording))
-        Recordings(memory).shown(memory, call)
-        for _ in range(_MOST_TRIES):
-            shown = span_shown(memory, call, request)
-            if shown["latest"] is None or shown.keys() >= {"path", "events", "things"}:
-                return True
-            if call.deadline.expired():
-                return False
-    except QueryTimeoutError:
-        return False
-    except Exception:
-        log.exception("page_not_warmed_up")
-    return True
 
 
 def span_request(given: QueryParams) -> SpanRequest:
