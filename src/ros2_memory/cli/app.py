@@ -155,8 +155,6 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
     ),
     "config": CommandEntry("config.config", "show the configuration in force", {0: "it was shown"}),
 }
-_PICTURES: Final = ("path", "signal", "timeline", "recap")
-"""What `plot` draws; the first unless another is named."""
 COMMON_EXIT_CODES: Final[Mapping[int, str]] = {
     2: "the command could not run (stderr gives the reason)",
     INTERRUPTED: "interrupted before it finished",
@@ -217,9 +215,6 @@ class LazyCommand(TyperCommand):
         """Returns the context of the real command, which runs, completes and shows its help."""
         if self._name == "ask" and args and not args[0].startswith("-"):
             args = [TOOL_HELP if word in _HELP else word for word in args]
-        if self._name == "plot" and args and args[0] not in _PICTURES and Path(args[0]).exists():
-            picture = args.pop(1) if args[1:] and args[1] in _PICTURES else _PICTURES[0]
-            args = [picture, *args]
         return self._load().make_context(info_name, args, parent, **extra)
 
     def _load(self) -> "Command":

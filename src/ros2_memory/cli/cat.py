@@ -56,7 +56,6 @@ def cat(
         raise InvalidArgumentsError("give --limit or --tail, not both")
     if any(most is not None and most < 1 for most in (limit, tail)):
         raise InvalidArgumentsError("--limit and --tail must be more than 0")
-    topic, bags = bags.with_topic(topic, "cat")
     memory = bags.memory()
     view = View(memory, Call())
     name = resolve_topic(view, topic)

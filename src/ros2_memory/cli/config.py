@@ -2,8 +2,7 @@
 
 import json
 import os
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Final
 
 import typer
@@ -14,7 +13,6 @@ from ros2_memory.cli.options import AsJson, BagDir, Words, as_command, load_give
 from ros2_memory.cli.output import leaves, print_json, print_line, print_reply
 from ros2_memory.config import plain_values
 from ros2_memory.config_sources import GROUPS, Sources
-from ros2_memory.core.errors import ConfigError
 from ros2_memory.core.model import JsonValue
 
 _MASK: Final = "********"
@@ -34,56 +32,33 @@ def config_show(
 ) -> None:
     """Show the configuration as YAML, composed of files, environment and arguments; no secrets.
 
-    Names of sections or keys, such as server or server.port, show those alone. A comment shows
-    whether the server has a token, never the token itself.
+    A comment shows whether the server has a token, never the token itself.
     """
-    named = [word for word in words or () if re.fullmatch(r"[a-z_][\w.]*", word)]
-    settings, source = load_given(bag_dir, [word for word in words or () if word not in named])
-    values = _chosen(dict(leaves(plain_values(settings))), named)
+    settings, source = load_given(bag_dir, words)
+    values = dict(leaves(plain_values(settings)))
     if as_json:
         rows = {key: {"value": value, "set": source(key)} for key, value in values.items()}
         print_json(rows if sources else values)
     elif sources:
-        _print_sources(values, source, () if named else GROUPS)
+        _print_sources(values, source)
     else:
         sections: dict[str, dict[str, JsonValue]] = {}
         for key, value in values.items():
             section, _, name = key.partition(".")
             sections.setdefault(section, {})[name] = value
         print_line(yaml.safe_dump(sections, sort_keys=False, allow_unicode=True).rstrip())
-        for name in () if named else ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
+        for name in ("MEMORY_API_TOKEN", "MEMORY_API_TOKEN_FILE"):
             if os.environ.get(name):
                 print_line(f"# {name} is set: {_MASK}")
 
 
-def _chosen(values: Mapping[str, JsonValue], named: Sequence[str]) -> Mapping[str, JsonValue]:
-    """Returns the keys that are named, or are of a section that is; all where none is.
-
-    Raises:
-        ConfigError: there is no such section or key.
-    """
-    if not named:
-        return values
-    chosen: set[str] = set()
-    for name in named:
-        keys = [key for key in values if f"{key}.".startswith(f"{name}.")]
-        if not keys:
-            sections = ", ".join(dict.fromkeys(key.partition(".")[0] for key in values))
-            raise ConfigError(
-                f"{name}: there is no such section or key; the sections are {sections} "
-                "(to change a setting, write key=value)"
-            )
-        chosen.update(keys)
-    return {key: value for key, value in values.items() if key in chosen}
-
-
-def _print_sources(values: Mapping[str, JsonValue], source: Sources, groups: Iterable[str]) -> None:
+def _print_sources(values: Mapping[str, JsonValue], source: Sources) -> None:
     """Prints a row for each group's choice and for each key: its name, who set it, its value.
 
     A key of a group that only takes over another key's value names that one as its source.
     """
     print_line(f"# files are those of {source.folder}")
-    chosen = {group: source.choice(group) for group in groups}
+    chosen = {group: source.choice(group) for group in GROUPS}
     rows: list[JsonValue] = []
     for key, (value, who) in (chosen | {key: (values[key], source(key)) for key in values}).items():
         file, link, named_key = who.partition(", as ")

@@ -16,7 +16,7 @@ from functools import wraps
 from inspect import Parameter, Signature, signature
 from io import StringIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final, Self, TypeAlias, get_args
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, get_args
 
 import typer
 
@@ -397,28 +397,6 @@ class Bags:
     def memory(self, *more: str) -> "Memory":
         """Opens the memory of these bags as `open_memory` does; `more` are further settings."""
         return open_memory(self.settings(*more), verbose=self.verbose)
-
-    def with_topic(self, first: str, command: str) -> tuple[str, Self]:
-        """Returns the topic of a command, before which a path may stand, and the bags.
-
-        Raises:
-            InvalidArgumentsError: there is a path, and no topic; or a path that does not exist.
-        """
-        others, is_there = self.words or [], _exists(first)
-        second = next((word for word in others if "=" not in word), None)
-        if _exists(second) if second is not None else not is_there:
-            return first, self
-        if second is None:
-            kind = "folder" if Path(first).is_dir() else "file"
-            raise InvalidArgumentsError(
-                f"{first} is a {kind}, not a topic; write `ros2-memory {command} {first} TOPIC`"
-            )
-        if not is_there:
-            raise InvalidArgumentsError(
-                f"neither {first} nor {second} is a file or folder that is there; name a bag or a "
-                "folder of bags beside the topic"
-            )
-        return second, replace(self, words=[first, *(word for word in others if word != second)])
 
 
 @dataclass(frozen=True, kw_only=True)

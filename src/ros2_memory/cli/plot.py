@@ -197,7 +197,6 @@ def plot_signal(
     bags: Bags,
 ) -> None:
     """Draw numeric fields of a topic over time, one row for each field."""
-    topic, bags = bags.with_topic(topic, "plot signal")
     asked = _checked_request(out, bags, times)
     name = resolve_topic(asked.view, topic)
     with spinner(f"reading {name}"):

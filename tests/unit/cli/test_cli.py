@@ -128,11 +128,6 @@ class TestConfig:
         assert shown["recording"]["bag_dir"] == str(bag_dir)
         assert shown["storage"]["_target_"].startswith("ros2_memory.")
 
-    def test_a_section_or_a_key_alone(self, exits: Program) -> None:
-        shown = yaml.safe_load(exits(0, "config show server data.now server.port=9300").out)
-        assert (shown["server"]["port"], [*shown["data"]]) == (9300, ["now"])
-        assert [*shown] == ["data", "server"]
-
     def test_a_token_is_not(self, monkeypatch: pytest.MonkeyPatch, exits: Program) -> None:
         monkeypatch.setenv("MEMORY_API_TOKEN", "a-secret-that-is-long-enough")
         shown = exits(0, "config show").out
