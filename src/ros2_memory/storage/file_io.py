@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 EMPTY_FILE: Final = "empty file: nothing had reached the disk"
-_MOST_HELD_BYTES: Final = 1 << 20
 LINK: Final = "a symbolic link, which is not followed"
 
 
@@ -66,7 +65,6 @@ class OpenFile:
         self.size = status.st_size
         times = status.st_mtime_ns, status.st_ino, status.st_ctime_ns
         self.key = FileKey(str(path), status.st_size, *times)
-        self._held = b""
 
     def __enter__(self) -> Self:
         """Returns the open file."""
@@ -76,15 +74,6 @@ class OpenFile:
         """Closes it."""
         os.close(self._descriptor)
 
-    def hold(self) -> None:
-        """Reads all of a small file, of which many parts are needed, at once.
-
-        Raises:
-            UnreadableError: it became shorter.
-        """
-        if self.size <= _MOST_HELD_BYTES:
-            self._held = self.read(0, self.size)
-
     def read(self, offset: int, length: int) -> bytes:
         """Returns exactly `length` bytes from `offset`.
 
@@ -93,8 +82,6 @@ class OpenFile:
         """
         if offset < 0 or length < 0 or offset + length > self.size:
             raise UnreadableError("damaged: it refers to bytes past its end")
-        if self._held:
-            return self._held[offset : offset + length]
         pieces: list[bytes] = []
         missing = length
         while missing:
@@ -114,8 +101,6 @@ class OpenFile:
         Raises:
             UnreadableError: the file became shorter.
         """
-        if self._held:
-            return [self._held[offset : offset + length] for offset in offsets]
         # One call for all: a file has a chunk, and so an offset, for each 16 KiB to 1 MiB.
         read, descriptor = os.pread, self._descriptor
         pieces = [(offset, read(descriptor, length, offset)) for offset in offsets]

@@ -136,7 +136,6 @@ class McapBags:
     def summarize(self, path: Path) -> BagSummary:
         """Returns topics with exact counts and first and last log times."""
         with OpenFile(path) as file:
-            file.hold()
             index = _Reading(self, file, has_totals=True).verified()
         return summarize_channels(
             index.channels,

@@ -86,7 +86,6 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
         OSError, MemoryError: the disk or the machine fails.
         EpisodicError: what `limit.take_turn` raises, which groups call likewise.
     """
-    whole = _at_once(file, chunks)
     begin = 0
     while begin < len(chunks):
         parts: list[bytes] = []
@@ -97,18 +96,19 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
         try:
             while end < len(chunks) and left > 0 and len(parts) < MAX_GROUP_CHUNKS:
                 chunk = chunks[end]
-                body, index = _bytes_of(file, chunk, whole, chunks[0].offset)
+                record = file.read(chunk.offset, chunk.length + chunk.index_length)
+                body = record[RECORD.size : chunk.length]
                 if parts and CHUNK.unpack_from(body)[2] > left:
                     break
                 end += 1
                 head = chunk_head(body)
                 compressed = body[head.data_at : head.data_at + head.data_size]
                 parts.append(decompressed_chunk(head, compressed, limit))
-                indexes.append(index)
+                indexes.append(record[chunk.length :])
                 left -= len(parts[-1])
                 if BATCH_BYTES - left > LARGE_BYTES:
                     limit.take_turn()
-            del body
+            del record, body
             buffer = parts[0] if len(parts) == 1 else b"".join(parts)
         except (OSError, MemoryError, EpisodicError):
             raise
@@ -119,30 +119,6 @@ def read_groups(file: OpenFile, chunks: Sequence[Chunk], limit: SizeLimit) -> It
         yield ReadChunks(chunks[begin : max(end, begin + 1)], buffer, sizes, indexes)
         del buffer
         begin = max(end, begin + 1)
-
-
-_AT_ONCE_BYTES: Final = 4 << 20
-
-
-def _at_once(file: OpenFile, chunks: Sequence[Chunk]) -> bytes:
-    """Returns the bytes of all chunks if they are few and follow each other; else nothing."""
-    if len(chunks) < 2:
-        return b""
-    first, last = chunks[0], chunks[-1]
-    span = last.offset + last.length + last.index_length - first.offset
-    if 0 < span <= _AT_ONCE_BYTES:
-        return file.read(first.offset, span)
-    return b""
-
-
-def _bytes_of(file: OpenFile, chunk: Chunk, whole: bytes, base: int) -> tuple[bytes, bytes]:
-    """Returns the body of a chunk's record, and the message indexes behind it."""
-    size = chunk.length + chunk.index_length
-    at = chunk.offset - base
-    if not 0 <= at <= at + size <= len(whole):
-        whole, at = file.read(chunk.offset, size), 0
-    end = at + chunk.length
-    return whole[at + RECORD.size : end], whole[end : at + size]
 
 
 def compared(
