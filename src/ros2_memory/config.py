@@ -710,12 +710,9 @@ def load_explained(
             )
         _append_interface_folder(composed, given)
         data = OmegaConf.to_container(composed, resolve=True, throw_on_missing=True)
-        raw = OmegaConf.to_container(composed, resolve=False)
     # What users keep beside them wins over what is shipped, unless they chose a folder.
     folders = [folder] if "MEMORY_CONFIG_DIR" in given else [Path("config").absolute(), folder]
-    settings = validated(
-        Settings, data, config_dirs=folders, source=sources, raw=raw, adapters=_NODES
-    )
+    settings = validated(Settings, data, config_dirs=folders, source=sources, adapters=_NODES)
     return settings, sources
 
 

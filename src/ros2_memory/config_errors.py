@@ -55,7 +55,6 @@ def validated(
     *,
     config_dirs: Sequence[Path],
     source: Callable[[str], str],
-    raw: object = None,
     adapters: Mapping[str, type] | None = None,
 ) -> _T:
     """Returns `data` as an instance of `model`.
@@ -64,9 +63,8 @@ def validated(
         model: a class of the configuration.
         data: the composed configuration, interpolations resolved.
         config_dirs: the folders in which a path that begins with `config/` is looked for.
-        source: returns who set the key of a dot-path, as a phrase that follows "set".
-        raw: `data` with its interpolations unresolved. A key that only repeats another key's
-            refused value is not reported again.
+        source: returns who set the key of a dot-path, as a phrase that follows "set". A key that
+            is set as another one, whose value is refused, is not reported again.
         adapters: the classes of sections that are chosen by their `_target_`.
 
     Raises:
@@ -77,11 +75,11 @@ def validated(
         return TypeAdapter(model).validate_python(data, context=config_dirs)
     except ValidationError as error:
         faults = [(_dot_path(fault, nodes), fault) for fault in error.errors(include_url=False)]
-    refused = {key for key, _fault in faults}
+    as_refused = tuple(f", as {_setting(key)}" for key, _fault in faults)
     lines = [
         f"{_sentence(model, key, fault, nodes)} (set {source(key)})"
         for key, fault in faults
-        if _interpolated_key(raw, key) not in refused
+        if not source(_setting(key)).endswith(as_refused)
     ]
     raise ConfigError("\n".join(lines))
 
@@ -132,15 +130,9 @@ def _dot_path(fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
     return f"{key}._target_" if fault["type"].startswith("union_tag") else key
 
 
-def _interpolated_key(raw: object, key: str) -> str | None:
-    """Returns the key that this one takes its value from (`${reader.chunk_cache_mb}`), if any."""
-    parts = key.split(".")
-    for depth, part in enumerate(parts, start=1):
-        raw = raw.get(part) if isinstance(raw, dict) else None
-        link = re.fullmatch(r"\$\{([\w.]+)\}", raw) if isinstance(raw, str) else None
-        if link:
-            return ".".join([link[1], *parts[depth:]])
-    return None
+def _setting(key: str) -> str:
+    """Returns a fault's section and key, without what lies deeper."""
+    return ".".join(key.split(".")[:2])
 
 
 def _sentence(model: type, key: str, fault: ErrorDetails, nodes: Mapping[str, type]) -> str:
