@@ -71,11 +71,7 @@ class Coverage:
         for covered in self.segments:
             span = covered.segment.spans.get(topic) if covered.missing else None
             if span is not None and window.overlaps(*span):
-                missing = (bag for bag in covered.missing if window.overlaps(bag.start, bag.end))
-                files = {bag.file for bag in missing}
-                for extent in covered.segment.extents(topic, window) if files else ():
-                    if extent.bag.file in files:
-                        yield extent
+                yield from covered.segment.extents(topic, window, covered.numbers < 0)
 
     def _are_there(self, numbers: IntArray) -> NDArray[np.bool_]:
         """Returns which of some numbers are of bags of the timeline."""

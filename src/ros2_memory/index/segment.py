@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from ros2_memory.core.arrays import Flags
+
 
 RARE_NS: Final[Ns] = 5 * NS_PER_S
 """A topic with a message this often, or less often, is rare."""
@@ -282,12 +284,19 @@ class Segment:
         # A path for each bag of a week would take longer than all else.
         return [Path(folder or "/") for folder in self.bags.folders]
 
-    def extents(self, topic: str, window: TimeWindow) -> Iterator[TopicExtent]:
-        """Yields the bags that hold the topic in a window, in order, once for each type."""
+    def extents(
+        self, topic: str, window: TimeWindow, among: Flags | None = None
+    ) -> Iterator[TopicExtent]:
+        """Yields the bags that hold the topic in a window, in order, once for each type.
+
+        Of all bags, or `among` some of them.
+        """
         column = self.column(topic)
         if column is None:
             return
         is_inside = (column.firsts < window.stop) & (column.lasts >= window.start)
+        if among is not None:
+            is_inside &= among[column.bags]
         rows, firsts, lasts, _ = (values[is_inside] for values in column)
         yield from map(TopicExtent, self.bags.at(rows), firsts.tolist(), lasts.tolist())
 

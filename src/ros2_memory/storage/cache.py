@@ -18,6 +18,8 @@ T = TypeVar("T")
 
 _SPARED: Final = 3
 """Values that stay, though they are older, for each that goes."""
+_ENTRY_BYTES: Final = 200
+"""What an entry takes besides its value: its key, and its place among the others."""
 _SHARED_BYTES: Final = 32 << 10
 """The size up to which a channel is shared; a longer one belongs to its file alone."""
 
@@ -58,6 +60,7 @@ class ByteLru(Generic[T]):
     def put(self, key: Hashable, value: T, size: int) -> None:
         """Caches `value`, which takes about `size` bytes, and drops others."""
         entries = self._all
+        size += _ENTRY_BYTES
         with entries.lock:
             _, replaced = entries.values.pop((self, key), (None, 0))
             entries.bytes -= replaced

@@ -122,8 +122,9 @@ class McapBags:
         large: LargeReads | None = None,
     ) -> None:
         self.limit = SizeLimit(max_chunk_mb << 20, (large or LargeReads()).acquire)
-        self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 2)
-        self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) // 2)
+        # Many programs write chunks of 4 MiB.
+        self.chunks: ByteLru[bytes] = ByteLru((cache_mb << 20) * 3 // 4)
+        self.indexes: ByteLru[McapIndex | Pairs] = ByteLru((cache_mb << 20) // 4)
         self.contradictions: ByteLru[str] = ByteLru(_REASONS_BYTES)
         # By the hashes of their keys: to fill a store each file of a history is read twice.
         self.sound: set[int] = set()
