@@ -461,9 +461,7 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     if not any(bag.reaches_into(asked) for bag in misdated):
         for gap in view.gaps(asked, around=True):
             return gap
-    segments = snapshot.timeline.segments_in(asked)
-    bags = (bag for segment in segments for bag in segment.bags if not is_carried(bag.file))
-    if any(bag.reaches_into(asked) for bag in bags):
+    if not all(is_carried(bag.file) for bag in snapshot.timeline.overlapping(asked)):
         return None
     start, end = asked.asked()
     if end < earliest:

@@ -184,11 +184,12 @@ class Watching:
         self._needed = tuple(dict.fromkeys(topics))
         self._scans: list[Scan] = []
         self._may_be_repeated = view.stream.may_be_repeated(self._topics)
+        files = chain.from_iterable(segment.bags.files() for segment in timeline.segments)
         rows = [
             row
-            for row, bag in enumerate(timeline.bags)
+            for row, file in enumerate(files)
             # Carried messages that nothing is seen by reach over all of the history.
-            if not is_carried(bag.file) or any(map(bag.summary.of, self._needed))
+            if not is_carried(file) or any(map(timeline.bags[row].summary.of, self._needed))
         ]
         self._bags = np.array(rows, np.int64)
         self._folder_of = timeline.folder_numbers[self._bags]
