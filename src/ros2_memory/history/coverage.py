@@ -461,7 +461,9 @@ def gap_around(view: View, asked: TimeWindow) -> tuple[Ns | None, Ns | None] | N
     if not any(bag.reaches_into(asked) for bag in misdated):
         for gap in view.gaps(asked, around=True):
             return gap
-    if not all(is_carried(bag.file) for bag in snapshot.timeline.overlapping(asked)):
+    segments = snapshot.timeline.segments_in(asked)
+    bags = (bag for segment in segments for bag in segment.overlapping(asked))
+    if not all(is_carried(bag.file) for bag in bags):
         return None
     start, end = asked.asked()
     if end < earliest:
