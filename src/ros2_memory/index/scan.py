@@ -10,6 +10,7 @@ import errno
 import os
 import stat
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -272,10 +273,9 @@ class Tree:
                 gone = {file: stamp for file, stamp in folder.stamps.items() if file not in there}
                 result.before.update(gone)
                 result.gone.update(gone)
-        for file in watched:
-            self._look_up(file, result)
-        for file in self._next_patrol() if patrolling else ():
-            self._look_up(file, result, settled_at=now)
+        self._look_up(watched, result)
+        if patrolling:
+            self._look_up(self._next_patrol(), result, settled_at=now)
         for file in result.gone & self.saved.keys():
             del self.saved[file]
         moments = self._moments
@@ -294,8 +294,7 @@ class Tree:
         for path in second:
             result.stamps.pop(path, None)
         result.gone.update(second - self._second_links)
-        for path in self._second_links - second - result.gone:
-            self._look_up(path, result)
+        self._look_up(self._second_links - second - result.gone, result)
         self._second_links = second
 
     def _find_second_links(self) -> set[str]:
@@ -427,10 +426,27 @@ class Tree:
                 result.stamps[file], result.before[file] = stamp, known_stamp
         return folder
 
-    def _look_up(self, path: str, result: ScanResult, settled_at: Ns | None = None) -> None:
-        if path in result.stamps or path in result.gone:
-            return
-        folder, before = self._folders.get(_folder_of(path)), self.stamp(path)
+    def _look_up(
+        self, paths: Iterable[str], result: ScanResult, settled_at: Ns | None = None
+    ) -> None:
+        """Adds files as they are now; with `settled_at` those alone that may have changed."""
+        for folder_path, files in groupby(sorted(paths, key=_folder_of), _folder_of):
+            folder = self._folders.get(folder_path)
+            # Made once for all files: a folder may have a week of bags.
+            stamps = {} if folder is None else folder.stamps
+            for path in files:
+                if path not in result.stamps and path not in result.gone:
+                    before = stamps.get(path, _UNSEEN)
+                    self._look_at(path, folder, before, result, settled_at)
+
+    def _look_at(
+        self,
+        path: str,
+        folder: _Folder | None,
+        before: Stamp,
+        result: ScanResult,
+        settled_at: Ns | None,
+    ) -> None:
         try:
             stamp = Stamp.of(os.lstat(path), folder.sidecar_ns if folder else 0)
         except OSError as error:
