@@ -93,8 +93,8 @@ _QUERY_MARGIN_S: Final = 0.5
 """How much before the call its query times out, so that the client receives the query's error."""
 
 _REPORTED_WAIT_S: Final = 0.5
-_LONG_S: Final = 0.1
-"""An answer that took longer used so much memory that what is free of it goes back."""
+_LONG_S: Final = 0.02
+"""After an answer that took longer, free memory goes back, which takes a millisecond."""
 _LOGGED_CHARS: Final = 300
 _WRITES: Final = (
     "it needs a recorder, which alone saves and deletes bags, and server.write_tools=true; with "
