@@ -143,14 +143,22 @@ class _Folder:
     @property
     def stamps(self) -> dict[str, Stamp]:
         """Of all bags, by path."""
-        if not self.names:
-            return self.newer
-        paths = (f"{self.path.rstrip('/')}/{name}" for name in self.names.split("/"))
-        rows = (
-            Stamp(size, mtime, ctime, inode, self.sidecar_ns)
-            for size, mtime, ctime, inode in self.rows.tolist()
-        )
-        return dict(zip(paths, rows, strict=True)) | self.newer
+        names = self.names.split("/") if self.names else []
+        return self._with_stamps(names, self.rows)
+
+    def stamps_of(self, paths: Iterable[str]) -> dict[str, Stamp]:
+        """Of those of some bags that it has, by path: a folder may have a week of others."""
+        wanted, names = {path.rpartition("/")[2] for path in paths}, self.names.split("/")
+        rows = [row for row, name in enumerate(names) if name in wanted]
+        return self._with_stamps([names[row] for row in rows], self.rows[rows])
+
+    def _with_stamps(self, names: Sequence[str], rows: NDArray[np.void]) -> dict[str, Stamp]:
+        root, sidecar = self.path.rstrip("/"), self.sidecar_ns
+        found = {
+            f"{root}/{name}": Stamp(size, mtime, ctime, inode, sidecar)
+            for name, (size, mtime, ctime, inode) in zip(names, rows.tolist(), strict=True)
+        }
+        return found | self.newer
 
     def keep(self, stamps: dict[str, Stamp]) -> None:
         """Has the directory hold these bags."""
@@ -325,7 +333,7 @@ class Tree:
     def stamp(self, path: str) -> Stamp:
         """Returns the stamp of a file that a scan returned."""
         folder = self._folders.get(_folder_of(path))
-        return _UNSEEN if folder is None else folder.stamps.get(path, _UNSEEN)
+        return _UNSEEN if folder is None else folder.stamps_of([path]).get(path, _UNSEEN)
 
     def lose(self, path: str) -> None:
         """Has the next scan return a file if it is there, whatever the mtime of its folder."""
@@ -431,10 +439,9 @@ class Tree:
     ) -> None:
         """Adds files as they are now; with `settled_at` those alone that may have changed."""
         for folder_path, files in groupby(sorted(paths, key=_folder_of), _folder_of):
-            folder = self._folders.get(folder_path)
-            # Made once for all files: a folder may have a week of bags.
-            stamps = {} if folder is None else folder.stamps
-            for path in files:
+            folder, in_folder = self._folders.get(folder_path), [*files]
+            stamps = {} if folder is None else folder.stamps_of(in_folder)
+            for path in in_folder:
                 if path not in result.stamps and path not in result.gone:
                     before = stamps.get(path, _UNSEEN)
                     self._look_at(path, folder, before, result, settled_at)
