@@ -76,7 +76,9 @@ class Timeline:
 
         def bags_around(bag: BagFile) -> list[BagFile]:
             at = self._position(bag)
-            return touched.setdefault(at, list(self.segments[at].bags))
+            if at not in touched:
+                touched[at] = [*self.segments[at].bags]
+            return touched[at]
 
         for bag in removed:
             bags_around(bag).remove(bag)
