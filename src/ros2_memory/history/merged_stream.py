@@ -10,7 +10,6 @@ Such a message counts once too, at its earliest log time, however long ago that 
 from __future__ import annotations
 
 import heapq
-from bisect import bisect_left, bisect_right
 from collections import Counter, deque
 from functools import partial
 from itertools import chain, pairwise
@@ -101,17 +100,18 @@ class MergedStream:
         return self.newest(topic, TimeWindow(MIN_NS, before))
 
     def _segment_windows(self, topics: Sequence[str], window: TimeWindow) -> list[TimeWindow]:
-        """Returns the window cut where segments begin, to hold few bags at a time."""
-        segments = self._timeline.segments
-        begin = bisect_right(segments, window.start, key=_start_of)
-        end = bisect_left(segments, window.stop, begin, key=_start_of)
-        held = (
-            segment
-            for segment in segments[begin:end]
-            if not segment.spans.keys().isdisjoint(topics)
-        )
-        edges = [window.start, *dict.fromkeys(map(_start_of, held)), window.stop]
-        return [TimeWindow(start, stop) for start, stop in pairwise(edges)]
+        """Returns the window cut where segments begin, to hold few bags at a time.
+
+        And behind the first, and before the last message in each: many ask for no more.
+        """
+        edges = {window.start, window.stop}
+        for segment in self._timeline.segments_in(window):
+            spans = [segment.spans[topic] for topic in topics if topic in segment.spans]
+            if spans:
+                first, last = min(first for first, _ in spans), max(last for _, last in spans)
+                edges.update((_start_of(segment), first + 1, last))
+        inside = sorted(edge for edge in edges if window.start <= edge <= window.stop)
+        return [TimeWindow(start, stop) for start, stop in pairwise(inside)]
 
     def _messages_in(
         self, topics: Sequence[str], window: TimeWindow, *, newest_first: bool

@@ -34,6 +34,7 @@ from ros2_memory.core.timebase import MAX_NS, Ns
 from ros2_memory.things.labels import Labels, moves_by_itself
 from ros2_memory.things.places import (
     GATE_MM,
+    MIDDLE,
     Sightings,
     places_of,
     poorly_localised,
@@ -72,6 +73,9 @@ _TINY_SHARE: Final = 0.1
 _BESIDE_SHARE: Final = 0.2
 _SEVERAL_SHARE: Final = 0.1
 """Where so many slices have several of a label at one place, it is no single thing that moves."""
+_FEWEST_IN_PART: Final = 10
+_SEVERAL_IN_PART: Final = 0.5
+"""Nor where so many have several in that part of time in which most of these slices are."""
 _FEWEST_BESIDE: Final = 3
 _NEWEST_BESIDE: Final = 9
 """So many slices say how many there are now: of more, some may have been taken away since."""
@@ -509,7 +513,8 @@ def _find_places(groups: Sequence[_Group], observed: _Observations) -> None:
 def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]:
     """Adds the places of several things that stand together; yields the spots of the others."""
     rows = observed.firm(group.rows)
-    x, y, z, slices = observed.sights.spots[rows][:, [Spot.X, Spot.Y, Spot.Z, Spot.SLICE]].T
+    names = (Spot.X, Spot.Y, Spot.Z, Spot.SLICE)
+    x, y, z, slices = (observed.sights.spots[rows, name] for name in names)
     place = np.full(len(rows), -1, np.int64)
     # Heights that are next to each other on one floor are not far apart.
     by_height = np.argsort(z, kind="stable")
@@ -519,8 +524,8 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
         place[floor] = np.where(on_floor < 0, -1, on_floor + place.max(initial=-1) + 1)
     rows, place = rows[place >= 0], place[place >= 0]
     # Where slices have several spots of the label, these are things that stand together.
-    distinct = np.bincount(distinct_rows((place, observed.groups[rows]))[0][:, 0])
-    several = np.bincount(place) - distinct > _SEVERAL_SHARE * distinct
+    pairs, pair_of = distinct_rows((place, observed.groups[rows]))
+    several = _stand_together(pairs[:, 0], np.bincount(pair_of))
     counts = np.bincount(place, observed.counts[rows])
     ends = np.cumsum(np.bincount(place))
     by_place = np.split(rows[np.argsort(place, kind="stable")], ends[:-1])
@@ -529,6 +534,21 @@ def _add_shared_places(group: _Group, observed: _Observations) -> Iterator[Ints]
             group.places.append(rows_there)
         elif counts[number] >= _FEWEST:
             yield rows_there
+
+
+def _stand_together(place: Ints, spots: Ints) -> list[bool]:
+    """Returns of which places slices have several spots: in all of time, or in one part of it.
+
+    `spots` are those in each slice of a place, in order of time; places are in order.
+    """
+    together = []
+    for in_slice in np.split(spots, np.flatnonzero(np.diff(place)) + 1):
+        has_several = np.flatnonzero(in_slice > 1)
+        begin, end = np.percentile(has_several, MIDDLE) if has_several.size else (0, len(spots))
+        in_part = _SEVERAL_IN_PART * (end - begin) < has_several.size >= _FEWEST_IN_PART
+        share_of_all = (in_slice - 1).sum() / len(in_slice)
+        together.append(bool(in_part or share_of_all > _SEVERAL_SHARE))
+    return together
 
 
 def _find_stays(groups: Sequence[_Group], observed: _Observations) -> None:
@@ -597,7 +617,10 @@ def _placed(
         total.tolist(),
         np.split(rows, begins[1:]),
         *zip(*stays, strict=True),
-        [stay.hits < max(_FEWEST, _LOWEST_RATE * stay.messages) for _, stay in stays],
+        [
+            stay.clear_hits < _FEWEST or stay.hits < _LOWEST_RATE * stay.messages
+            for _, stay in stays
+        ],
     )
     numbers = (column.tolist() for column in columns)
     return [PlacedStay(*row) for row in zip(*numbers, *others, strict=True)]

@@ -23,7 +23,7 @@ odometry, which shows that it had been off.
 from __future__ import annotations
 
 import math
-from collections import defaultdict
+from collections import defaultdict, deque
 from itertools import combinations, pairwise, product, starmap
 from typing import TYPE_CHECKING, Final, NamedTuple
 
@@ -53,7 +53,7 @@ _HALO_SHARE: Final = 0.1
 """A peak within `GATE_MM` of another one, and lighter than this share of it, is its noise."""
 _OWN_SHARE: Final = 0.5
 """But for one that has this share of its weight while it is seen: a thing that came there."""
-_MIDDLE: Final = (10, 90)
+MIDDLE: Final = (10, 90)
 """Between these percentiles of its spots: noise of another one may have been there before."""
 _SCATTER_MM: Final = 800
 _FEW: Final = 25.0
@@ -89,7 +89,7 @@ class _Spots(NamedTuple):
     def share(self, cells: Flags, others: Flags) -> float:
         """Returns the weight of some cells by that of others, while most of it is seen."""
         is_inside = cells[self.cell]
-        first, last = np.percentile(self.slice[is_inside], _MIDDLE)
+        first, last = np.percentile(self.slice[is_inside], MIDDLE)
         weight = self.weight * ((self.slice >= first) & (self.slice <= last))
         return float(weight[is_inside].sum() / max(weight[others[self.cell]].sum(), 1.0))
 
@@ -319,11 +319,11 @@ def _are_moved(series: _Series, variance: Floats) -> Flags:
     """Returns the sightings before which a thing was moved; `variance` of visits is by thing."""
     moved = np.zeros(len(series.n), np.bool_)
     begins = np.flatnonzero(np.diff(series.thing, prepend=-1)).tolist()
-    waiting = [*pairwise([*begins, len(moved)])]
+    waiting = deque(pairwise([*begins, len(moved)]))
     while waiting:
         spans, size = [], 0
         while waiting and size < _AT_ONCE:
-            start, stop = waiting.pop()
+            start, stop = waiting.popleft()
             spans.append((start, stop))
             size += stop - start
         rows = np.concatenate([np.arange(*span) for span in spans])
@@ -468,7 +468,8 @@ def _alternate(sights: JoinedSights, counts: Ints, one: Mask, other: Mask) -> bo
     epoch = sights.epochs[spots[of_both, Spot.SLICE]]
     for number in np.unique(epoch).tolist():
         rows = of_both[epoch == number]
-        x, y, slices, label = spots[rows][:, [Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL]].T
+        names = (Spot.X, Spot.Y, Spot.SLICE, Spot.LABEL)
+        x, y, slices, label = (spots[rows, name] for name in names)
         place = places_of(x, y, counts[rows], slices)
         for here in (place == nearest for nearest in range(int(place.max(initial=-1)) + 1)):
             is_other = other[label[here]].astype(np.int64)

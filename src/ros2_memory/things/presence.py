@@ -60,7 +60,7 @@ _MISSED_BY_CHANCE: Final = 0.01
 _LEFT_BY_CHANCE: Final = 0.05
 _FEWEST_HITS: Final = 3
 _RARE_OF: Final = 20
-"""A cell with fewer hits sees a place only if it has no more messages than so many for each."""
+"""A cell sees a place if some hits in a row, or all, are in no more messages than so many each."""
 _LEAST_RATE: Final = 0.1
 """In looks with a hit, a cell that sees a place has one in as many of the messages, at least."""
 _MANY_LOOKS: Final = 10
@@ -95,6 +95,9 @@ class Cells:
         self.looks_in = np.bincount(self.cell)
         self.messages_in = np.bincount(self.cell, self.n).astype(np.int64)
         self._starts = np.cumsum(self.looks_in) - self.looks_in
+        # How many messages looks from the same cell before have, and those of other cells.
+        self.messages_before = np.empty(len(order), np.int64)
+        self.messages_before[order] = np.cumsum(self.n[order], dtype=np.int64) - self.n[order]
         after, before = order[1:], order[:-1]
         is_next = self.cell[after] == self.cell[before]
         is_next &= np.diff(self.slice[order].astype(np.int64)) <= 1
@@ -259,6 +262,7 @@ class Evidence(NamedTuple):
         hits: how many messages of each of these looks have the label there.
         blind: the places and slices, as keys in order, of hits by messages without a known pose.
         times: how many hits each of these has.
+        sees: whether each of the looks is from a cell that sees the place.
         fair: whether a look that has no hit could have: from a cell that sees the place, and with
             the place well inside the field of view.
     """
@@ -269,6 +273,7 @@ class Evidence(NamedTuple):
     hits: Ints
     blind: Ints
     times: Ints
+    sees: Flags
     fair: Flags
 
     def at(self, place: int) -> Evidence:
@@ -284,6 +289,7 @@ class Evidence(NamedTuple):
             narrowed(self.hits[looks]),
             narrowed(_number(self.blind[blind])),
             narrowed(self.times[blind]),
+            self.sees[looks].copy(),
             self.fair[looks].copy(),
         )
 
@@ -317,8 +323,9 @@ class Looks(NamedTuple):
 class Stay(NamedTuple):
     """A time at a place: the slices of the first and the last sighting, and what came after.
 
-    `messages` are those of the looks that saw it. Between the slices `firm_first` and `firm_last`
-    single detections, which may be false, are not needed to see it there.
+    `messages` are those of the looks that saw it, `clear_hits` the hits from cells that see it.
+    Between the slices `firm_first` and `firm_last` single detections, which may be false, are not
+    needed to see it there.
     `left` is the slice by which it was seen to be gone (chance of missing it below 5 %), or None.
     """
 
@@ -327,6 +334,7 @@ class Stay(NamedTuple):
     firm_first: int
     firm_last: int
     hits: int
+    clear_hits: int
     messages: int
     left: int | None
 
@@ -352,7 +360,7 @@ def evidence_at(
     messages = cells.n[_number(hit_looks)]
     np.minimum(hits_of, messages, out=hits_of)
     hit_cells, cell_of = np.unique(cells.cells_of(hit_looks), return_inverse=True)
-    sees = _sees(cells, hit_cells, cell_of, messages, hits_of)
+    sees = _sees(cells, hit_cells, cell_of, _number(hit_looks), hits_of)
     # From a dock, ten thousands of looks are at each place of which it once had a false detection.
     hit_slices = _keys(_place(hit_looks), cells.slice[_number(hit_looks)])
     beside = cells.looks_during(_distinct(np.concatenate((hit_slices, blind))))
@@ -367,7 +375,8 @@ def evidence_at(
     looks, cell = looks[order], cell[order]
     hits = np.zeros(len(looks), np.int64)
     hits[np.searchsorted(looks, hit_looks)] = hits_of
-    fair = sees[cell]
+    look_sees = sees[cell]
+    fair = look_sees.copy()
     fair[fair] = _are_in_view(cells, fields, places, looks[fair])
     numbers = _number(looks)
     n = cells.n[numbers].astype(np.int64)
@@ -375,7 +384,7 @@ def evidence_at(
         of_label = np.flatnonzero(label[_place(looks)] == nth)
         n[of_label] -= cells.totals_in(numbers[of_label], unplaced[nth])
     cell, n, hits = map(narrowed, (cell, np.maximum(n, hits), hits))
-    return Evidence(looks, cell, n, hits, blind, times, fair)
+    return Evidence(looks, cell, n, hits, blind, times, look_sees, fair)
 
 
 def _are_in_view(cells: Cells, fields: Floats, places: Floats, looks: Ints) -> Flags:
@@ -423,19 +432,20 @@ def _are_in(ordered: Ints, keys: Ints) -> Flags:
     return are_in
 
 
-def _sees(cells: Cells, hit_cells: Ints, cell: Ints, n: Ints, hits: Ints) -> Flags:
+def _sees(cells: Cells, hit_cells: Ints, cell: Ints, hit_looks: Ints, hits: Ints) -> Flags:
     """Returns which cells see a place, not only report it falsely once in a while.
 
-    `cell` has the number among these of each look that saw it, `n` its messages. From a dock that
+    `cell` has the number among these of each look that saw it, in order of time. From a dock that
     faces a wall, ten thousands of messages have some false detections behind it.
     """
     place, number = _place(hit_cells), _number(hit_cells)
     hits_in, messages = np.bincount(cell, hits, len(hit_cells)), cells.messages_in[number]
-    looks, hit_looks = cells.looks_in[number], np.bincount(cell, minlength=len(hit_cells))
-    is_frequent = (hits_in >= _FEWEST_HITS) | (messages <= _RARE_OF * hits_in)
-    is_dense = hits_in >= _LEAST_RATE * np.bincount(cell, n, len(hit_cells))
+    looks, own_looks = cells.looks_in[number], np.bincount(cell, minlength=len(hit_cells))
+    is_frequent = messages <= _RARE_OF * hits_in
+    is_frequent[_in_a_row(cell, hits, cells.messages_before[hit_looks])] = True
+    is_dense = hits_in >= _LEAST_RATE * np.bincount(cell, cells.n[hit_looks], len(hit_cells))
     # What other cells see most of the time, a cell that sees it does not miss nearly always.
-    share, weight = hit_looks / looks, np.minimum(looks, _MANY_LOOKS)
+    share, weight = own_looks / looks, np.minimum(looks, _MANY_LOOKS)
     others = np.bincount(place, weight)[place] - weight
     pooled = np.bincount(place, share * weight)[place] - share * weight
     is_blocked = looks >= _MANY_LOOKS
@@ -444,9 +454,26 @@ def _sees(cells: Cells, hit_cells: Ints, cell: Ints, n: Ints, hits: Ints) -> Fla
     return sees
 
 
+def _in_a_row(cell: Ints, hits: Ints, messages_before: Ints) -> Ints:
+    """Returns the cells of which `_FEWEST_HITS` in a row are in few messages.
+
+    `hits` are those of each look of a cell, in order of time.
+    """
+    order = np.argsort(cell, kind="stable")
+    cell, before = cell[order], messages_before[order]
+    running = np.cumsum(hits[order])
+    until = np.searchsorted(running, running - hits[order] + _FEWEST_HITS)
+    begin = np.flatnonzero(until < len(cell))
+    end = until[begin]
+    is_row = (cell[end] == cell[begin]) & (before[end] - before[begin] <= _RARE_OF * _FEWEST_HITS)
+    cells: Ints = cell[begin[is_row]]
+    return cells
+
+
 def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     """Yields the stays at places, each with the number of its place, in order of time."""
-    slices, odds, hits, messages = _by_slice(cells, evidence)
+    slices, odds, *counts = _by_slice(cells, evidence)
+    hits = counts[0]
     start, stop = _present(odds, _place(slices))
     run, rows = np.repeat(np.arange(len(start)), stop - start), in_ranges(start, stop - start)
     run, rows = run[hits[rows] > 0], rows[hits[rows] > 0]
@@ -463,7 +490,7 @@ def stays_at(cells: Cells, evidence: Evidence) -> Iterator[tuple[int, Stay]]:
     for begin, end in zip((firm_last + 1).tolist(), until.tolist(), strict=True):
         gone = np.cumsum(odds[begin:end]) < math.log(_LEFT_BY_CHANCE)
         left.append(int(_number(slices[begin + gone.argmax()])) if gone.any() else None)
-    sums = [np.append(0, np.cumsum(counts)).astype(np.int64) for counts in (hits, messages)]
+    sums = [np.append(0, np.cumsum(count)).astype(np.int64) for count in counts]
     totals = (count[last + 1] - count[first] for count in sums)
     ends = (_number(slices[row]) for row in (first, last, firm_first, firm_last))
     columns = (column.tolist() for column in (*ends, *totals))
@@ -476,24 +503,25 @@ def _ends(run: Ints, rows: Ints, which: Flags) -> tuple[Ints, Ints]:
     return rows[np.diff(run, prepend=-1) != 0], rows[np.diff(run, append=-1) != 0]
 
 
-def _by_slice(cells: Cells, evidence: Evidence) -> tuple[Ints, Floats, Ints, Ints]:
+def _by_slice(cells: Cells, evidence: Evidence) -> tuple[Ints, Floats, Ints, Ints, Ints]:
     """Returns the slices of places, as keys in order, with the evidence of each alone.
 
-    That is the natural logarithm of the odds that it was there, how often it was seen, and the
-    messages of the looks that saw it.
+    That is the natural logarithm of the odds that it was there, how often it was seen, how often
+    from cells that see the place, and the messages of the looks that saw it.
     """
     looks = _keys(_place(evidence.looks), cells.slice[_number(evidence.looks)])
     slices = _distinct(np.concatenate((looks, evidence.blind)))
     slice_of, blind = np.searchsorted(slices, looks), np.searchsorted(slices, evidence.blind)
     hit = np.flatnonzero(evidence.hits)  # few of them all
-    hits = np.bincount(slice_of[hit], evidence.hits[hit], len(slices))
-    messages = np.bincount(slice_of[hit], evidence.n[hit], len(slices))
-    hits[blind] += evidence.times
-    messages[blind] += evidence.times
+    weights = evidence.hits[hit], evidence.hits[hit] * evidence.sees[hit], evidence.n[hit]
+    counts = [np.bincount(slice_of[hit], weight, len(slices)) for weight in weights]
+    for count in counts:
+        count[blind] += evidence.times
+    hits, clear_hits, messages = counts
     by_look = _odds(cells, evidence, hit, np.flatnonzero((hits > 0)[slice_of]))
     odds = np.bincount(slice_of, by_look, len(slices)).astype(np.float64)
     odds[blind] += _UNPLACED_HIT * evidence.times
-    return slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, messages
+    return slices, odds.clip(-_MOST_BY_SLICE, _MOST_BY_SLICE), hits, clear_hits, messages
 
 
 def _odds(cells: Cells, evidence: Evidence, hit: Ints, there: Ints) -> Floats:

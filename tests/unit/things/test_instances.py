@@ -109,3 +109,22 @@ def test_a_detector_that_has_a_thing_twice_now_and_then_makes_no_second_one() ->
     alone = [(HERE, seen_at(2, 0))] * 1800
     [mug] = estimate(whole([bag_of(*alone, *messages)]), LABELS).instances
     assert len(mug.stays) == 1
+
+
+def test_a_second_thing_that_comes_close_beside_one_after_long_stands_with_it() -> None:
+    """In each slice both are seen, and none goes to and fro between the two places."""
+    alone = [(HERE, seen_at(2, 0))] * 2400
+    both = [(HERE, [*seen_at(2, 0), *seen_at(2, 0.5)])] * 150
+    found = estimate(whole([bag_of(*alone, *both)]), LABELS)
+    [mugs] = found.instances
+    [stay] = mugs.stays
+    assert (stay.count, found.side_by_side(stay.spots)) == (2700, 2)
+
+
+def test_what_was_seen_once_from_each_of_three_poses_and_mostly_not_is_no_thing() -> None:
+    bags = []
+    for nth, y in enumerate([-3.0, 0.0, 3.0] * 10):
+        pose = (0.0, y, 0.0)
+        seen = [seen_at(4, 0)] if nth < 3 else [[]]
+        bags.append(bag_of(*[(pose, things) for things in (*seen, *[[]] * 4)], start=100 * nth))
+    assert estimate(whole(bags), LABELS).instances == []

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -92,6 +93,16 @@ def test_places_that_are_looked_up_at_once_have_the_evidence_and_stays_of_each(
         ]
 
 
+@pytest.mark.parametrize(("every", "sees"), [(50, False), (2, True)])
+def test_a_cell_sees_a_place_if_some_hits_come_close_to_each_other(every: int, sees: bool) -> None:
+    """From a dock, a detector of 1 Hz has false detections at a place now and then."""
+    cells, hits = _seen([(1, 0, 10, int(nth % every == 0)) for nth in range(500)], {})
+    place = np.zeros(len(hits), np.int64)
+    found = evidence_at(cells, _ANYWHERE, np.array([[3000.0, 100.0]]), hits, place, **UNPLACED)
+    assert found.fair.all() == found.sees.all() == sees
+    assert len(found.looks) == (500 if sees else len(hits))
+
+
 def _seen(
     given_looks: list[tuple[int, int, int, int]], unplaced: dict[int, int]
 ) -> tuple[Cells, np.ndarray]:
@@ -116,12 +127,13 @@ def _with_every_look(cells: Cells, found: Evidence, rows: np.ndarray) -> Evidenc
     known = np.unique(cells.cell[seen_in])
     looks = np.flatnonzero(np.isin(cells.cell, known))
     at = np.searchsorted(looks, found.looks)
-    hits, fair = np.zeros(len(looks), np.int64), np.zeros(len(looks), np.bool_)
-    hits[at], fair[at] = found.hits, found.fair
+    hits = np.zeros(len(looks), np.int64)
+    sees, fair = (np.zeros(len(looks), np.bool_) for _ in range(2))
+    hits[at], sees[at], fair[at] = found.hits, found.sees, found.fair
     np.add.at(of := np.zeros(len(cells.n), np.int64), seen_in, rows[rows[:, 1] >= 0, Hit.N])
     assert (hits == np.minimum(of, cells.n)[looks]).all()
     cell = np.searchsorted(known, cells.cell[looks])
-    return Evidence(looks, cell, cells.n[looks], hits, found.blind, found.times, fair)
+    return Evidence(looks, cell, cells.n[looks], hits, found.blind, found.times, sees, fair)
 
 
 def _sights(looks: list[tuple[int, ...]], bags: int) -> JoinedSights:
