@@ -1,8 +1,10 @@
 """Sights as few bytes, and the sights of many parts of a history joined.
 
-A packed part is a zstd frame: how many bytes a number takes (4 or 8), the first slice, how many
-rows each table has, how many bytes the names take, and the names of topics and labels as JSON. Then
-table after table and column after column the lowest bytes of all numbers, the next ones, and so on.
+A packed part has sections, each of one stretch of the clock and one session. It is a zstd frame:
+how many bytes a number takes (4 or 8), the first slice, how many sections there are, how many bytes
+the names take, how many rows each section has in each table, and the names of topics and labels as
+JSON. Then table after table and column after column the lowest bytes of all numbers, the next ones,
+and so on.
 A number is how much it is more than the one above it in its column, its sign in the lowest bit.
 Times are in us: the first one of a row from the beginning of its slice on, the last one from the
 first one on. A minute of a detector that sees a room takes some 400 bytes.
@@ -44,10 +46,11 @@ if TYPE_CHECKING:
 Names: TypeAlias = "tuple[dict[str, int], dict[str, int]]"
 """The numbers of topics and of labels."""
 
-_HEAD: Final = Struct(f"<Bq{len(TABLES) + 1}I")
+_HEAD: Final = Struct("<BqII")
+_ROWS: Final = np.dtype(("<u4", len(TABLES)))
 _SLICE_US: Final = SLICE_NS // NS_PER_US
 _SIGN: Final = 63
-_AT_ONCE: Final = 256
+_AT_ONCE: Final = 16
 """So many parts are unpacked together."""
 _COLUMNS: Final = tuple(map(len, TABLES))
 _SPOTS, _LOOKS, _HITS, _SCORES, _BESIDE, _UNPLACED, _FIXES = range(len(TABLES))
@@ -73,8 +76,11 @@ _IN_SLICES: Final = {
 }
 
 
-def packed(sights: Sights) -> bytes:
-    """Returns the sights of some slices of the clock as bytes."""
+def packed(sights: Sights, rows: Ints | None = None) -> bytes:
+    """Returns the sights of some slices of the clock as bytes.
+
+    `rows` has how many each section has in each table; without, there is one section.
+    """
     slices = [sights.tables[number][:, 0] for number in _IN_SLICES if len(sights.tables[number])]
     begin = min((int(array.min()) for array in slices), default=0)
     coded = []
@@ -92,7 +98,8 @@ def packed(sights: Sights) -> bytes:
         coded.append(((steps << 1) ^ (steps >> _SIGN)).view(np.uint64))
     width = 4 if all(int(array.max(initial=0)) < 1 << 32 for array in coded) else 8
     names = json.dumps((sights.topics, sights.labels)).encode()
-    head = _HEAD.pack(width, begin, *map(len, sights.tables), len(names))
+    in_tables = np.array([[*map(len, sights.tables)]] if rows is None else rows, _ROWS.base)
+    head = _HEAD.pack(width, begin, len(in_tables), len(names)) + in_tables.tobytes()
     planes = [byte_planes(column, width) for array in coded for column in array.view(np.int64)]
     return compressed(b"".join((head, names, *planes)))
 
@@ -125,7 +132,7 @@ def joined(
     epochs: Sequence[int],
     sessions: Sequence[int],
 ) -> JoinedSights:
-    """Returns the sights of packed parts, which are of some epochs and sessions.
+    """Returns the sights of packed parts, whose sections are of some epochs and sessions.
 
     Fixes are in order of time for each session: at one time there may be several robots.
     """
@@ -133,22 +140,25 @@ def joined(
     names: Names = {}, {}
     # Of each table and column, those of the parts that are unpacked together, in few bytes.
     pieces: list[list[list[Ints]]] = [[[] for _ in range(size + 1)] for size in _COLUMNS]
+    sections = 0
     for begin in range(0, max(len(parts), 1), _AT_ONCE):
-        tables, part_of = _unpacked(parts[begin : begin + _AT_ONCE], names)
-        for of_table, table, numbers in zip(pieces, tables, part_of, strict=True):
-            for of_column, column in zip(of_table, (*table, numbers + begin), strict=True):
+        tables, rows = _unpacked(parts[begin : begin + _AT_ONCE], names)
+        section_of = _sections_of(rows)
+        for of_table, table, numbers in zip(pieces, tables, section_of, strict=True):
+            for of_column, column in zip(of_table, (*table, numbers + sections), strict=True):
                 of_column.append(narrowed(column))
+        sections += len(rows)
     columns = [[*map(_concatenated, of_table)] for of_table in pieces]
-    part = [table.pop() for table in columns]
-    _number_rows(columns, part, len(parts))
+    section = [table.pop() for table in columns]
+    _number_rows(columns, section, sections)
     for kind, places in enumerate(_NAMED):
         rank = np.argsort([names[kind][name] for name in sorted(names[kind])]).astype(np.int64)
         for at, column in places:
             columns[at][column] = narrowed(rank[columns[at][column]])
-    epoch_of_slice = _number_slices(columns, part, epoch)
+    epoch_of_slice = _number_slices(columns, section, epoch)
     keys = {_SPOTS: 3, _LOOKS: 2, _UNPLACED: 3}
     orders = {at: _order(columns[at][:size]) for at, size in keys.items()}
-    orders[_FIXES] = _distinct_fixes(columns[_FIXES], session[part[_FIXES]])
+    orders[_FIXES] = _distinct_fixes(columns[_FIXES], session[section[_FIXES]])
     spots, looks = (_places(orders[at]) for at in (_SPOTS, _LOOKS))
     columns[_HITS][Hit.LOOK] = looks[columns[_HITS][Hit.LOOK]]
     for at in (_HITS, _SCORES, _BESIDE):
@@ -167,23 +177,23 @@ def _concatenated(pieces: list[Ints]) -> Ints:
     return column
 
 
-def _number_rows(columns: Sequence[list[Ints] | Ints], part: Sequence[Ints], parts: int) -> None:
-    """Numbers the spots and looks that tables name through all parts, no more for each of these."""
-    spots, looks = (begins_of(part[at], parts) for at in (_SPOTS, _LOOKS))
+def _number_rows(columns: Sequence[list[Ints]], section: Sequence[Ints], sections: int) -> None:
+    """Numbers the spots and looks that tables name through all sections, no more for each."""
+    spots, looks = (begins_of(section[at], sections) for at in (_SPOTS, _LOOKS))
     for at in (_HITS, _SCORES, _BESIDE):
-        columns[at][0] = columns[at][0] + spots[part[at]]
+        columns[at][0] = columns[at][0] + spots[section[at]]
     look = columns[_HITS][Hit.LOOK]
-    columns[_HITS][Hit.LOOK] = np.where(look < 0, -1, look + looks[part[_HITS]])
+    columns[_HITS][Hit.LOOK] = np.where(look < 0, -1, look + looks[section[_HITS]])
 
 
-def _number_slices(columns: list[list[Ints]], part: Sequence[Ints], epoch: Ints) -> Ints:
-    """Numbers the slices in tables, which are of some parts; returns the epoch of each."""
-    begins = {at: _begins(columns[at][0], part[at]) for at in _IN_SLICES}
-    of_runs = [(columns[at][0][rows], epoch[part[at][rows]]) for at, rows in begins.items()]
+def _number_slices(columns: list[list[Ints]], section: Sequence[Ints], epoch: Ints) -> Ints:
+    """Numbers the slices in tables, which are of some sections; returns the epoch of each."""
+    begins = {at: _begins(columns[at][0], section[at]) for at in _IN_SLICES}
+    of_runs = [(columns[at][0][rows], epoch[section[at][rows]]) for at, rows in begins.items()]
     slices, number = distinct_rows([*map(np.concatenate, zip(*of_runs, strict=True))])
     number = narrowed(number)
     for at, rows in begins.items():
-        columns[at][0] = np.repeat(number[: len(rows)], np.diff(rows, append=len(part[at])))
+        columns[at][0] = np.repeat(number[: len(rows)], np.diff(rows, append=len(section[at])))
         number = number[len(rows) :]
     return slices[:, 1]
 
@@ -210,11 +220,10 @@ def _places(order: Ints) -> Ints:
 
 
 def united(parts: Sequence[bytes]) -> bytes:
-    """Returns packed parts as one: their rows one after the other."""
+    """Returns packed parts as one, with the sections of all."""
     topics, labels = names = dict[str, int](), dict[str, int]()
-    tables, part = _unpacked(parts, names)
-    _number_rows(tables, part, len(parts))
-    return packed(Sights((*topics,), (*labels,), *(table.T for table in tables)))
+    tables, rows = _unpacked(parts, names)
+    return packed(Sights((*topics,), (*labels,), *(table.T for table in tables)), rows)
 
 
 def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
@@ -226,33 +235,42 @@ def _distinct_fixes(columns: Sequence[Ints], session: Ints) -> Ints:
     return order[_begins(*(column[order] for column in (*columns, session)))]
 
 
-def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], list[Ints]]:
-    """Returns the tables of all parts, and the part of each row of these.
+def _sections_of(rows: Ints) -> list[Ints]:
+    """Returns the section of each row of each table; `rows` has how many each has."""
+    return [np.repeat(np.arange(len(rows)), in_table) for in_table in rows.T]
+
+
+def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], Ints]:
+    """Returns the tables of all parts, and how many rows each section has in each.
 
     Each table has its columns one after the other. `names` has the numbers of topics and labels,
     and gets those of others.
     """
     planes: list[list[Bytes]] = [[] for _ in TABLES]
-    own_names, heads = [], []
+    own_names, starts, rows_of_parts = [], [], [np.zeros((0, len(TABLES)), _ROWS.base)]
     for part in parts:
         data = decompressed(part)
-        width, begin, *counts, size = _HEAD.unpack_from(data)
-        at = _HEAD.size + size
-        own_names.append(data[_HEAD.size : at])
-        heads.append((begin, *counts))
-        for blocks, columns, count in zip(planes, _COLUMNS, counts, strict=True):
+        width, begin, sections, size = _HEAD.unpack_from(data)
+        rows_of_parts.append(np.frombuffer(data, _ROWS, sections, _HEAD.size))
+        at = _HEAD.size + sections * _ROWS.itemsize
+        own_names.append(data[at : at + size])
+        at += size
+        starts.append(begin)
+        totals = rows_of_parts[-1].sum(axis=0).tolist()
+        for blocks, columns, count in zip(planes, _COLUMNS, totals, strict=True):
             if count:
                 shape = (columns, width, count)
                 blocks.append(np.frombuffer(data, np.uint8, math.prod(shape), at).reshape(shape))
                 at += math.prod(shape)
-    starts, *sizes = np.array(heads, np.int64).reshape(-1, 1 + len(TABLES)).T
-    numbers = np.arange(len(parts))
-    part_of = [np.repeat(numbers, rows) for rows in sizes]
+    begins = np.array(starts, np.int64)
+    rows = np.concatenate(rows_of_parts).astype(np.int64)
+    of_parts = np.array([of_part.sum(axis=0) for of_part in rows_of_parts[1:]], np.int64)
+    part_of = _sections_of(of_parts.reshape(-1, len(TABLES)))
     # Of all parts at once: numpy takes longer to be called than to go through a part.
     tables = [_restored(planes.pop(0), part, at) for at, part in enumerate(part_of)]
     for at, times in _IN_SLICES.items():
         table = tables[at]
-        table[0] += starts[part_of[at]]
+        table[0] += begins[part_of[at]]
         table[times.first] = (table[times.first] + table[0] * _SLICE_US) * NS_PER_US
         if times.last is not None:
             table[times.last] = table[times.last] * NS_PER_US + table[times.first]
@@ -264,10 +282,10 @@ def _unpacked(parts: Sequence[bytes], names: Names) -> tuple[list[Ints], list[In
             for text, both in distinct.items()
         }
         code = np.array([*chain.from_iterable(codes[text] for text in own_names)], np.int64)
-        begins = np.cumsum([0, *(len(codes[text]) for text in own_names)])
+        first_codes = np.cumsum([0, *(len(codes[text]) for text in own_names)])
         for at, column in places:
-            tables[at][column] = code[tables[at][column] + begins[part_of[at]]]
-    return tables, part_of
+            tables[at][column] = code[tables[at][column] + first_codes[part_of[at]]]
+    return tables, rows
 
 
 def _restored(planes: Sequence[Bytes], part: Ints, at: int) -> Ints:

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T", bound="Hashable")
 _Part: TypeAlias = "list[SeenStretch[Session]]"
+_Odometry: TypeAlias = "tuple[str, Session | None]"
+"""A frame, and the session in which its coordinates hold; None of the map, where they always do."""
 
 _MOST_SPOTS: Final = 150_000
 """Places of a label in a slice that are looked at together: a home robot has 50,000 in a week."""
@@ -206,7 +208,7 @@ class _Loader:
         if cached is not None:
             return isinstance(cached, KnownThings) or cached <= moment
         parts, crowded = self._gathered
-        since = parts[0][0].start if crowded else moment
+        since = _begin(parts[0]) if crowded else moment
         if since > moment:
             self._put(since)
         return since <= moment
@@ -286,14 +288,14 @@ class _Loader:
                 if spots >= most:
                     return parts[::-1], True
                 if parts and reading.expired():
-                    self._read_from = parts[-1][0].start
+                    self._read_from = _begin(parts[-1])
                     break
                 parts.append(part)
                 spots += spots_in(part)
         except QueryTimeoutError:
             if not parts:
                 raise
-            self._read_from = parts[-1][0].start
+            self._read_from = _begin(parts[-1])
         return parts[::-1], False
 
     def _things_in(self, parts: Sequence[_Part], *, crowded: bool) -> KnownThings:
@@ -303,12 +305,15 @@ class _Loader:
             _TakesTooLongError: that takes longer than an answer may, and fewer would do.
         """
         stretches = _of_detectors([stretch for part in parts for stretch in part])
-        epochs, frames = self._epochs(stretches)
-        session_of = _numbers((stretch.start, stretch.session) for stretch in stretches)
-        of_parts = [
-            (epoch, session_of[stretch.session])
-            for epoch, stretch in zip(epochs, stretches, strict=True)
+        epoch_of, frames = self._epochs(stretches)
+        session_of = _numbers(
+            pair for part in stretches for pair in zip(part.starts, part.sessions, strict=True)
+        )
+        sections = [
+            (epoch_of[self._odometry(session, stretch.frame_id)], session_of[session])
+            for stretch in stretches
             for _ in stretch.sights
+            for session in stretch.sessions
         ]
         estimating = self._view.call.partial_after(_ESTIMATING_S)
 
@@ -321,37 +326,42 @@ class _Loader:
         self._view.memory.large.acquire()
         sights = joined(
             [topic.packed for stretch in stretches for topic in stretch.sights],
-            [epoch for epoch, _ in of_parts],
-            [session for _, session in of_parts],
+            [epoch for epoch, _ in sections],
+            [session for _, session in sections],
         )
         things = estimate(sights, self._labels, self._min_score, go_on)
         since = self._read_from
         if crowded:
-            since = max(parts[0][0].start, MIN_NS if since is None else since)
-        has_map = bool(sights.topics) and 0 in epochs
+            since = max(_begin(parts[0]), MIN_NS if since is None else since)
+        has_map = bool(sights.topics) and any(epoch == 0 for epoch, _ in sections)
         return KnownThings(
             things, self._labels, frames, since, has_map, crowded=crowded, until=self._until
         )
 
-    def _epochs(self, stretches: _Part) -> tuple[list[int], tuple[str, ...]]:
-        """Returns the epoch of each stretch, and the frame of each epoch.
+    def _epochs(self, stretches: _Part) -> tuple[dict[_Odometry, int], tuple[str, ...]]:
+        """Returns the number of each epoch, and the frame of each.
 
         All that is in the map is of epoch 0. Odometry starts again in each session.
         """
-        map_frame = self._view.limits.map_frame
-        placed: list[tuple[Ns, tuple[str, Session | None]]] = [(MIN_NS, (map_frame or "", None))]
-        for session, start, frame, *_ in stretches:
-            placed.append((start, (frame, None if frame == map_frame else session)))
+        placed: list[tuple[Ns, _Odometry]] = [(MIN_NS, (self._view.limits.map_frame or "", None))]
+        for sessions, starts, frame, *_ in stretches:
+            placed += zip(starts, (self._odometry(one, frame) for one in sessions), strict=True)
         numbers = _numbers(placed)
-        return [numbers[odometry] for _, odometry in placed[1:]], tuple(
-            frame for frame, _ in numbers
-        )
+        return numbers, tuple(frame for frame, _ in numbers)
+
+    def _odometry(self, session: Session, frame: str) -> _Odometry:
+        return frame, None if frame == self._view.limits.map_frame else session
 
 
 def _numbers(timed: Iterable[tuple[Ns, T]]) -> dict[T, int]:
     """Returns the numbers of values that begin at some times, in the order of these."""
     in_time = dict.fromkeys(value for _, value in sorted(timed, key=itemgetter(0)))
     return {value: number for number, value in enumerate(in_time)}
+
+
+def _begin(part: _Part) -> Ns:
+    """Returns when the first ten minutes of a part begin."""
+    return min(stretch.starts[0] for stretch in part)
 
 
 def _of_detectors(stretches: _Part) -> _Part:

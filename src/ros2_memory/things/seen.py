@@ -28,7 +28,7 @@ from ros2_memory.history.scan import open_scan, remembered, scan
 from ros2_memory.things.placing import AROUND_NS, LOCALISER, Placer
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from ros2_memory.analysis.sights import Sights
     from ros2_memory.columns.scan import Scan
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 S = TypeVar("S")
 
-VERSION: Final = 5
+VERSION: Final = 6
 """Of what sights follow from. Raise it with every change of what is seen in the same messages."""
 SIGHTS_NS: Final[Ns] = 60 * SLICE_NS
 _TOGETHER_NS: Final[Ns] = 36 * SIGHTS_NS
@@ -74,19 +74,20 @@ _TEXT: Final = "std_msgs/msg/String"
 
 
 class SeenStretch(NamedTuple, Generic[S]):
-    """The sights of a session in ten minutes of the clock, or in `STRETCH_NS`.
+    """The sights of a session in ten minutes of the clock, or those of several in `STRETCH_NS`.
 
     Attributes:
-        session: its recordings; in the store a number, see `Seen.of`.
-        start: log time (ns) of the ten minutes, the first ones that have some.
+        sessions: that of each section of the sights: its recordings; in the store their numbers,
+            see `Seen.of`.
+        starts: log time (ns) of the ten minutes of each section, in order.
         frame_id: of all places and poses: the map, or that of the robot's poses where no transforms
             lead to the map.
         spots: how many spots there are.
         sights: of each topic.
     """
 
-    session: S
-    start: Ns
+    sessions: tuple[S, ...]
+    starts: tuple[Ns, ...]
     frame_id: str
     spots: int
     sights: tuple[TopicSights, ...]
@@ -105,7 +106,7 @@ class TopicSights(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """What was seen in a stretch, by the number of the session."""
+    """What was seen in a stretch, by the numbers of the sessions."""
 
     stretches: tuple[SeenStretch[int], ...]
 
@@ -117,7 +118,10 @@ class Seen(NamedTuple):
 
     def of(self, sessions: Sequence[Session]) -> list[SeenStretch[Session]]:
         """Returns the stretches with these sessions in place of their numbers."""
-        return [SeenStretch(sessions[stretch[0]], *stretch[1:]) for stretch in self.stretches]
+        return [
+            SeenStretch(tuple(sessions[number] for number in stretch[0]), *stretch[1:])
+            for stretch in self.stretches
+        ]
 
 
 SIGHTS: Final[FragmentKind[Seen]] = FragmentKind("sights", (Seen, SeenStretch, TopicSights))
@@ -377,13 +381,12 @@ class Watching:
 
         def make() -> Joined[Seen]:
             # Which topics are of detectors shows in all of a history, so these stay apart.
-            def kind(stretch: SeenStretch[Session]) -> tuple[int, str, list[tuple[str, ...]]]:
-                topics = [of_topic.topics for of_topic in stretch.sights]
-                return numbers[stretch.session], stretch.frame_id, topics
+            def kind(stretch: SeenStretch[Session]) -> tuple[str, list[tuple[str, ...]]]:
+                return stretch.frame_id, [of_topic.topics for of_topic in stretch.sights]
 
             seen = [part for stretch in reversed(together) for part in self._seen_in(stretch)]
             by_kind = groupby(sorted(seen, key=kind), kind)
-            return Joined([Seen(tuple(_as_one(of[0], [*alike]) for of, alike in by_kind))])
+            return Joined([Seen(tuple(_as_one([*alike], numbers) for _, alike in by_kind))])
 
         key = FragmentKey(start, digest, parts)
         [seen] = remembered(self._view, joining(SIGHTS), key, make).fragments
@@ -476,7 +479,7 @@ class Watching:
                     for sights in seen.sights
                 )
                 start = around.window.start
-                stretches.append(SeenStretch(number, start, seen.frame_id, spots, topics))
+                stretches.append(SeenStretch((number,), (start,), seen.frame_id, spots, topics))
         return Seen(tuple(stretches))
 
     def _rows(self, window: TimeWindow) -> Iterator[Rows]:
@@ -485,8 +488,10 @@ class Watching:
             yield from scan(self._view, topic, window, may_match=self._placer.rows.may_match)
 
 
-def _as_one(number: int, stretches: Sequence[SeenStretch[Session]]) -> SeenStretch[int]:
-    """Returns stretches of one session, which has a number, and the same topics as one."""
+def _as_one(
+    stretches: Sequence[SeenStretch[Session]], numbers: Mapping[Session, int]
+) -> SeenStretch[int]:
+    """Returns stretches of the same topics and frame as one; sessions have numbers."""
     topics = tuple(
         TopicSights(
             of_topic[0].topics,
@@ -495,8 +500,9 @@ def _as_one(number: int, stretches: Sequence[SeenStretch[Session]]) -> SeenStret
         )
         for of_topic in zip(*(stretch.sights for stretch in stretches), strict=True)
     )
-    first = stretches[0]
-    return SeenStretch(number, first.start, first.frame_id, spots_in(stretches), topics)
+    sessions = tuple(numbers[session] for stretch in stretches for session in stretch.sessions)
+    starts = tuple(start for stretch in stretches for start in stretch.starts)
+    return SeenStretch(sessions, starts, stretches[0].frame_id, spots_in(stretches), topics)
 
 
 def spots_in(stretches: Iterable[SeenStretch[S]]) -> int:

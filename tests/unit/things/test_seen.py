@@ -42,7 +42,8 @@ def day() -> list[Msg]:
 def sights_in(memory: Memory) -> JoinedSights:
     stretches = [one for some in Watching(View(memory, Call())).newest_first() for one in some]
     parts = [part.packed for stretch in stretches for part in stretch.sights]
-    return joined(parts, [0] * len(parts), [0] * len(parts))
+    sections = [0 for stretch in stretches for _ in stretch.sights for _ in stretch.sessions]
+    return joined(parts, sections, sections)
 
 
 def things_in(memory: Memory) -> tuple[Thing, ...]:
@@ -133,7 +134,7 @@ def test_joined_sights_say_the_same(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def starts_in(memory: Memory, most: float = math.inf) -> list[int]:
     watching = Watching(View(memory, Call()))
-    return [part[0].start for part in watching.newest_first(most=most)]
+    return [part[0].starts[0] for part in watching.newest_first(most=most)]
 
 
 def with_joined_alone(world: World) -> World:
