@@ -38,12 +38,13 @@ if TYPE_CHECKING:
 _MOST_WAITING: Final = 1_024
 """Fragments that wait to be stored; of more the oldest are made again."""
 
+_MOST: Final = (1 << 63) - 1
 _KEY_BYTES: Final = 400
 """About how much memory it takes to remember a fragment, besides its own."""
 _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
-_TUPLE, _BYTES, _ARRAY, _ROWS = -1, -2, -3, -4
-_NUMBERS: Final = frozenset({int, float})
+_TUPLE, _BYTES, _ARRAY, _ROWS, _COLUMN = -1, -2, -3, -4, -5
+_NUMBERS: Final = {int: "<i8", float: "<f8"}
 
 log = get_logger(__name__)
 
@@ -112,6 +113,10 @@ def _plain_rows(
     none = [_TUPLE, *(nth for nth, value in enumerate(values) if value is None)]
     kinds = {*map(type, there)}
     kind = kinds.pop() if len(kinds) == 1 < len(there) else object
+    if kind in _NUMBERS and (kind is float or max(map(abs, cast("list[int]", there))) <= _MOST):
+        numbers_there = np.array(there, _NUMBERS[kind]).tobytes()
+        data.append(numbers_there)
+        return [_COLUMN, len(numbers_there), none[1:], _NUMBERS[kind]]
     if kind is np.ndarray:
         arrays = cast("list[Array]", there)
         if len({(array.dtype, array.shape[1:]) for array in arrays}) == 1:
@@ -142,16 +147,18 @@ def from_bytes(data: bytes, classes: Sequence[type]) -> object:
 
 
 def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
-    if isinstance(value, str):
-        return sys.intern(value)  # names of columns and labels are in thousands of fragments
     if isinstance(value, dict):
         return {sys.intern(key): _restored(entry, classes, tail) for key, entry in value.items()}
     if not isinstance(value, list):
-        return value
+        # Names of columns and labels are in thousands of fragments.
+        return sys.intern(value) if isinstance(value, str) else value
     number, *rest = value
-    if number in {_BYTES, _ARRAY}:
+    if number in {_BYTES, _ARRAY, _COLUMN}:
         size, *array = rest
         packed = tail.read(size)
+        if number == _COLUMN:
+            none, dtype = array
+            return _with_none(np.frombuffer(packed, dtype).tolist(), none)
         return packed if number == _BYTES else _unpacked(packed, *array)
     # Most are numbers: to call for each would take half of the time.
     parts = [part if type(part) in _NUMBERS else _restored(part, classes, tail) for part in rest]
@@ -173,9 +180,13 @@ def _rows(
         rows = [*zip(*columns, strict=True)]
     else:
         rows = [*map(classes[cast("int", kind)], *columns)]
-    for nth in none:
-        rows.insert(nth, None)
-    return tuple(rows)
+    return _with_none(rows, none)
+
+
+def _with_none(values: list[object], places: Sequence[int]) -> tuple[object, ...]:
+    for nth in places:
+        values.insert(nth, None)
+    return tuple(values)
 
 
 def _packed(array: Array) -> tuple[str, float | None, bytes]:

@@ -145,20 +145,30 @@ def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
     name = split_of(bags[highest].file)
     are_ranks = name is not None and name.number != numbers[highest]
 
+    spans = [
+        (series, begin, end, late[slice(*among)].tolist() if is_recording(series) else [])
+        for series, (begin, end), among in zip(
+            all_series, pairwise(edges.tolist()), pairwise(late_edges), strict=True
+        )
+        if begin < end
+    ]
+    looked_at = {at for _, begin, end, lates in spans for at in (begin, end - 1, *lates)}
+    looked_at |= {at + 1 for at in looked_at if at + 1 < len(order)}
+    rows = order[[*looked_at]].tolist()
+    made = {
+        at: Split(int(numbers[row]), bag)
+        for at, row, bag in zip(looked_at, rows, bags.at(rows), strict=True)
+    }
+
     def split(series: Series, at: int) -> Split:
-        row = order[at]
-        bag, number = bags[int(row)], int(numbers[row])
+        number, bag = made[at]
         return Split(int(stem_of(bag.file).removeprefix(series)) if are_ranks else number, bag)
 
     ranges: dict[Series, SplitRange] = {}
-    for series, (begin, end), among in zip(
-        all_series, pairwise(edges.tolist()), pairwise(late_edges), strict=True
-    ):
-        if begin < end:
-            lates = late[slice(*among)].tolist() if is_recording(series) else ()
-            pairs = [(split(series, at), split(series, at + 1)) for at in lates if at + 1 < end]
-            first, last = split(series, begin), split(series, end - 1)
-            ranges[series] = SplitRange(first, last, tuple(_steps_of(pairs)))
+    for series, begin, end, lates in spans:
+        pairs = [(split(series, at), split(series, at + 1)) for at in lates if at + 1 < end]
+        first, last = split(series, begin), split(series, end - 1)
+        ranges[series] = SplitRange(first, last, tuple(_steps_of(pairs)))
     return ranges
 
 
