@@ -6,7 +6,6 @@ The same as `SchemaExtractor.pose` and `twist` give for each message, rounded al
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, cast
 
 import numpy as np
@@ -69,11 +68,8 @@ class PoseColumns:
             return None
         if not columns.axes:
             raise NoPoseError
-        read = partial(_read, _RoundedRows(table, index), columns, times)
         try:
-            if index is not None:
-                return read()
-            return table.remember("poses", read, lambda poses: 1000 + 76 * len(poses))
+            return _read(_RoundedRows(table, index), columns, times)
         except UnknownShapeError:
             return None
 

@@ -379,6 +379,9 @@ class Scan:
         else:
             for head in self._scanner.parts(topic, reach, coverage):
                 yield _Source(head.first, head.last, head)
+            if self._request.stored:
+                # Of bags nothing is read: those near the window tell what does not settle in it.
+                reach = reach.intersect(self._request.window.widened(2 * STRETCH_NS))
             extents = coverage.missing_extents(topic, reach)
         of_bags: dict[str, _Source] = {}
         for bag, *span in extents:

@@ -193,15 +193,20 @@ class PoseReader:
             InvalidArgumentsError: messages carry no position.
         """
         try:
-            poses = of_columns(
-                self._view, rows, lambda some: self._columns.of(some.table, some.times, some.index)
-            )
+            poses = of_columns(self._view, rows, self._by_columns)
         except NoPoseError:
             for message in messages_of(self._view, rows.some(np.array([0]))):
                 lack = describe_lack(self._view, "position", message)
                 raise InvalidArgumentsError(lack) from None
             return joined_poses([])  # deleted meanwhile
         return poses_of(self._decoded(rows)) if poses is None else joined_poses(poses)
+
+    def _by_columns(self, rows: Rows) -> Poses | None:
+        read = partial(self._columns.of, rows.table, rows.times, rows.index)
+        if rows.index is None and self._view.call.stored:
+            # Of the poses of a part its path, track, standstills and sights are made.
+            return rows.table.remember("poses", read, lambda poses: 1000 + 76 * len(poses or ()))
+        return read()
 
     def _decoded(self, rows: Rows) -> list[tuple[Ns, Pose, float | None]]:
         extractor = self._view.extractor

@@ -372,8 +372,8 @@ class Sessions:
         received: dict[Session, list[StampedTransform]] = defaultdict(list)
         for statics in self.static_back(TimeWindow.everything()):
             received[self.of(view.bag_dir / statics.recording)] += statics.transforms
-        for session in {self.of(bag.recording) for bag in coverage.missing}:
-            received.pop(session, None)
+        for recording in {bag.recording for bag in coverage.missing}:
+            received.pop(self.of(recording), None)
         return {session: _without_repeats(found) for session, found in received.items()}
 
     def static_back(self, window: TimeWindow) -> Iterator[Statics]:
