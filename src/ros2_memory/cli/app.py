@@ -95,14 +95,6 @@ COMMANDS: Final[Mapping[str, CommandEntry]] = {
             1: "part of it could not be read or decoded, or has no definition (stderr names it)",
         },
     ),
-    "prove": CommandEntry(
-        "prove.prove",
-        "write the messages that an answer rests on to MCAP",
-        {
-            0: "the same question over the file gives the same answer",
-            1: "its answer differs, or a type that it needs has no definition (stderr names them)",
-        },
-    ),
     "forget": CommandEntry(
         "maintenance.forget.forget",
         "delete a time window, after confirmation",
