@@ -17,9 +17,9 @@ from ros2_memory.cli.options import (
     Recording,
     Sets,
     Verbose,
-    day_of,
     is_folder,
     load_to_look,
+    newest_day,
     open_memory,
     parse_duration,
     parse_time,
@@ -121,7 +121,7 @@ def ask(
         parse_arguments(rest, schemas), schemas, unix_from_ns(present_time(memory))
     )
     if name == "recap" and arguments.keys().isdisjoint(_TIMES_OF_RECAP):
-        first, last = day_of(memory, None).asked()
+        first, last = newest_day(memory).asked()
         arguments |= {"start": unix_from_ns(first), "end": unix_from_ns(last)}
     with spinner(f"asking {name}"):
         (reply,) = call_tools(dispatcher, {name: arguments})
