@@ -23,7 +23,6 @@ from ros2_memory.cli.output import (
     format_time,
     print_json,
     stdout_console,
-    with_commands,
 )
 from ros2_memory.core.errors import InvalidArgumentsError
 from ros2_memory.core.model import JsonValue, TimeWindow
@@ -110,7 +109,7 @@ class Observation:
         """Why answers may be incomplete."""
         missing = self.status.missing if self.status.live else ()
         unoffered = [f"offered by no publisher: {listed(missing)}"] if missing else []
-        return [escape(with_commands(line)) for line in (*unoffered, *self.status.problems)]
+        return [escape(line) for line in (*unoffered, *self.status.problems)]
 
 
 def watch(
