@@ -145,7 +145,7 @@ class TestPaths:
         bag = folder / "a" / "a_0.mcap"
         bag.write_bytes(bag.read_bytes()[:-20])
         os.utime(bag, (1.7e9, 1.7e9))
-        shown = exits(0, "topics .").out
+        shown = exits(0, "topics .").err
         assert shown.count("readable part is used") == 1
         assert "2 topics: 1 unfinished bag" in shown
         assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
