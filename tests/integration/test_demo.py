@@ -68,7 +68,7 @@ def test_a_wrong_answer_is_told_and_is_the_exit_code() -> None:
     output: list[str] = []
     code = run_demo(output.append, [position, falsified], once=True, port=0)
     assert code == 1
-    assert "WRONG: expected the message of" in output[-2]
+    assert "WRONG: expected a time 10 s ago" in output[-2]
     assert output[-1] == "1 of 2 answers are right."
 
 

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import tempfile
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 import pytest
 import yaml
 
-from tests.integration.another_user import NOBODY, as_nobody, needs_another_user
 from tests.integration.test_server_process import Served
 from tests.support.live_recorder import Machine, answer, machine
 from tests.support.processes import PATIENCE_S, until
@@ -179,7 +177,6 @@ def test_a_list_that_is_there_is_used_and_a_program_that_dies_ends_it_with_code_
         shown = up.out.read_text()
         assert f"{listed} is used as it is\n" in shown
         assert "it lacks, of what would be proposed: /bumper\n" in shown
-        assert "it lists, and nobody offers: /joy\n" in shown
         up.served()
         below = descendants(up.process.pid)
         server = next(each for each, words in below.items() if "ros2_memory.server" in words)
@@ -202,27 +199,3 @@ def test_where_no_topic_is_offered_it_names_the_domain_and_what_to_do(
     assert f"no topic is offered in ROS_DOMAIN_ID={domain} over rmw_fastrtps_cpp" in said
     assert "start the robot's nodes, and give this command their ROS_DOMAIN_ID" in said
     assert not (tmp_path / "bags" / "topics.yaml").exists()
-
-
-@needs_another_user
-def test_publishers_of_another_user_are_named(site: Machine, tmp_path: Path) -> None:
-    with tempfile.TemporaryDirectory() as made:  # a test's own folder is closed to other users
-        Path(made).chmod(0o777)
-        drive = ("--topics", "/odom", "/tf")
-        nobody = [*as_nobody(), f"ROS_LOG_DIR={made}"]
-        with (
-            publishing_robot(site.env, Path(made) / "truth", *drive, through=nobody) as robot,
-            started(tmp_path, site.env) as up,
-        ):
-            assert robot.t0
-            named = f"nodes of user {NOBODY} run, or ran, here"
-            until(lambda: named in up.out.read_text() + up.err.read_text())
-            # Where the robot made the port anew that the first look left, messages come by chance.
-            is_heard = named in up.out.read_text()
-            if not is_heard:
-                assert up.code() == 2
-    said = up.out.read_text() if is_heard else up.err.read_text()
-    assert "run the recorder as the robot's user" in said
-    if not is_heard:
-        assert "2 topics are offered" in said
-        assert f"no message came to user {os.getuid()} in 5 s ({named})" in said

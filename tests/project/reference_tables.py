@@ -110,21 +110,20 @@ def _listed(columns: Iterable[tuple[str, str, str]]) -> str:
 
 def exit_table() -> str:
     """Each command, what it is for, and what its exit codes say, but for success."""
-    rows = []
-    for name, (_, purpose, codes) in COMMANDS.items():
-        failures = (f"{code}: {_short(why)}" for code, why in codes.items() if code)
-        rows.append((f"`{name}`", purpose, "; ".join(failures)))
-    common = "; ".join(f"{code}: {_short(why)}" for code, why in COMMON_EXIT_CODES.items())
+    rows = [
+        (f"`{name}`", purpose, f"1: {_short(negative)}" if negative else "")
+        for name, (_, purpose, negative) in COMMANDS.items()
+    ]
     columns = table(("command", "what it is for", "exit code"), rows)
     return (
         f"{columns}\n\nExit code 0 is success; for others stderr has the reason. Where nothing "
-        f"else is said, {common}."
+        f"else is said, {_short(COMMON_EXIT_CODES)}."
     )
 
 
 def _short(why: str) -> str:
     """What an exit code says, without that stderr says more."""
-    return re.sub(r" \((see )?stderr.*\)", "", why)
+    return re.sub(r" \((see )?stderr[^)]*\)", "", why)
 
 
 def tool_sections(tools: Iterable[Tool], replies: Mapping[str, str]) -> str:

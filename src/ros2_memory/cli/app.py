@@ -33,133 +33,104 @@ class CommandEntry(NamedTuple):
     """One row of the list of commands.
 
     `path` is where the command's function, or the Typer application of a group, is in this package.
+    `negative` says what its exit code 1 means.
     """
 
     path: str
     purpose: str
-    exit_codes: Mapping[int, str]
+    negative: str = ""
 
 
 COMMANDS: Final[Mapping[str, CommandEntry]] = {
     "ask": CommandEntry(
         "ask.ask",
         "call any tool of the server, without a server",
-        {
-            0: "the tool answered, even if the answer is 'never'",
-            1: "the tool returned an error, which gives the reason",
-        },
+        "the tool returned an error, which gives the reason",
     ),
     "topics": CommandEntry(
         "info.topics",
         "every recorded topic, with its rate",
-        {0: "topics are listed", 1: "nothing is recorded"},
+        "nothing is recorded",
     ),
     "info": CommandEntry(
         "info.info",
         "what is recorded: size, time range, gaps, damage, budget",
-        {0: "there are bags", 1: "there are no bags"},
+        "there are no bags",
     ),
     "recordings": CommandEntry(
         "info.recordings",
         "every recording: start, length, size, storage, maker",
-        {0: "recordings are listed", 1: "there are no recordings"},
+        "there are no recordings",
     ),
     "cat": CommandEntry(
         "cat.cat",
         "the messages of a topic, as text, CSV or JSON lines",
-        {
-            0: "all messages were printed",
-            1: "there are no messages, or some could not be read (see stderr)",
-        },
+        "there are no messages, or some could not be read (see stderr)",
     ),
     "plot": CommandEntry(
         "plot.plot",
         "draw the path, a signal, the timeline or the recap of a day",
-        {0: "the picture is written", 2: "no picture is written (stderr gives the reason)"},
     ),
     "watch": CommandEntry(
         "watch.watch",
         "show live what is being recorded",
-        {0: "ended by --count or Ctrl-C, whatever it showed"},
     ),
     "doctor": CommandEntry(
         "doctor.doctor",
         "find problems, and say how to fix them",
-        {0: "no problems", 1: "warnings", 2: "errors"},
+        "warnings; 2: errors",
     ),
     "export": CommandEntry(
         "export.export",
         "copy a time window to MCAP or Parquet",
-        {
-            0: "the whole window was copied",
-            1: "part of it could not be read or decoded, or has no definition (stderr names it)",
-        },
-    ),
-    "prove": CommandEntry(
-        "prove.prove",
-        "write the messages that an answer rests on to MCAP",
-        {
-            0: "the same question over the file gives the same answer",
-            1: "its answer differs, or a type that it needs has no definition (stderr names them)",
-        },
+        "part of it could not be read or decoded, or has no definition (stderr names it)",
     ),
     "forget": CommandEntry(
         "maintenance.forget.forget",
         "delete a time window, after confirmation",
-        {
-            0: "everything in the window is deleted (with --dry-run: would be), or it is empty",
-            1: "some of it stays and is named, or you answered no",
-        },
+        "some of it stays and is named, or you answered no",
     ),
     "adopt": CommandEntry(
         "maintenance.adopt.adopt",
         "let the recorder delete bags that it did not make",
-        {0: "the recorder owns the bags now, or did before", 1: "there are no bag files"},
+        "there are no bag files",
     ),
     "demo": CommandEntry(
         "app.demo",
         "ask a simulated robot questions with known answers",
-        {0: "all answers were right", 1: "an answer was wrong"},
+        "an answer was wrong",
     ),
     "serve": CommandEntry(
         "serve.serve",
         "answer questions over MCP, like ros2-memory-server",
-        {0: "the server was stopped", 1: "it cannot listen on the address"},
+        "it cannot listen on the address",
     ),
     "up": CommandEntry(
         "up.up",
         "on a robot: propose what to record, and record and serve it",
-        {
-            0: "stopped by Ctrl-C, and both programs have ended",
-            1: "the recorder or the server ended by itself (stderr has its last error), or you "
-            "answered no",
-        },
+        "the recorder or the server ended by itself (stderr has its last error), or you "
+        "answered no",
     ),
     "index": CommandEntry(
         "maintenance.index.index",
         "store the columns of every bag now, so that answers take milliseconds",
-        {0: "every bag that can be stored is stored"},
     ),
     "ship": CommandEntry(
         "maintenance.ship.ship",
         "ship the bags of many robots into a lake of Iceberg tables",
-        {
-            0: "with --once: every closed bag is in the lake",
-            1: "with --once: some bags are not, or may not be, in the lake (stderr names them)",
-        },
+        "with --once: some bags are not, or may not be, in the lake (stderr names them)",
     ),
     "recover": CommandEntry(
         "maintenance.recover.recover",
         "repair unfinished MCAP files",
-        {0: "every file is whole", 1: "a file could not be repaired"},
+        "a file could not be repaired",
     ),
-    "config": CommandEntry("config.config", "show the configuration in force", {0: "it was shown"}),
+    "config": CommandEntry("config.config", "show the configuration in force"),
 }
-COMMON_EXIT_CODES: Final[Mapping[int, str]] = {
-    2: "the command could not run (stderr gives the reason)",
-    INTERRUPTED: "interrupted before it finished",
-}
-"""The exit codes of every command, unless its own entry gives a code another meaning."""
+COMMON_EXIT_CODES: Final = (
+    "2: the command could not run (stderr gives the reason); 130: interrupted before it finished"
+)
+"""Of every command, unless its own entry gives a code another meaning."""
 
 app = typer.Typer(
     name="ros2-memory",
@@ -233,8 +204,9 @@ class LazyCommand(TyperCommand):
 
 def epilog(command: str) -> str:
     """Returns the last lines of a command's help: what its exit codes mean."""
-    codes = {**COMMON_EXIT_CODES, **COMMANDS[command].exit_codes}
-    return f"Exit code: {'; '.join(f'{code}: {codes[code]}' for code in sorted(codes))}."
+    negative = COMMANDS[command].negative
+    failed = f"1: {negative}; " if negative else ""
+    return f"Exit code: 0: done; {failed}{COMMON_EXIT_CODES}."
 
 
 def _print_version(requested: bool) -> None:

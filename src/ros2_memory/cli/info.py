@@ -1,7 +1,7 @@
 """`ros2-memory topics`, `info` and `recordings`: what is recorded, how much of it, and by whom."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -16,14 +16,15 @@ from ros2_memory.cli.output import (
     format_value,
     print_json,
     print_line,
+    print_notes,
     print_reply,
     stdout_console,
     with_shorter_lists,
 )
 from ros2_memory.config import Settings
-from ros2_memory.core.model import BagFile, JsonValue
+from ros2_memory.core.model import BagFile
 from ros2_memory.core.reply import JsonObject, Scope, shown
-from ros2_memory.core.text import counted, listed
+from ros2_memory.core.text import listed
 from ros2_memory.core.timebase import unix_from_ns
 from ros2_memory.history.context import Call, Latching, Memory
 from ros2_memory.index.recordings import name_of, recordings_of
@@ -52,10 +53,10 @@ def topics(as_json: AsJson = False, *, bags: Bags) -> bool:
     if as_json:
         print_json(rows)
     elif rows:
-        without = [{key: row[key] for key in row if key != "notes"} for row in rows]
-        print_reply([*without])
-        if notes := _notes_of(topic_rows):
-            print_reply({"notes": notes})
+        print_reply([{key: row[key] for key in row if key != "notes"} for row in rows])
+        # What is wrong with one bag is noted on each topic in it.
+        notes = {note: row.topic for row in topic_rows for note in row.notes}
+        print_notes(f"{topic}: {note}" for note, topic in notes.items())
     else:
         _print_nothing(memory)
     return not rows
@@ -80,24 +81,12 @@ def _row_with_rate(topic: TopicRow, snapshot: Snapshot, latching: Latching) -> J
     return row
 
 
-def _notes_of(rows: Sequence[TopicRow]) -> list[JsonValue]:
-    """Returns each note once: what is wrong with one bag is noted on each topic in it."""
-    topics_by_note: dict[str, list[str]] = {}
-    for row in rows:
-        for note in row.notes:
-            topics_by_note.setdefault(note, []).append(row.topic)
-    return [
-        f"{topics[0] if len(topics) == 1 else counted(len(topics), 'topic')}: {note}"
-        for note, topics in topics_by_note.items()
-    ]
-
-
 def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     """Show what is recorded: time range, gaps, damaged files, the budget and how long it lasts."""
     # A planner's context is short; a person's screen scrolls.
     settings = bags.settings("server.max_reply_chars=1000000000", "server.tools=all")
     robots = settings.fleet.robots
-    reports: dict[str, JsonObject] = {}
+    reports: dict[str, dict[str, JsonObject]] = {}
     are_bags = False
     for name in robots or ("",):
         own, memory = open_robot(settings, name, verbose=bags.verbose)
@@ -112,23 +101,22 @@ def info(as_json: AsJson = False, *, bags: Bags) -> bool:
     return not are_bags
 
 
-def _report(settings: Settings, memory: Memory) -> JsonObject:
+def _report(settings: Settings, memory: Memory) -> dict[str, JsonObject]:
     """Returns what is recorded in one bag directory: replies of two tools, and how much it is."""
     tools: dict[str, dict[str, object]] = {"memory_status": {}, "data_time_range": {}}
     replies = call_tools(build_dispatcher(settings, memory), tools)
     shown = {tool: json.loads(reply.text) for tool, reply in zip(tools, replies, strict=True)}
-    return {**shown, "held": _amount_recorded(memory.index.snapshot())}
+    return {"held": _amount_recorded(memory.index.snapshot()), **shown}
 
 
-def _show(memory: Memory, report: JsonObject) -> None:
+def _show(memory: Memory, report: Mapping[str, JsonObject]) -> None:
     """Prints a report for people."""
     snapshot = memory.index.snapshot()
     aside = (snapshot.active, snapshot.damaged, snapshot.unread, snapshot.empty)
     if not any((snapshot.bags, *aside)):
         _print_nothing(memory)
         return
-    status, ranged, recorded = report.values()
-    shown = {**_object(recorded), **_for_people(status), **_for_people(ranged)}
+    shown = _for_people({key: value for part in report.values() for key, value in part.items()})
     budget = budget_of(memory, snapshot, memory.index.heartbeat(), memory.clock.now())
     if budget.most is not None:  # bags that are only looked at have none
         shown["budget"] = describe_budget(budget)
@@ -136,10 +124,6 @@ def _show(memory: Memory, report: JsonObject) -> None:
         topics = sorted(snapshot.silent_topics)
         shown["topics_without_messages"] = listed(topics, at_most=_MOST_SILENT)
     print_reply(with_shorter_lists(shown, shown))
-
-
-def _object(value: JsonValue) -> JsonObject:
-    return value if isinstance(value, dict) else {}
 
 
 def _amount_recorded(snapshot: Snapshot) -> JsonObject:
@@ -167,11 +151,9 @@ def storage_of(bags: Sequence[BagFile]) -> str:
     return ", ".join(sorted({(bag_kind(bag.path.name) or "")[1:] for bag in bags}))
 
 
-def _for_people(value: JsonValue) -> JsonObject:
+def _for_people(reply: JsonObject) -> JsonObject:
     """Returns a reply without keys that are empty or repeated, or about a missing recorder."""
-    reply = _object(value)
-    has_recorder = reply.get("recorder", "") is not None
-    left_out = _TOLD_TWICE if has_recorder else _TOLD_TWICE | _OF_RECORDER
+    left_out = _TOLD_TWICE if reply["recorder"] is not None else _TOLD_TWICE | _OF_RECORDER
     return {
         key: value
         for key, value in reply.items()

@@ -370,11 +370,10 @@ def parse_end(text: str, now: float, start: float) -> float:
     return window_end_s(text, end, start)
 
 
-def day_of(memory: "Memory", day: str | None) -> TimeWindow:
-    """Returns a day of this machine's calendar, from midnight to midnight; None is the newest."""
+def newest_day(memory: "Memory") -> TimeWindow:
+    """Returns the newest day of data in this machine's calendar, from midnight to midnight."""
     newest = memory.index.snapshot().dating.latest
-    now = present_time(memory) if day is not None or newest is None else newest
-    at = unix_from_ns(now) if day is None else parse_time(day, unix_from_ns(now))
+    at = unix_from_ns(memory.clock.now() if newest is None else newest)
     date = datetime.fromtimestamp(at).astimezone().date()
     days = (date, date + timedelta(days=1))
     begin, end = (datetime.combine(day, time.min).timestamp() for day in days)

@@ -11,7 +11,6 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -19,7 +18,6 @@ from typing import Annotated, Final, NamedTuple
 
 import typer
 import yaml
-from rich.live import Live
 
 from ros2_memory.bag_dir.durable_write import write_durably
 from ros2_memory.bag_dir.heartbeat import Heartbeat, read_heartbeat
@@ -32,7 +30,6 @@ from ros2_memory.cli.output import (
     format_size,
     print_line,
     spinner,
-    stdout_console,
 )
 from ros2_memory.cli.proposal import (
     INDEX_BYTES,
@@ -58,7 +55,6 @@ from ros2_memory.recorder.process.installation import (
     Installation,
     advice_on_rmw,
     advice_on_silence,
-    advice_on_users,
     find_installation,
     rmw_of,
     setup_files_here,
@@ -73,7 +69,7 @@ from ros2_memory.storage.base import BagReader
 SECONDS: Final = 5.0
 """How long topics are measured."""
 EVERY_S: Final = 10.0
-"""Without a terminal, a line is printed so often, and when the state changes."""
+"""A line is printed so often, and when the state changes."""
 _TICK_S: Final = 0.2
 _PATIENCE: Final = Patience(interrupt_s=40.0, terminate_s=5.0)
 """The recorder waits for children of its own."""
@@ -220,26 +216,12 @@ def _require_messages(robot: _Robot, measured: Survey) -> None:
             "and give this command their ROS_DOMAIN_ID, RMW_IMPLEMENTATION and "
             f"ROS_AUTOMATIC_DISCOVERY_RANGE{f'; {advice}' if advice else ''}"
         )
-    owners = ", ".join(map(str, sorted(_owners_of_segments() - {os.getuid()})))
-    others = f"nodes of user {owners} run, or ran, here" if owners else ""
     if light and not any(topic.messages for topic in light):
         raise RecorderError(
             f"{counted(len(light), 'topic is', 'topics are')} offered in {robot.where}, and no "
-            f"message came to user {os.getuid()} in {SECONDS:g} s{others and f' ({others})'}; "
+            f"message came to user {os.getuid()} in {SECONDS:g} s; "
             f"{advice_on_silence(robot.ros.env)}"
         )
-    # Fast DDS lets their messages through where such a node made anew what a recorder had left.
-    if others and (advice := advice_on_users(robot.ros.env)):
-        print_line(f"{others}; what they send may come now and not later: {advice}")
-
-
-def _owners_of_segments() -> set[int]:
-    """Returns the users whose nodes have shared memory of Fast DDS."""
-    owners: set[int] = set()
-    for segment in Path("/dev/shm").glob("fastrtps_*"):  # noqa: S108 - Fast DDS has them there
-        with suppress(FileNotFoundError):  # its node ended just now
-            owners.add(segment.stat().st_uid)
-    return owners
 
 
 def _write_proposal(robot: _Robot, measured: Survey, disk: Disk, *, yes: bool) -> None:
@@ -296,9 +278,6 @@ def _show_list(robot: _Robot, measured: Survey, disk: Disk) -> None:
     missing = [topic.topic for topic in chosen(proposal, Choice.RECORD) if topic not in recorded]
     if missing:
         print_line(f"it lacks, of what would be proposed: {', '.join(missing)}")
-    unoffered = [*{*selection.exact}.difference(topic.topic for topic in measured.topics)]
-    if unoffered:
-        print_line(f"it lists, and nobody offers: {', '.join(sorted(unoffered))}")
 
 
 def _print_topics(proposal: Proposal, disk: Disk, recorded: list[Offered], measured: Survey) -> str:
@@ -381,41 +360,34 @@ def _run_programs(words: Sequence[str], bag_dir: Path) -> bool:
 
 def _watch(programs: Mapping[str, Child], bag_dir: Path) -> str:
     """Shows what comes in, until a program ends; returns which one, and its last words."""
-    console = stdout_console()
     before, due_s = "", 0.0
     last = dict.fromkeys(programs, "it gave no reason")
-    with Live(console=console, auto_refresh=False) as live:
-        while True:
-            for name, child in programs.items():
-                status = child.exit_status()
-                for line in filter(None, map(escape, child.take_lines())):
-                    if "http://" not in line:  # the address of the page is no reason
-                        last[name] = line
-                    console.print(f"{name}: {line}", soft_wrap=True)
-                if status is not None:
-                    return f"the {name} ended with status {status}: {last[name]}"
-            beat = read_heartbeat(bag_dir).heartbeat
-            state, line = "starting", "recorder: starting"
-            if beat is not None and beat.pid == programs["recorder"].pid:
-                state, line = _line_of(beat)
-            if console.is_terminal:
-                live.update(escape(line), refresh=True)
-            elif state != before or time.monotonic() >= due_s:
-                before, due_s = state, time.monotonic() + EVERY_S
-                print_line(escape(line))
-            time.sleep(_TICK_S)
+    while True:
+        for name, child in programs.items():
+            status = child.exit_status()
+            for line in filter(None, map(escape, child.take_lines())):
+                if "http://" not in line:  # the address of the page is no reason
+                    last[name] = line
+                print_line(f"{name}: {line}")
+            if status is not None:
+                return f"the {name} ended with status {status}: {last[name]}"
+        beat = read_heartbeat(bag_dir).heartbeat
+        if beat is not None and beat.pid == programs["recorder"].pid:
+            heard = len({*beat.subscribed} - {*beat.silent})
+            if before != (before := f"{beat.state} {heard}") or time.monotonic() >= due_s:
+                due_s = time.monotonic() + EVERY_S
+                print_line(escape(_line_of(beat, heard)))
+        time.sleep(_TICK_S)
 
 
-def _line_of(beat: Heartbeat) -> tuple[str, str]:
-    """Returns the recorder's state, and a line on it with what comes in."""
-    heard = len({*beat.subscribed} - {*beat.silent})
+def _line_of(beat: Heartbeat, heard: int) -> str:
+    """Returns a line on what the recorder does, and on how many topics it has heard."""
     for_s = unix_from_ns(WallClock().now() - beat.since)
     line = f"recorder: {beat.state} for {format_duration(for_s)}, {counted(heard, 'topic')}"
     why = beat.waiting_for or (None if beat.recovered else beat.last_error)
     if beat.silent:
         line += f", silent: {listed(beat.silent)}"
-    line += f", {format_size(beat.bytes_written)}{f'; {why}' if why else ''}"
-    return f"{beat.state} {heard}", line
+    return f"{line}, {format_size(beat.bytes_written)}{f'; {why}' if why else ''}"
 
 
 def survey(ros: Installation, reader: BagReader, chunk_bytes: int) -> Survey:

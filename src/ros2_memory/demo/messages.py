@@ -99,19 +99,6 @@ class MessageSchedule:
         """Yields all streams' messages in the order in which they are received, without end."""
         return merge(*map(self.messages, STREAMS), key=lambda message: message.log_time)
 
-    def newest(self, stream: Stream, at: Ns) -> Message | None:
-        """Returns the newest message with a log time at or before `at`; None before the first."""
-        return next(self.newest_first(stream, at), None)
-
-    def newest_first(self, stream: Stream, at: Ns) -> Iterator[Message]:
-        """Yields the stream's messages with a log time at or before `at`, newest first."""
-        first = self._first(stream)
-        last = first if stream.latched else (at - self.t0) // stream.period
-        for k in range(max(first, last), first - 1, -1):
-            message = self.message(stream, k)
-            if message.log_time <= at:
-                yield message
-
     def _first(self, stream: Stream) -> int:
         return 0 if stream.latched else -((self.t0 - self.start) // stream.period)
 

@@ -16,7 +16,7 @@ import yaml
 
 from ros2_memory.bootstrap import build_repairer
 from ros2_memory.core.errors import BagError
-from ros2_memory.core.timebase import Clock, Ns, WallClock, ns_from_unix, unix_from_ns
+from ros2_memory.core.timebase import Clock, WallClock, ns_from_unix, unix_from_ns
 from ros2_memory.demo.messages import MessageSchedule, Stream, definition, payload
 from ros2_memory.storage.base import Channel, Record, Schema
 from ros2_memory.storage.mcap.writer import McapWriter
@@ -62,7 +62,6 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
         self._clock = clock or WallClock()
         self._due = timeline.everything()
         self._next = next(self._due)
-        self._closed: list[tuple[Ns, Ns]] = []
         self._caught_up, self._ending = threading.Event(), threading.Event()
         self._thread = threading.Thread(target=self._record, name="demo-recorder", daemon=True)
         self._thread.start()
@@ -70,16 +69,6 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-
-    def closed_ends(self, since: Ns, until: Ns) -> tuple[Ns, ...]:
-        """Returns the ends of closed splits: the log times of their last messages.
-
-        First the end of the newest split that was closed by the wall-clock time `since` (if there
-        was one), then that of each that was closed after it up to `until`.
-        """
-        closed = [*self._closed]
-        before = [end for at, end in closed if at <= since]
-        return (*before[-1:], *(end for at, end in closed if since < at <= until))
 
     def stop(self) -> None:
         """Ends the recording as a clean shutdown does: a footer, and metadata.yaml."""
@@ -100,14 +89,11 @@ class DemoRecorder(AbstractContextManager["DemoRecorder"]):
 
     def _split(self) -> Iterator[Record]:
         """Yields the messages of one split, each when it is received."""
-        first = last = self._next.log_time
+        first = self._next.log_time
         while self._next.log_time - first <= self._duration and not self._is_over():
             message, self._next = self._next, next(self._due)
-            last = message.log_time
             channel = _channel(message.stream)
-            yield Record(channel, last, message.publish_time, payload(message))
-        # Noted before the footer: who sees that must find the split among the closed ones.
-        self._closed.append((self._clock.now(), last))
+            yield Record(channel, message.log_time, message.publish_time, payload(message))
 
     def _is_over(self) -> bool:
         """Waits until the next message is received; returns whether the recording ends instead."""

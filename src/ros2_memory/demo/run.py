@@ -109,7 +109,6 @@ PLACES_NAME: Final = "places.yaml"
 _OURS: Final = ("MEMORY_", "MCP_", "ROS_VISION_INTERFACES_PATH", "CREDENTIALS_DIRECTORY")
 _UP_WITHIN_S: Final = 300.0
 """As long as it may take on a machine with much else to do; one that fails ends at once."""
-_SAID_AFTER_S: Final = 5.0
 _LOOKED_AT_S: Final = 0.5
 _LOG_LINES_SHOWN: Final = 8
 
@@ -135,11 +134,9 @@ def server_environment(
 
 @contextmanager
 def running_server(
-    bag_dir: Path, port: int, say: Callable[[str], object], *, verbose: bool = False
+    bag_dir: Path, port: int, *, verbose: bool = False
 ) -> Iterator[tuple[Child, str]]:
     """Yields a server that answers, with its address, and ends it after the block.
-
-    Says what it waits for.
 
     Its log goes to stderr where `verbose`; its columns into a folder that is removed at the end: no
     one else uses it. The rooms of the flat are written to `places.yaml` in the bag directory. It
@@ -160,14 +157,14 @@ def running_server(
             stderr=None if verbose else subprocess.STDOUT,
         )
         try:
-            yield server, _address_of(server, say)
+            yield server, _address_of(server)
         finally:
             end_all([server])
 
 
-def _address_of(server: Child, say: Callable[[str], object]) -> str:
+def _address_of(server: Child) -> str:
     """Waits until a server has printed its address, and returns that."""
-    begun, said, lines = time.monotonic(), False, list[str]()
+    begun, lines = time.monotonic(), list[str]()
     while not (printed := re.search(rf"http://{HOST}:\d+", "\n".join(lines))):
         status, waited_s, failed = server.exit_status(), time.monotonic() - begun, ""
         lines += server.take_lines()
@@ -178,9 +175,6 @@ def _address_of(server: Child, say: Callable[[str], object]) -> str:
         if failed:
             words = [": its last words are", *lines[-_LOG_LINES_SHOWN:]] if lines else []
             raise EpisodicError("\n  ".join([failed, *words]))
-        if waited_s > _SAID_AFTER_S and not said:
-            said = True
-            say(f"waiting up to {_UP_WITHIN_S:g} s for the server to answer")
         time.sleep(0.05)
     return printed[0]
 
@@ -190,10 +184,6 @@ SHORTEST_S: Final = LAP_S + 2 * SPLIT_DURATION_S
 LONGEST_S: Final = 86_400.0
 _UNDERWAY_S: Final = 22
 """How long the robot has been driving when its recording begins (it leaves the front door)."""
-
-_KNOWN_WITHIN_NS: Final = 3 * NS_PER_S
-"""The server knows a closed split within this time: the index refresh, with some room."""
-
 
 _CONNECTED_WITHIN_S: Final = 60.0
 
@@ -245,7 +235,7 @@ def run_demo(
         bag_dir.mkdir(parents=True, exist_ok=True)
         folder = bag_dir.resolve()
         recorder = stack.enter_context(_recorder(folder, duration_s))
-        server, url = stack.enter_context(running_server(folder, port, tell, verbose=verbose))
+        server, url = stack.enter_context(running_server(folder, port, verbose=verbose))
         tell(
             "A simulated robot drives through a flat and records what it does. A client asks the "
             "real\nquery server about it, and each answer is held against the robot's closed form."
@@ -307,9 +297,7 @@ async def _ask(client: Client, question: Question, recorder: DemoRecorder) -> Ex
         return Exchange(question, "", f"the call failed: {error}", right=False)
     after = clock.now()
     reply = "".join(part.text for part in result.content if isinstance(part, TextContent))
-    call = CallContext(
-        recorder.timeline, before, after, recorder.closed_ends(before - _KNOWN_WITHIN_NS, after)
-    )
+    call = CallContext(recorder.timeline.t0, before, after)
     return judge_reply(question, reply, call, is_error=result.is_error)
 
 

@@ -95,8 +95,8 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         ("cat /odom gone", "gone: there is no such file or folder"),
         ("cat a /odom", "/odom: there is no such file or folder"),
         # People read commands where an error names a tool.
-        ("cat /odom empty", "; `ros2-memory info` lists"),
-        ("cat /nothing a", "; `ros2-memory topics` lists"),
+        ("cat /odom empty", "; data_time_range lists"),
+        ("cat /nothing a", "; list_recorded_topics lists"),
         ("cat '/\x1b[31m' .", "/\\x1b[31m"),
         ("export .", "give one of --mcap FILE and --parquet DIR"),
         ("export . --mcap x --parquet b", "give one of --mcap FILE and --parquet DIR"),
@@ -145,9 +145,9 @@ class TestPaths:
         bag = folder / "a" / "a_0.mcap"
         bag.write_bytes(bag.read_bytes()[:-20])
         os.utime(bag, (1.7e9, 1.7e9))
-        shown = exits(0, "topics .").out
+        shown = exits(0, "topics .").err
         assert shown.count("readable part is used") == 1
-        assert "2 topics: 1 unfinished bag" in shown
+        assert ": 1 unfinished bag" in shown
         assert [len(row["notes"]) for row in exits(0, "topics . --json").json] == [1, 1]
 
     def test_bags_of_others_need_no_recorder_and_no_preset(

@@ -54,7 +54,7 @@ def test_every_unfinished_file_below_a_directory_is_repaired(tmp_path: Path) -> 
     assert files_in(tmp_path) == ["a", "a/a_0.mcap", "a/a_1.mcap", "a/metadata.yaml", "b"]
     assert printed[0].startswith(f"a/a_1.mcap: repaired: {count} messages")
     metadata = f"{tmp_path}/a/metadata.yaml: written to match the files"
-    assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, outcome.summary(dry_run=False)]
+    assert printed[1:] == ["b/b_0.mcap: empty, removed", metadata, outcome.summary()]
 
 
 class TestMetadata:
@@ -179,20 +179,6 @@ def test_a_terminal_sees_which_file_is_repaired_and_then_a_clean_line(
     shown = terminal.getvalue()
     assert "repairing a/a_0.mcap (1 of 1)" in shown
     assert "\x1b[2K" in shown.rpartition("repairing")[2]
-
-
-def test_a_dry_run_says_what_would_be_changed_and_changes_nothing(tmp_path: Path) -> None:
-    left_open(tmp_path / "rec/rec_0.mcap")
-    (tmp_path / "rec/rec_1.mcap").write_bytes(b"")
-    before = {path: path.read_bytes() for path in tmp_path.rglob("*.*")}
-    outcome = recover_files(tmp_path, dry_run=True, clock=later(60))
-    assert (outcome.repaired, outcome.removed) == (1, 1)
-    repaired, removed, metadata, *_, last = outcome.lines
-    assert repaired.startswith("rec/rec_0.mcap: would be repaired")
-    assert removed == "rec/rec_1.mcap: empty, would be removed"
-    assert metadata.endswith("metadata.yaml: would be written to match the files")
-    assert last.startswith("nothing was changed")
-    assert {path: path.read_bytes() for path in tmp_path.rglob("*.*")} == before
 
 
 class TestTheProgram:

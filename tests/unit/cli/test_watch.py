@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pty
+import re
 import shutil
 import subprocess
 import time
@@ -13,7 +14,7 @@ import pytest
 
 from ros2_memory.bag_dir.heartbeat import Heartbeat, RecorderState, write_heartbeat
 from ros2_memory.bag_dir.state_files import Loss, append_losses
-from ros2_memory.cli.watch import AS_USUAL, TopicRate
+from ros2_memory.cli.watch import AS_USUAL, assessment
 from ros2_memory.core.timebase import NS_PER_S
 from tests.support.bags import boolean, log_entry, odom, text, write_mcap
 from tests.support.forked_commands import write_command
@@ -44,7 +45,7 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("rate", "usual", "age_s", "assessment"),
+    ("rate", "usual", "age_s", "expected"),
     [
         (20.0, 20.0, 0.0, AS_USUAL),
         (9.9, 20.0, 0.0, "slow"),
@@ -57,9 +58,9 @@ def bag_dir(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_a_rate_is_assessed_by_what_is_usual(
-    rate: float, usual: float | None, age_s: float, assessment: str
+    rate: float, usual: float | None, age_s: float, expected: str
 ) -> None:
-    assert TopicRate("/x", rate, usual, age_s).assessment == assessment
+    assert assessment(rate, usual, age_s) == expected
 
 
 def rows_of(output: str) -> dict[str, str]:
@@ -70,7 +71,7 @@ def rows_of(output: str) -> dict[str, str]:
 
 def test_each_look_says_of_every_topic_whether_its_rate_is_as_usual(exits: Program) -> None:
     output = exits(0, "watch --count 2 --every 0.01").out
-    assert output.count("recorder: none") == 2
+    assert re.findall(r"recorder +(\w+)", output) == ["none"] * 2
     rows = rows_of(output)
     assert rows["/odom"].endswith(AS_USUAL)
     assert rows["/chatter"].endswith("silent")
@@ -98,7 +99,7 @@ def test_messages_that_two_recordings_have_count_once(bag_dir: Path, exits: Prog
 
 def test_an_empty_memory_can_be_watched(tmp_path: Path, exits: Program) -> None:
     (tmp_path / "none").mkdir()
-    assert "no data" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
+    assert "latest          none" in exits(0, f"watch --count 1 --bag-dir {tmp_path}/none").out
 
 
 def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
@@ -117,7 +118,7 @@ def test_a_terminal_gets_a_table(tmp_path: Path) -> None:
         os.close(ours)
         assert process.wait(60) == 0
     assert b"/odom" in shown
-    assert b"usually" in shown
+    assert b"usual_hz" in shown
     assert b"silent" in shown
 
 
@@ -126,7 +127,7 @@ def test_restarts_and_topics_that_nobody_offers_are_reported(bag_dir: Path, exit
     beat = Heartbeat(1, now, RecorderState.RECORDING, (), now, 0, (), (), None, 2.0, 2, lost)
     write_heartbeat(bag_dir, beat)
     output = exits(0, "watch --count 1").out
-    assert "recorder: recording, restarted 2 times  newest" in output
+    assert re.search(r"recorder +recording (.*\n)+restarts +2 ", output)
     assert "offered by no publisher: /gone, /lost" in output
 
 
@@ -142,12 +143,9 @@ class TestOldData:
     def test_is_not_judged_by_what_is_usual(self, old: Path, exits: Program) -> None:
         output = exits(0, f"watch --count 1 --bag-dir {old}").out
         assert "as usual" not in output
-        assert "days old" in output
-        assert (
-            "no new data: the rates are those of the last 10 s of data, and not checked" in output
-        )
+        assert "days ago" in output
+        assert re.search(r"is_live +false", output)
 
     def test_is_as_old_as_the_tools_say(self, old: Path, exits: Program) -> None:
         output = exits(0, f"watch --count 1 --bag-dir {old} data.now=latest").out
-        assert "which is now (data.now=latest)" in output
-        assert "days old" not in output
+        assert "days ago" not in output

@@ -44,7 +44,7 @@ def test_a_server_that_cannot_listen_is_told_by_its_last_words(tmp_path: Path) -
         port = taken.getsockname()[1]
         with (
             pytest.raises(EpisodicError, match=rf"(?s)exit code 1.*port {port} .* in use"),
-            running_server(tmp_path, port, print),
+            running_server(tmp_path, port),
         ):
             pass
 
