@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Final
 
-PRAGMAS: Final = ("page_size = 1024", "auto_vacuum = INCREMENTAL", "secure_delete = ON")
+PRAGMAS: Final = (
+    "page_size = 1024",
+    "cache_size = -256",  # KiB: a server may have hundreds open, and the kernel has their pages
+    "auto_vacuum = INCREMENTAL",
+    "secure_delete = ON",
+)
 """Of each connection, before anything else: deleted rows are overwritten, and pages that become
 free go back to the disk."""
 TABLES: Final = (

@@ -42,7 +42,7 @@ _LOCAL: Final = (
     " UNION ALL BY NAME"
     " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
 )
-_MESSAGE_BYTES: Final = 64 << 20
+_MESSAGE_BYTES: Final = 16 << 20
 
 log = get_logger(__name__)
 
