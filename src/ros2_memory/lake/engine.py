@@ -43,6 +43,7 @@ _LOCAL: Final = (
     " SELECT * FROM read_parquet($local, union_by_name = true, hive_partitioning = false)"
 )
 _MESSAGE_BYTES: Final = 16 << 20
+_CHANNEL_BYTES: Final = 8 << 20
 
 log = get_logger(__name__)
 
@@ -61,6 +62,7 @@ class Lake:
 
     Attributes:
         messages: packed ones that were read last, of all robots.
+        channels: those of the bags that were read last.
     """
 
     def __init__(
@@ -76,6 +78,7 @@ class Lake:
         self._database = duckdb.connect(config={**settings})
         self._catalog, self._translated = catalog, translated
         self.messages = ByteLru[bytes](_MESSAGE_BYTES)
+        self.channels = ByteLru[object](_CHANNEL_BYTES)
         self._lock = threading.Lock()
         self._looked_at = -math.inf
         self._tables: dict[str, IcebergTable] = {}

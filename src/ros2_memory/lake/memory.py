@@ -11,7 +11,7 @@ from datetime import date, timedelta
 from itertools import chain
 from operator import itemgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple, cast
 from zlib import crc32
 
 from ros2_memory.columns.pack import is_large
@@ -22,7 +22,7 @@ from ros2_memory.index.snapshot import Snapshot
 from ros2_memory.index.timeline import Timeline
 from ros2_memory.lake.tables import ShippedBag, day_of, end_of, unpacked_messages
 from ros2_memory.storage.base import BagReader, Batch, Channel, Closing, Definition, Record, Schema
-from ros2_memory.storage.cache import ByteLru, shared
+from ros2_memory.storage.cache import shared
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -49,7 +49,6 @@ _LOOKS: Final = 4
 """What is known of the lake serves for all robots for this part of the time that it may be old."""
 _GONE: Final = "it is not in the lake any more"
 _HEAD_BYTES: Final = 200
-_HEADS_BYTES: Final = 8 << 20
 
 _BAGS: Final = (
     f"SELECT {', '.join(ShippedBag._fields)}, summary, counts, joined FROM bags"  # noqa: S608 - constants
@@ -296,9 +295,6 @@ class LakeReader(BagReader):
     index: LakeIndex
     decoder: BagReader
     large: LargeReads
-    _heads: ByteLru[Sequence[_Head]] = field(
-        default_factory=lambda: ByteLru(_HEADS_BYTES), init=False
-    )
 
     def reads(self, path: Path) -> bool:
         """Returns True: all files of the index are of the lake."""
@@ -387,12 +383,13 @@ class LakeReader(BagReader):
         Raises:
             BagVanishedError: it is not in the lake any more.
         """
-        heads = self._heads.get((bag.bag_id, bag.file.sidecar_ns))
+        known = self.index.lake.channels
+        heads = cast("Sequence[_Head] | None", known.get((bag.bag_id, bag.file.sidecar_ns)))
         if heads is None:
             heads_by_bag = self._read_heads(bag)
             for bag_id, read in heads_by_bag.items():
                 size_bytes = _HEAD_BYTES * (1 + len(read))
-                self._heads.put((bag_id, bag.together[bag_id]), read, size_bytes)
+                known.put((bag_id, bag.together[bag_id]), read, size_bytes)
             heads = heads_by_bag[bag.bag_id]
         if not heads and bag.file.summary.count:
             # Deleted, or replaced under another id, since the index of this robot was read.
