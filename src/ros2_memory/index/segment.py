@@ -23,10 +23,8 @@ from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
 from ros2_memory.index.split_order import (
     Series,
-    SplitNames,
     SplitRange,
     StepBack,
-    split_names_of,
     split_ranges_of,
 )
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
@@ -187,11 +185,6 @@ class Segment:
         return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
-    def split_names(self) -> SplitNames:
-        """What the names of the bags say."""
-        return split_names_of(self.bags.files())
-
-    @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
         _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
@@ -207,7 +200,7 @@ class Segment:
     @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
         """Which splits of each recording are among the bags, by their number."""
-        return split_ranges_of(self)
+        return split_ranges_of(self.bags)
 
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:

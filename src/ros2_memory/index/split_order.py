@@ -7,8 +7,8 @@ splits lie on both sides of one that cannot be read.
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from itertools import chain, pairwise
+from collections import defaultdict
+from itertools import chain, pairwise, repeat
 from operator import attrgetter
 from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
 
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
+    from ros2_memory.index.bag_rows import BagRows
     from ros2_memory.index.segment import Segment
 
 Series: TypeAlias = str
@@ -32,10 +33,18 @@ Series: TypeAlias = str
 
 
 class Split(NamedTuple):
-    """A bag with its number in its series."""
+    """A bag with its number in its series: a row of some bags, and its first and last log time."""
 
     number: int
-    bag: BagFile
+    start: Ns
+    end: Ns
+    row: int
+    bags: BagRows
+
+    @property
+    def bag(self) -> BagFile:
+        """The bag, which is made when it is asked for."""
+        return self.bags[self.row]
 
 
 class Neighbours(NamedTuple):
@@ -71,17 +80,25 @@ class SplitName(NamedTuple):
     number: int
 
 
+class Stem(NamedTuple):
+    """What the paths of bags share: their series, zeros before the number, and the suffixes."""
+
+    series: Series
+    zeros: str
+    suffix: str
+
+
 class SplitNames(NamedTuple):
-    """What the names of some bags say.
+    """The paths of some bags.
 
     Attributes:
-        series: the different ones, in order of the bags; of a name without a number the path.
-        positions: for each bag, where its series is among these.
-        numbers: of the bags in their series, or their ranks; -1 where the name has none.
+        stems: the different ones, in order of the bags.
+        positions: for each bag, where its stem is among these.
+        numbers: of the bags in their series; -1 where the name has none.
     """
 
-    series: Sequence[Series]
-    positions: NDArray[np.int64]
+    stems: Sequence[Stem]
+    positions: NDArray[np.uint16]
     numbers: NDArray[np.int64]
 
 
@@ -90,8 +107,9 @@ _BY_NUMBER: Final = attrgetter("number")
 
 def stem_of(file: str) -> str:
     """Returns the path of a bag without its suffixes."""
-    stem = file.removesuffix(COMPRESSED)
-    return stem[: stem.rfind(".")]
+    path = file.removesuffix(COMPRESSED)
+    stem, dot, suffix = path.rpartition(".")
+    return stem if dot and "/" not in suffix else path
 
 
 def split_of(file: str) -> SplitName | None:
@@ -103,25 +121,25 @@ def split_of(file: str) -> SplitName | None:
 
 def split_names_of(files: Iterable[str]) -> SplitNames:
     """Returns what the names of bags say, which are paths."""
-    position_of: dict[Series, int] = {}
-    rows: list[tuple[int, int]] = []
-    following, position, series, number, suffix = "", 0, "", 0, ""
+    position_of: dict[Stem, int] = {}
+    positions, numbers = list[int](), list[int]()
+    following, position, number, stem = "", 0, 0, Stem("", "", "")
     for file in files:
         # Mostly the bag after one is the next split.
         if file == following:
             number += 1
         else:
-            series, number = split_of(file) or (file, -1)
-            suffix = file[len(stem_of(file)) :]
-            position = position_of.setdefault(series, len(position_of))
-        rows.append((position, number))
-        following = f"{series}{number + 1}{suffix}"
-    if max([number for _, number in rows], default=0) > MAX_NS:
-        # A date with microseconds has 20 digits.
-        known = sorted({-1, *(number for _, number in rows)})
-        rows = [(position, bisect_left(known, number) - 1) for position, number in rows]
-    positions, numbers = np.array(rows, np.int64).reshape(-1, 2).T
-    return SplitNames([*position_of], positions, numbers)
+            path = stem_of(file)
+            series, number = split_of(file) or (path, -1)
+            zeros = path[len(series) :].removesuffix(str(number))
+            stem = Stem(series, zeros, file[len(path) :])
+            position = position_of.setdefault(stem, len(position_of))
+        positions.append(position)
+        numbers.append(number)
+        following = f"{stem.series}{stem.zeros}{number + 1}{stem.suffix}"
+    # A date with microseconds has 20 digits.
+    dtype = np.int64 if max(numbers, default=0) <= MAX_NS else object
+    return SplitNames([*position_of], np.array(positions, np.uint16), np.array(numbers, dtype))
 
 
 def is_recording(series: Series) -> bool:
@@ -130,36 +148,27 @@ def is_recording(series: Series) -> bool:
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
-def split_ranges_of(segment: Segment) -> dict[Series, SplitRange]:
-    """Returns the range of each series among the bags of a segment."""
-    bags, (all_series, positions, numbers) = segment.bags, segment.split_names
+def split_ranges_of(bags: BagRows) -> dict[Series, SplitRange]:
+    """Returns the range of each series among some bags."""
+    position_of: dict[Series, int] = {}
+    of_stems = [position_of.setdefault(stem.series, len(position_of)) for stem in bags.names.stems]
+    positions, numbers = np.array(of_stems)[bags.names.positions], bags.names.numbers
     order = np.lexsort((numbers, positions))
     order = order[numbers[order] >= 0]
+    edges = np.searchsorted(positions[order], np.arange(len(position_of) + 1))
     # Few splits begin before the one before them has ended.
-    late = np.flatnonzero(bags.ends[order[:-1]] > bags.starts[order[1:]])
-    edges = np.searchsorted(positions[order], np.arange(len(all_series) + 1))
-    late_edges = np.searchsorted(late, edges).tolist()
-
-    # Ranks stand for numbers of which one is beyond 64 bits.
-    highest = int(numbers.argmax())
-    name = split_of(bags[highest].file)
-    are_ranks = name is not None and name.number != numbers[highest]
-
-    def split(series: Series, at: int) -> Split:
-        row = order[at]
-        bag, number = bags[int(row)], int(numbers[row])
-        return Split(int(stem_of(bag.file).removeprefix(series)) if are_ranks else number, bag)
-
-    ranges: dict[Series, SplitRange] = {}
-    for series, (begin, end), among in zip(
-        all_series, pairwise(edges.tolist()), pairwise(late_edges), strict=True
-    ):
-        if begin < end:
-            lates = late[slice(*among)].tolist() if is_recording(series) else ()
-            pairs = [(split(series, at), split(series, at + 1)) for at in lates if at + 1 < end]
-            first, last = split(series, begin), split(series, end - 1)
-            ranges[series] = SplitRange(first, last, tuple(_steps_of(pairs)))
-    return ranges
+    before, after = order[:-1], order[1:]
+    late = (bags.ends[before] > bags.starts[after]) & (positions[before] == positions[after])
+    pairs: dict[int, list[tuple[Split, Split]]] = defaultdict(list)
+    for earlier, later in zip(_splits(bags, before[late]), _splits(bags, after[late]), strict=True):
+        pairs[int(positions[later.row])].append((earlier, later))
+    there = np.flatnonzero(np.diff(edges))
+    firsts, lasts = (_splits(bags, order[at]) for at in (edges[there], edges[there + 1] - 1))
+    all_series = [*position_of]
+    return {
+        all_series[at]: SplitRange(first, last, tuple(_steps_of(pairs[at])))
+        for at, first, last in zip(there.tolist(), firsts, lasts, strict=True)
+    }
 
 
 def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
@@ -179,8 +188,8 @@ def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
             steps.extend(chain.from_iterable(split_range.steps for split_range in ranges))
             steps.extend(_steps_of((earlier.last, later.first) for earlier, later in pairs))
         else:
-            bags = chain.from_iterable(segment.bags for segment in holding)
-            steps.extend(_steps_of(pairwise(_splits_of(series, bags))))
+            splits = chain.from_iterable(_splits_of(series, segment.bags) for segment in holding)
+            steps.extend(_steps_of(pairwise(sorted(splits, key=_BY_NUMBER))))
     return steps
 
 
@@ -201,19 +210,25 @@ def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
     higher = (split for split in splits if split.number > number)
     before = max(lower, key=_BY_NUMBER, default=None)
     after = min(higher, key=_BY_NUMBER, default=None)
-    return Neighbours(before and before.bag.end, after and after.bag.start)
+    return Neighbours(before and before.end, after and after.start)
 
 
-def _splits_of(series: Series, bags: Iterable[BagFile]) -> list[Split]:
-    """Returns the splits of a series among these bags, by number."""
-    named = ((split_of(bag.file), bag) for bag in bags if bag.file.startswith(series))
-    splits = [Split(name.number, bag) for name, bag in named if name and name.series == series]
-    return sorted(splits, key=_BY_NUMBER)
+def _splits_of(series: Series, bags: BagRows) -> Iterator[Split]:
+    """Yields the splits of a series among these bags."""
+    stems, positions, numbers = bags.names
+    is_of = np.array([stem.series == series for stem in stems])
+    return _splits(bags, np.flatnonzero(is_of[positions] & (numbers >= 0)))
+
+
+def _splits(bags: BagRows, rows: NDArray[np.intp]) -> Iterator[Split]:
+    """Yields the splits in some rows of bags."""
+    of_bags = bags.names.numbers, bags.starts, bags.ends
+    return map(Split, *(of[rows].tolist() for of in of_bags), rows.tolist(), repeat(bags))
 
 
 def _steps_of(pairs: Iterable[tuple[Split, Split]]) -> Iterator[StepBack]:
     """Yields where the clock was set back between two splits that follow each other."""
     for earlier, later in pairs:
-        by = earlier.bag.end - later.bag.start
+        by = earlier.end - later.start
         if earlier.number < later.number and by > OUT_OF_ORDER_NS:
             yield StepBack(earlier.bag, later.bag, by)

@@ -11,7 +11,9 @@ from ros2_memory.core.timebase import MAX_NS, MIN_NS
 from ros2_memory.index.bag_rows import BagRows, Bags
 
 times = st.integers(MIN_NS, MAX_NS)
-names = st.text(st.characters(exclude_characters="/\0"), min_size=1)
+names = st.text(st.characters(exclude_characters="/\0"), min_size=1) | st.from_regex(
+    r"[._a]?[0-9]{0,21}(\.mcap|\.db3)?(\.zstd)?", fullmatch=True
+).filter(bool)
 topics = st.builds(
     TopicSummary, st.sampled_from(["/a", "/b"]), st.just("T"), st.just("cdr"), times, times, times
 )
