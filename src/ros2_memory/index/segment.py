@@ -198,6 +198,13 @@ class Segment:
         return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
 
     @cached_property
+    def handed_over(self) -> frozenset[str]:
+        """The folders with a `handover.json`."""
+        _, _, sidecars = self.bags.contents.T
+        folders = np.unique(self.bags.folder_of[sidecars != 0]).tolist()
+        return frozenset(map(self.bags.folders.__getitem__, folders))
+
+    @cached_property
     def split_ranges(self) -> dict[Series, SplitRange]:
         """Which splits of each recording are among the bags, by their number."""
         return split_ranges_of(self.bags)
@@ -308,7 +315,8 @@ class Segment:
 
         The bags are in the order of `_order`.
         """
-        numbers = np.empty((len(headers), len(self.bags), 3), np.int64)
+        # Counts beside counts, and times beside times: so they are added up at once.
+        numbers = np.empty((3, len(headers), len(self.bags)), np.int64).transpose(1, 2, 0)
         end = 0
         for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
@@ -466,8 +474,10 @@ def _spacings(counts: NDArray[np.int64], spans: NDArray[np.int64]) -> list[dict[
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
     keys = topics * _OCTAVES + octaves
     sums = np.zeros((3, len(counts) * _OCTAVES), np.int64)
+    # Mostly the next bag has the same key.
+    begins = np.flatnonzero(np.diff(keys, prepend=-1))
     for added, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
-        np.add.at(added, keys, values)
+        np.add.at(added, keys[begins], np.add.reduceat(values, begins))
     spacings: list[dict[int, Spacing]] = [{} for _ in counts]
     there = np.flatnonzero(sums[0])
     for key, spacing in zip(there.tolist(), sums[:, there].T.tolist(), strict=True):
