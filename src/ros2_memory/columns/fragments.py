@@ -43,7 +43,7 @@ _KEY_BYTES: Final = 400
 _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
 _TUPLE, _BYTES, _ARRAY, _ROWS = -1, -2, -3, -4
-_NUMBERS: Final = frozenset({int, float})
+_PLAIN: Final = frozenset({int, float, bool, type(None)})
 
 log = get_logger(__name__)
 
@@ -149,12 +149,15 @@ def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
     if not isinstance(value, list):
         return value
     number, *rest = value
-    if number in {_BYTES, _ARRAY}:
+    if number == _BYTES:
+        return tail.read(*rest)
+    if number == _ARRAY:
         size, *array = rest
-        packed = tail.read(size)
-        return packed if number == _BYTES else _unpacked(packed, *array)
+        return _unpacked(tail.read(size), *array)
+    parts = rest
     # Most are numbers: to call for each would take half of the time.
-    parts = [part if type(part) in _NUMBERS else _restored(part, classes, tail) for part in rest]
+    if not _PLAIN.issuperset(map(type, rest)):
+        parts = [part if type(part) in _PLAIN else _restored(part, classes, tail) for part in rest]
     if number == _ROWS:
         none, kind, *columns = cast("list[Sequence[object]]", parts)
         return _rows(cast("Sequence[int]", none), kind, columns, classes)
