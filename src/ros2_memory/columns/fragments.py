@@ -149,11 +149,10 @@ def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
     if not isinstance(value, list):
         return value
     number, *rest = value
-    if number == _BYTES:
-        return tail.read(*rest)
-    if number == _ARRAY:
+    if _ARRAY <= number <= _BYTES:
         size, *array = rest
-        return _unpacked(tail.read(size), *array)
+        packed = tail.read(size)
+        return packed if number == _BYTES else _unpacked(packed, *array)
     parts = rest
     # Most are numbers: to call for each would take half of the time.
     if not _PLAIN.issuperset(map(type, rest)):
