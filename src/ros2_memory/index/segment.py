@@ -21,12 +21,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
-from ros2_memory.index.split_order import (
-    Series,
-    SplitRange,
-    StepBack,
-    split_ranges_of,
-)
+from ros2_memory.index.split_order import StepBack
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -203,11 +198,6 @@ class Segment:
         _, _, sidecars = self.bags.contents.T
         folders = np.unique(self.bags.folder_of[sidecars != 0]).tolist()
         return frozenset(map(self.bags.folders.__getitem__, folders))
-
-    @cached_property
-    def split_ranges(self) -> dict[Series, SplitRange]:
-        """Which splits of each recording are among the bags, by their number."""
-        return split_ranges_of(self.bags)
 
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:

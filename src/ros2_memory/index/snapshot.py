@@ -110,7 +110,7 @@ class Snapshot:
         """What the dates and the order of all bags show about the clocks that dated them."""
         recorded = self.timeline.recorded_segments
         within = chain.from_iterable(segment.set_back for segment in recorded)
-        between = steps_of(self.timeline.segments)
+        between = steps_of(self.timeline)
         return check_dates(self.timeline, [*between, *within], self.scanned_at)
 
     @cached_property

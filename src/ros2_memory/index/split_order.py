@@ -7,10 +7,7 @@ splits lie on both sides of one that cannot be read.
 
 from __future__ import annotations
 
-from collections import defaultdict
-from itertools import chain, pairwise, repeat
-from operator import attrgetter
-from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -19,32 +16,17 @@ from ros2_memory.core.model import COMPRESSED
 from ros2_memory.core.timebase import MAX_NS
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Sequence
 
     from numpy.typing import NDArray
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.core.timebase import Ns
-    from ros2_memory.index.bag_rows import BagRows
     from ros2_memory.index.segment import Segment
+    from ros2_memory.index.timeline import Timeline
 
 Series: TypeAlias = str
 """The path of a bag file without its number: what the files of one recording share."""
-
-
-class Split(NamedTuple):
-    """A bag with its number in its series: a row of some bags, and its first and last log time."""
-
-    number: int
-    start: Ns
-    end: Ns
-    row: int
-    bags: BagRows
-
-    @property
-    def bag(self) -> BagFile:
-        """The bag, which is made when it is asked for."""
-        return self.bags[self.row]
 
 
 class Neighbours(NamedTuple):
@@ -63,14 +45,6 @@ class StepBack(NamedTuple):
     before: BagFile
     after: BagFile
     by: Ns
-
-
-class SplitRange(NamedTuple):
-    """A series within a segment: its first and last split by number, and the steps between."""
-
-    first: Split
-    last: Split
-    steps: tuple[StepBack, ...]
 
 
 class SplitName(NamedTuple):
@@ -100,9 +74,6 @@ class SplitNames(NamedTuple):
     stems: Sequence[Stem]
     positions: NDArray[np.uint16]
     numbers: NDArray[np.int64]
-
-
-_BY_NUMBER: Final = attrgetter("number")
 
 
 def stem_of(file: str) -> str:
@@ -148,49 +119,29 @@ def is_recording(series: Series) -> bool:
     return prefix == f"{folder.rpartition('/')[2]}_"
 
 
-def split_ranges_of(bags: BagRows) -> dict[Series, SplitRange]:
-    """Returns the range of each series among some bags."""
+def steps_of(timeline: Timeline) -> list[StepBack]:
+    """Returns where the clock was set back between two splits of a recording that follow."""
     position_of: dict[Series, int] = {}
-    of_stems = [position_of.setdefault(stem.series, len(position_of)) for stem in bags.names.stems]
-    positions, numbers = np.array(of_stems)[bags.names.positions], bags.names.numbers
-    order = np.lexsort((numbers, positions))
-    order = order[numbers[order] >= 0]
-    edges = np.searchsorted(positions[order], np.arange(len(position_of) + 1))
-    # Few splits begin before the one before them has ended.
+    all_series, all_numbers = [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for stems, positions, numbers in (segment.bags.names for segment in timeline.segments):
+        of_stems = [
+            position_of.setdefault(series, len(position_of)) if is_recording(series) else -1
+            for series, *_ in stems
+        ]
+        all_series.append(np.array(of_stems)[positions])
+        all_numbers.append(numbers)
+    series, numbers = np.concatenate(all_series), np.concatenate(all_numbers)
+    bags, starts, ends = timeline.bags, timeline.starts, timeline.ends
+    order = np.lexsort((numbers, series))
     before, after = order[:-1], order[1:]
-    late = (bags.ends[before] > bags.starts[after]) & (positions[before] == positions[after])
-    pairs: dict[int, list[tuple[Split, Split]]] = defaultdict(list)
-    for earlier, later in zip(_splits(bags, before[late]), _splits(bags, after[late]), strict=True):
-        pairs[int(positions[later.row])].append((earlier, later))
-    there = np.flatnonzero(np.diff(edges))
-    firsts, lasts = (_splits(bags, order[at]) for at in (edges[there], edges[there + 1] - 1))
-    all_series = [*position_of]
-    return {
-        all_series[at]: SplitRange(first, last, tuple(_steps_of(pairs[at])))
-        for at, first, last in zip(there.tolist(), firsts, lasts, strict=True)
-    }
-
-
-def steps_of(segments: Iterable[Segment]) -> list[StepBack]:
-    """Returns where the clock was set back, from the ranges of all segments in order.
-
-    All bags are looked at only of series whose ranges do not follow each other.
-    """
-    by_series: dict[Series, list[Segment]] = {}
-    for segment in segments:
-        for series in filter(is_recording, segment.split_ranges):
-            by_series.setdefault(series, []).append(segment)
-    steps: list[StepBack] = []
-    for series, holding in by_series.items():
-        ranges = [segment.split_ranges[series] for segment in holding]
-        pairs = [*pairwise(ranges)]
-        if all(earlier.last.number < later.first.number for earlier, later in pairs):
-            steps.extend(chain.from_iterable(split_range.steps for split_range in ranges))
-            steps.extend(_steps_of((earlier.last, later.first) for earlier, later in pairs))
-        else:
-            splits = chain.from_iterable(_splits_of(series, segment.bags) for segment in holding)
-            steps.extend(_steps_of(pairwise(sorted(splits, key=_BY_NUMBER))))
-    return steps
+    is_next = (series[before] == series[after]) & (series[after] >= 0)
+    is_next &= (numbers[before] >= 0) & (numbers[before] < numbers[after])
+    begins = np.minimum(starts[after], MAX_NS - OUT_OF_ORDER_NS)
+    is_late = is_next & (ends[before] > begins + OUT_OF_ORDER_NS)
+    return [
+        StepBack(bags[earlier], bags[later], int(ends[earlier]) - int(starts[later]))
+        for earlier, later in zip(before[is_late].tolist(), after[is_late].tolist(), strict=True)
+    ]
 
 
 def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
@@ -198,37 +149,15 @@ def neighbours(file: str, segments: Iterable[Segment]) -> Neighbours:
     name = split_of(file)
     if name is None:
         return Neighbours()
-    series, number = name
-    splits: list[Split] = []
-    for segment in segments:
-        split_range = segment.split_ranges.get(series)
-        if split_range is not None:
-            first, last, _ = split_range
-            is_inside = first.number < number < last.number
-            splits += _splits_of(series, segment.bags) if is_inside else (first, last)
-    lower = (split for split in splits if split.number < number)
-    higher = (split for split in splits if split.number > number)
-    before = max(lower, key=_BY_NUMBER, default=None)
-    after = min(higher, key=_BY_NUMBER, default=None)
-    return Neighbours(before and before.end, after and after.start)
-
-
-def _splits_of(series: Series, bags: BagRows) -> Iterator[Split]:
-    """Yields the splits of a series among these bags."""
-    stems, positions, numbers = bags.names
-    is_of = np.array([stem.series == series for stem in stems])
-    return _splits(bags, np.flatnonzero(is_of[positions] & (numbers >= 0)))
-
-
-def _splits(bags: BagRows, rows: NDArray[np.intp]) -> Iterator[Split]:
-    """Yields the splits in some rows of bags."""
-    of_bags = bags.names.numbers, bags.starts, bags.ends
-    return map(Split, *(of[rows].tolist() for of in of_bags), rows.tolist(), repeat(bags))
-
-
-def _steps_of(pairs: Iterable[tuple[Split, Split]]) -> Iterator[StepBack]:
-    """Yields where the clock was set back between two splits that follow each other."""
-    for earlier, later in pairs:
-        by = earlier.end - later.start
-        if earlier.number < later.number and by > OUT_OF_ORDER_NS:
-            yield StepBack(earlier.bag, later.bag, by)
+    lower: list[tuple[int, Ns]] = []
+    higher: list[tuple[int, Ns]] = []
+    for bags in (segment.bags for segment in segments):
+        stems, positions, numbers = bags.names
+        is_of_series = np.array([stem.series == name.series for stem in stems])[positions]
+        rows = np.flatnonzero(is_of_series & (numbers >= 0))
+        rows = rows[np.argsort(numbers[rows], kind="stable")]
+        before = rows[numbers[rows] < name.number][-1:]
+        after = rows[numbers[rows] > name.number][:1]
+        lower += zip(numbers[before].tolist(), bags.ends[before].tolist(), strict=True)
+        higher += zip(numbers[after].tolist(), bags.starts[after].tolist(), strict=True)
+    return Neighbours(max(lower)[1] if lower else None, min(higher)[1] if higher else None)

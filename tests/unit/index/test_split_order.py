@@ -11,6 +11,7 @@ from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
 from ros2_memory.index.split_order import split_names_of, split_of, stem_of, steps_of
+from ros2_memory.index.timeline import Timeline
 
 S = 10**9
 
@@ -31,7 +32,7 @@ def in_parts(bags: list[BagFile], size: int) -> list[Segment]:
 
 
 def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
-    found = steps_of(in_parts(bags, size))
+    found = steps_of(Timeline(in_parts(bags, size)))
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
