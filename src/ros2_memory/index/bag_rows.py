@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, overloa
 import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
-from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.model import BagFile, BagState, folder_path
 from ros2_memory.index.split_order import split_names_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -175,9 +176,17 @@ class Bags(Sequence[BagFile]):
     def __getitem__(self, at: int | slice[int | None, int | None]) -> BagFile | list[BagFile]:
         if isinstance(at, slice):
             return [self[nth] for nth in range(len(self))[at]]
-        nth = range(len(self))[at]
+        part, row = self._row(range(len(self))[at])
+        return part[row]
+
+    def recording(self, at: int) -> Path:
+        """Returns the recording of a bag, which is not made for that."""
+        part, row = self._row(at)
+        return folder_path(part.folders[part.folder_of[row]] or "/")
+
+    def _row(self, nth: int) -> tuple[BagRows, int]:
         part = bisect_right(self._edges, nth) - 1
-        return self._parts[part][nth - self._edges[part]]
+        return self._parts[part], nth - self._edges[part]
 
 
 def _numbered(values: Iterable[T]) -> tuple[list[T], _Places]:
