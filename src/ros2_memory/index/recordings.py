@@ -24,7 +24,6 @@ from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.segment import folder_of
 from ros2_memory.index.split_order import split_of, stem_of
 
 if TYPE_CHECKING:
@@ -105,7 +104,7 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     A folder with a metadata.yaml is one recording, and so is one whose bags are
     named after it, or with a number alone.
     """
-    folders: dict[str, list[BagFile]] = {}
+    series: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
     for bags in (segment.bags for segment in snapshot.timeline.recorded_segments):
         # Those of one stem are alike in this.
@@ -116,17 +115,11 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
             for file in firsts
         ]
         for bag in bags.at(np.array(are_loose)[positions]):
-            folders.setdefault(folder_of(bag), []).append(bag)
-    recordings: dict[str, str] = {}
-    for in_folder in folders.values():
-        series: dict[str, list[BagFile]] = {}
-        for bag in in_folder:
             series.setdefault(_series_of(bag.file), []).append(bag)
-        for name, members in series.items():
-            are_splits = _are_splits(members)
-            recordings.update(
-                {bag.file: name if are_splits else stem_of(bag.file) for bag in members}
-            )
+    recordings: dict[str, str] = {}
+    for name, members in series.items():
+        are_splits = _are_splits(members)
+        recordings |= {bag.file: name if are_splits else stem_of(bag.file) for bag in members}
     return recordings
 
 

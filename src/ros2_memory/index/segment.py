@@ -146,9 +146,9 @@ class Segment:
         """The bag that ends last."""
         return self.bags[int(self.bags.ends.argmax())]
 
-    def overlapping(self, window: TimeWindow) -> list[BagFile]:
-        """Returns the bags whose span overlaps a window, in order."""
-        return [*self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))]
+    def overlapping(self, window: TimeWindow) -> Iterator[BagFile]:
+        """Yields the bags whose span overlaps a window, in order."""
+        return self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))
 
     @cached_property
     def recorded(self) -> Segment | None:
