@@ -439,11 +439,6 @@ def _added(
     )
 
 
-def folder_of(bag: BagFile) -> str:
-    """Returns the folder of a bag: that of its recording, as a string."""
-    return bag.file[: bag.file.rfind("/")]
-
-
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
     """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
     _, firsts, lasts = numbers.transpose(2, 0, 1)
