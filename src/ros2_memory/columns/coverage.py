@@ -97,10 +97,18 @@ class Coverage:
 
     def bag(self, number: int) -> BagFile | None:
         """Returns the bag of a number; None where it is none of the timeline."""
+        at = self._position(number)
+        return None if at is None else self._bags[at]
+
+    def recording(self, number: int) -> Path | None:
+        """Returns the recording of the bag of a number, as `bag`."""
+        at = self._position(number)
+        return None if at is None else self._bags.recording(at)
+
+    def _position(self, number: int) -> int | None:
         at = int(self._numbers.searchsorted(number))
-        if at == self._numbers.size or self._numbers[at] != number:
-            return None
-        return self._bags[int(self._order[at])]
+        is_there = at < self._numbers.size and self._numbers[at] == number
+        return int(self._order[at]) if is_there else None
 
     def unhashed(self) -> list[BagFile]:
         """Returns the stored bags of which copies cannot be recognised."""

@@ -45,6 +45,7 @@ _FEW: Final = 256
 """Shorter arrays are stored as they are: to unpack one takes longer than to read it."""
 _TUPLE, _BYTES, _ARRAY, _ROWS, _COLUMN = -1, -2, -3, -4, -5
 _NUMBERS: Final = {int: "<i8", float: "<f8"}
+_PLAIN: Final = frozenset({int, float, bool, type(None)})
 
 log = get_logger(__name__)
 
@@ -160,8 +161,10 @@ def _restored(value: object, classes: Sequence[type], tail: BytesIO) -> object:
             none, dtype = array
             return _with_none(np.frombuffer(packed, dtype).tolist(), none)
         return packed if number == _BYTES else _unpacked(packed, *array)
+    parts = rest
     # Most are numbers: to call for each would take half of the time.
-    parts = [part if type(part) in _NUMBERS else _restored(part, classes, tail) for part in rest]
+    if not _PLAIN.issuperset(map(type, rest)):
+        parts = [part if type(part) in _PLAIN else _restored(part, classes, tail) for part in rest]
     if number == _ROWS:
         none, kind, *columns = cast("list[Sequence[object]]", parts)
         return _rows(cast("Sequence[int]", none), kind, columns, classes)

@@ -282,10 +282,10 @@ class Scan:
     def recording_of(self, part: int) -> Path:
         """Returns the recording of a whole part of which all rows count."""
         assert self._coverage is not None  # noqa: S101 - there are no parts without one
-        bag = self._coverage.bag(int(self._head_of[part].bags[0]))
-        if bag is None:
+        recording = self._coverage.recording(int(self._head_of[part].bags[0]))
+        if recording is None:
             raise GoneError
-        return bag.recording
+        return recording
 
     @cached_property
     def _numbers(self) -> IntArray:

@@ -160,14 +160,14 @@ def numbers_of(
     if size == schema.numbers.size:
         whole = np.frombuffer(joined, "<i8").reshape(summaries, -1, 3)
         return whole[:, positions].swapaxes(0, 1)
-    base = np.ndarray((summaries, 1), "<i8", joined, 0, (size, 0))
+    base = np.ndarray((summaries,), "<i8", joined, 0, (size,))
     # Eight bytes each: a count and a first time, and a last time behind three bytes of that.
-    shape, strides = (len(schema.topics), summaries, 2), (_TOPIC_BYTES, size, _TIME_BYTES)
-    pairs = np.ndarray(shape, "<i8", joined, _BASE.size, strides)[[*positions]]
-    numbers: IntArray = np.empty((len(positions), summaries, 3), np.int64)
-    numbers[:, :, 0] = pairs[:, :, 0] & ((1 << 8 * _COUNT_BYTES) - 1)
-    numbers[:, :, 1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
-    return numbers
+    shape, strides = (2, len(schema.topics), summaries), (_TIME_BYTES, _TOPIC_BYTES, size)
+    pairs = np.ndarray(shape, "<i8", joined, _BASE.size, strides)[:, [*positions]]
+    numbers: IntArray = np.empty((3, len(positions), summaries), np.int64)
+    numbers[0] = pairs[0] & ((1 << 8 * _COUNT_BYTES) - 1)
+    numbers[1:] = base + (pairs.view("<u8") >> 8 * _COUNT_BYTES).view("<i8")
+    return numbers.transpose(1, 2, 0)
 
 
 def set_back_while_written(by: Ns) -> str:

@@ -173,7 +173,7 @@ class BagFile(NamedTuple):
     def recording(self) -> Path:
         """The directory of the rosbag2 recording that this file is a split of."""
         folder, slash, _ = self.file.rpartition("/")
-        return _folder(folder or slash)
+        return folder_path(folder or slash)
 
     def reaches_into(self, window: TimeWindow) -> bool:
         """Whether it may have messages in a window, as it begins and ends."""
@@ -182,7 +182,7 @@ class BagFile(NamedTuple):
 
 # Two caches, since a pass over all files would evict the folders.
 _path = lru_cache(maxsize=_CACHED_PATHS)(Path)
-_folder = lru_cache(maxsize=_CACHED_PATHS)(Path)
+folder_path = lru_cache(maxsize=_CACHED_PATHS)(Path)
 
 
 @dataclass(frozen=True, slots=True)

@@ -229,13 +229,13 @@ def _recordings_to_compare(view: View) -> list[tuple[str, Sequence[BagFile]]]:
     root = f"{view.bag_dir}/"
     bags_of: dict[str, Sequence[BagFile]] = {}
     newest: dict[str, str] = {}
-    for path, bags in recordings_of(view.snapshot).items():
+    holding = recordings_of(view.snapshot, lambda schema: any(map(schema.positions.get, topics)))
+    for path, bags in holding.items():
         folder, _, name = path.rpartition("/")
-        holding = [bag for bag in bags if any(map(bag.summary.schema.positions.get, topics))]
-        if holding and not is_kept_apart(path.removeprefix(root)):
-            bags_of[path] = holding
+        if not is_kept_apart(path.removeprefix(root)):
+            bags_of[path] = bags
             maker = folder if has_own_name(name) else path
-            if maker not in newest or bags_of[newest[maker]][0].start < holding[0].start:
+            if maker not in newest or bags_of[newest[maker]][0].start < bags[0].start:
                 newest[maker] = path
     ordered = sorted(newest.values(), key=lambda path: bags_of[path][0].start)
     return [(path, bags_of[path]) for path in ordered[-_MAX_TREES:]] if len(ordered) > 1 else []

@@ -277,6 +277,7 @@ class Sessions:
         chains = components(
             (folder, f"{folder.rpartition('/')[0]}/{name}")
             for folder, path in (paths.items() if len(paths) > 1 else ())
+            if str(path) in view.timeline.handed_over
             for name in view.memory.index.joined_with(path)
         )
         return _TransformSpans(

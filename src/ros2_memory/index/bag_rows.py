@@ -14,10 +14,12 @@ from typing import TYPE_CHECKING, Final, NamedTuple, TypeAlias, TypeVar, overloa
 import numpy as np
 
 from ros2_memory.core.bag_summary import BagSummary, SummarySchema
-from ros2_memory.core.model import BagFile, BagState
+from ros2_memory.core.model import BagFile, BagState, folder_path
+from ros2_memory.index.split_order import split_names_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Iterator
+    from pathlib import Path
 
     from numpy.typing import NDArray
 
@@ -49,6 +51,7 @@ class BagRows:
             the store; see `taken`.
 
     Attributes:
+        names: the paths of the bags.
         folders: where the bags lie, in the order of the bags.
         folder_of: by row, which of these.
         summaries: what the bags hold.
@@ -56,11 +59,10 @@ class BagRows:
 
     def __init__(self, bags: Iterable[BagFile], stored: tuple[int, Ints] | None = None) -> None:
         files, sizes, mtimes, states, summaries, starts, ends, sidecars = zip(*bags, strict=True)
-        folders = [file.rpartition("/")[0] for file in files]
-        self.folders, self.folder_of = _numbered(folders)
-        names = [file[len(folder) :] for file, folder in zip(files, folders, strict=True)]
-        self._names = "".join(names)
-        self._edges = np.fromiter(accumulate(map(len, names), initial=0), np.uint32)
+        self.names = split_names_of(files)
+        folders = (stem.series.rpartition("/")[0] for stem in self.names.stems)
+        self.folders, folder_of = _numbered(folders)
+        self.folder_of: _Places = folder_of[self.names.positions]
         kinds, self._kind_of = _numbered((id(known.schema), len(known.data)) for known in summaries)
         self._place_of = np.empty_like(self._kind_of)
         self.summaries: list[Summaries] = []
@@ -117,10 +119,15 @@ class BagRows:
 
     def files(self, rows: Rows = _ALL) -> list[str]:
         """Returns the paths of the bags, or of those of some rows."""
-        names, folders = self._names, self.folders
-        edges = (self._edges[:-1][rows].tolist(), self._edges[1:][rows].tolist())
-        of_rows = zip(self.folder_of[rows].tolist(), *edges, strict=True)
-        return [folders[folder] + names[begin:end] for folder, begin, end in of_rows]
+        stems, positions, numbers = self.names
+        return [
+            f"{series}{zeros}{number}{suffix}" if number >= 0 else f"{series}{suffix}"
+            for (series, zeros, suffix), number in zip(
+                map(stems.__getitem__, positions[rows].tolist()),
+                numbers[rows].tolist(),
+                strict=True,
+            )
+        ]
 
     def __len__(self) -> int:
         return len(self._kind_of)
@@ -169,9 +176,17 @@ class Bags(Sequence[BagFile]):
     def __getitem__(self, at: int | slice[int | None, int | None]) -> BagFile | list[BagFile]:
         if isinstance(at, slice):
             return [self[nth] for nth in range(len(self))[at]]
-        nth = range(len(self))[at]
+        part, row = self._row(range(len(self))[at])
+        return part[row]
+
+    def recording(self, at: int) -> Path:
+        """Returns the recording of a bag, which is not made for that."""
+        part, row = self._row(at)
+        return folder_path(part.folders[part.folder_of[row]] or "/")
+
+    def _row(self, nth: int) -> tuple[BagRows, int]:
         part = bisect_right(self._edges, nth) - 1
-        return self._parts[part][nth - self._edges[part]]
+        return self._parts[part], nth - self._edges[part]
 
 
 def _numbered(values: Iterable[T]) -> tuple[list[T], _Places]:

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from ros2_memory.index.segment import folder_of
-
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from pathlib import Path
 
     from ros2_memory.core.model import BagFile
     from ros2_memory.index.timeline import Timeline
@@ -31,9 +30,9 @@ def alike_among(timeline: Timeline) -> Iterator[tuple[BagFile, BagFile]]:
     edges = np.cumsum([len(segment.bags) for segment in timeline.segments])
     of_segments = zip(timeline.segments, np.split(are_suspects, edges), strict=False)
     suspects = chain.from_iterable(segment.bags.at(rows) for segment, rows in of_segments)
-    originals: dict[tuple[str, int, int, int], BagFile] = {}
+    originals: dict[tuple[Path, int, int, int], BagFile] = {}
     for bag in sorted(suspects, key=lambda bag: (len(bag.file), bag.file)):
-        original = originals.setdefault((folder_of(bag), bag.size, bag.start, bag.end), bag)
+        original = originals.setdefault((bag.recording, bag.size, bag.start, bag.end), bag)
         if original is not bag and original.summary == bag.summary:
             yield original, bag
 

@@ -13,22 +13,26 @@ from __future__ import annotations
 
 import re
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from ros2_memory.bag_dir.layout import MOMENTS_FOLDER, is_thinned
+import numpy as np
+
+from ros2_memory.bag_dir.layout import MOMENTS_FOLDER
 from ros2_memory.core.bag_summary import OUT_OF_ORDER_NS
 from ros2_memory.core.memo import Key
 from ros2_memory.core.model import BAG_KINDS
 from ros2_memory.core.timebase import NS_PER_S, Ns
-from ros2_memory.index.segment import folder_of
 from ros2_memory.index.split_order import split_of, stem_of
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
+    from ros2_memory.core.bag_summary import SummarySchema
     from ros2_memory.core.model import BagFile
+    from ros2_memory.index.bag_rows import BagRows
+    from ros2_memory.index.segment import Segment
     from ros2_memory.index.snapshot import Snapshot
 
 _OF_NAME: Final = rf"(?:/.*|(?:_\d+)?(?:{'|'.join(map(re.escape, BAG_KINDS))}))?"
@@ -54,16 +58,32 @@ def paths_named(path: str) -> re.Pattern[str]:
     return re.compile(re.escape(path) + _OF_NAME)
 
 
-def recordings_of(snapshot: Snapshot) -> dict[str, list[BagFile]]:
+def recordings_of(
+    snapshot: Snapshot, is_wanted: Callable[[SummarySchema], object] = lambda _: True
+) -> dict[str, list[BagFile]]:
     """Returns the bags of each recording, by its path: a folder, or that of a bag less its suffix.
 
-    With `data.recording` each of these names, below the bag directory, is one recording.
+    With `data.recording` each of these names, below the bag directory, is one recording. Only the
+    bags with a schema that `is_wanted`.
     """
-    loose = loose_bags(snapshot)
     recordings: dict[str, list[BagFile]] = {}
-    for bag in snapshot.bags:
-        recordings.setdefault(loose.get(bag.file) or folder_of(bag), []).append(bag)
+    for bags, paths in _with_recordings(snapshot, snapshot.timeline.recorded_segments):
+        rows = np.flatnonzero(bags.with_schema(is_wanted))
+        for row, bag in zip(rows.tolist(), bags.at(rows), strict=True):
+            recordings.setdefault(paths[row], []).append(bag)
     return recordings
+
+
+def _with_recordings(
+    snapshot: Snapshot, segments: Iterable[Segment]
+) -> Iterator[tuple[BagRows, Sequence[str]]]:
+    """Yields the bags of segments, and of each one the path of its recording."""
+    loose = loose_bags(snapshot)
+    for bags in (segment.bags for segment in segments):
+        paths = [bags.folders[nth] for nth in bags.folder_of.tolist()]
+        if loose:
+            paths = [*map(loose.get, bags.files(), paths)]
+        yield bags, paths
 
 
 def name_of(path: str, bags: Sequence[BagFile], root: str) -> str:
@@ -84,22 +104,22 @@ def loose_bags(snapshot: Snapshot) -> dict[str, str]:
     A folder with a metadata.yaml is one recording, and so is one whose bags are
     named after it, or with a number alone.
     """
-    folders: dict[str, list[BagFile]] = {}
+    series: dict[str, list[BagFile]] = {}
     whole = {*snapshot.metadata_folders}
-    for bag in snapshot.bags:
-        folder = folder_of(bag)
-        if folder not in whole and not is_named_after_folder(bag.file):
-            folders.setdefault(folder, []).append(bag)
-    recordings: dict[str, str] = {}
-    for bags in folders.values():
-        series: dict[str, list[BagFile]] = {}
-        for bag in bags:
+    for bags in (segment.bags for segment in snapshot.timeline.recorded_segments):
+        # Those of one stem are alike in this.
+        positions = bags.names.positions
+        firsts = bags.files(np.unique(positions, return_index=True)[1])
+        are_loose = [
+            file.rpartition("/")[0] not in whole and not is_named_after_folder(file)
+            for file in firsts
+        ]
+        for bag in bags.at(np.array(are_loose)[positions]):
             series.setdefault(_series_of(bag.file), []).append(bag)
-        for name, members in series.items():
-            are_splits = _are_splits(members)
-            recordings.update(
-                {bag.file: name if are_splits else stem_of(bag.file) for bag in members}
-            )
+    recordings: dict[str, str] = {}
+    for name, members in series.items():
+        are_splits = _are_splits(members)
+        recordings |= {bag.file: name if are_splits else stem_of(bag.file) for bag in members}
     return recordings
 
 
@@ -179,27 +199,26 @@ class _Overlap(NamedTuple):
 
 def _sweep(snapshot: Snapshot) -> tuple[dict[str, Ns], dict[tuple[str, str], _Overlap]]:
     """Returns how long each recording is, and where two of them have bags at once."""
-    misdated, loose = snapshot.dating.misdated, loose_bags(snapshot)
     lengths: dict[str, Ns] = {}
     overlaps: dict[tuple[str, str], _Overlap] = {}
     ends: dict[str, Ns] = {}  # of the recordings that may last into the next bag
-    for bag in snapshot.bags:
-        if bag.file in misdated or is_thinned(bag.file):
-            continue
-        recording, start = loose.get(bag.file) or folder_of(bag), bag.start
-        if _IN_MOMENTS in recording:
-            recording = _recorded_folder(recording)
+    bags_of_segments = (
+        zip(paths, bags.starts.tolist(), bags.ends.tolist(), strict=True)
+        for bags, paths in _with_recordings(snapshot, snapshot.whole_segments)
+    )
+    for path, start, end in chain.from_iterable(bags_of_segments):
+        recording = _recorded_folder(path) if _IN_MOMENTS in path else path
         for other in [name for name in ends if name != recording]:
             if ends[other] <= start:
                 del ends[other]
                 continue
             pair = (min(other, recording), max(other, recording))
             overlap = overlaps.get(pair, _Overlap(start, start, 0))
-            overlaps[pair] = overlap.extended(start, min(ends[other], bag.end))
-        before = ends.get(recording, bag.end)
-        added = bag.end - max(start, ends.get(recording) or start)
+            overlaps[pair] = overlap.extended(start, min(ends[other], end))
+        before = ends.get(recording)
+        added = end - max(start, before or start)
         lengths[recording] = lengths.get(recording, 0) + max(added, 0)
-        ends[recording] = max(before, bag.end)
+        ends[recording] = max(before or end, end)
     return lengths, overlaps
 
 

@@ -21,14 +21,7 @@ from ros2_memory.core.model import BagFile, BagState, TimeWindow
 from ros2_memory.core.timebase import MAX_NS, MIN_NS, NS_PER_MS, NS_PER_S, Ns
 from ros2_memory.index.bag_rows import BagRows
 from ros2_memory.index.holes import Pause, pauses_between
-from ros2_memory.index.split_order import (
-    Series,
-    SplitNames,
-    SplitRange,
-    StepBack,
-    split_names_of,
-    split_ranges_of,
-)
+from ros2_memory.index.split_order import StepBack
 from ros2_memory.messages.levels import FOXGLOVE_LOGS
 
 if TYPE_CHECKING:
@@ -153,9 +146,9 @@ class Segment:
         """The bag that ends last."""
         return self.bags[int(self.bags.ends.argmax())]
 
-    def overlapping(self, window: TimeWindow) -> list[BagFile]:
-        """Returns the bags whose span overlaps a window, in order."""
-        return [*self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))]
+    def overlapping(self, window: TimeWindow) -> Iterator[BagFile]:
+        """Yields the bags whose span overlaps a window, in order."""
+        return self.bags.at((self.bags.starts < window.stop) & (self.bags.ends >= window.start))
 
     @cached_property
     def recorded(self) -> Segment | None:
@@ -187,11 +180,6 @@ class Segment:
         return int(self.bags.sizes.sum()), int(left_open.sum())
 
     @cached_property
-    def split_names(self) -> SplitNames:
-        """What the names of the bags say."""
-        return split_names_of(self.bags.files())
-
-    @cached_property
     def folder_spans(self) -> dict[str, Span]:
         """By folder, the log times of the first and last message (inclusive) of its bags."""
         _, firsts, lasts = _added(self._by_folder, [0], axis=0)[0].T.tolist()
@@ -205,9 +193,11 @@ class Segment:
         return {folder: Tally(*row) for folder, row in zip(self.bags.folders, rows, strict=True)}
 
     @cached_property
-    def split_ranges(self) -> dict[Series, SplitRange]:
-        """Which splits of each recording are among the bags, by their number."""
-        return split_ranges_of(self)
+    def handed_over(self) -> frozenset[str]:
+        """The folders with a `handover.json`."""
+        _, _, sidecars = self.bags.contents.T
+        folders = np.unique(self.bags.folder_of[sidecars != 0]).tolist()
+        return frozenset(map(self.bags.folders.__getitem__, folders))
 
     @cached_property
     def faulty(self) -> tuple[BagFile, ...]:
@@ -315,7 +305,8 @@ class Segment:
 
         The bags are in the order of `_order`.
         """
-        numbers = np.empty((len(headers), len(self.bags), 3), np.int64)
+        # Counts beside counts, and times beside times: so they are added up at once.
+        numbers = np.empty((3, len(headers), len(self.bags)), np.int64).transpose(1, 2, 0)
         end = 0
         for schema, bags, joined in self.bags.summaries:
             begin, end = end, end + bags.size
@@ -448,11 +439,6 @@ def _added(
     )
 
 
-def folder_of(bag: BagFile) -> str:
-    """Returns the folder of a bag: that of its recording, as a string."""
-    return bag.file[: bag.file.rfind("/")]
-
-
 def _runs(numbers: NDArray[np.int64]) -> Iterator[tuple[Span, ...]]:
     """Yields the runs of each topic, by count, first and last; see `analysis.silences`."""
     _, firsts, lasts = numbers.transpose(2, 0, 1)
@@ -473,8 +459,10 @@ def _spacings(counts: NDArray[np.int64], spans: NDArray[np.int64]) -> list[dict[
     octaves = np.maximum(np.log2(spans / intervals) * _PER_OCTAVE, 0).astype(np.int64)
     keys = topics * _OCTAVES + octaves
     sums = np.zeros((3, len(counts) * _OCTAVES), np.int64)
+    # Mostly the next bag has the same key.
+    begins = np.flatnonzero(np.diff(keys, prepend=-1))
     for added, values in zip(sums, (np.ones_like(spans), spans, intervals), strict=True):
-        np.add.at(added, keys, values)
+        np.add.at(added, keys[begins], np.add.reduceat(values, begins))
     spacings: list[dict[int, Spacing]] = [{} for _ in counts]
     there = np.flatnonzero(sums[0])
     for key, spacing in zip(there.tolist(), sums[:, there].T.tolist(), strict=True):

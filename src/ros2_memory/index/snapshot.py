@@ -110,7 +110,7 @@ class Snapshot:
         """What the dates and the order of all bags show about the clocks that dated them."""
         recorded = self.timeline.recorded_segments
         within = chain.from_iterable(segment.set_back for segment in recorded)
-        between = steps_of(self.timeline.segments)
+        between = steps_of(self.timeline)
         return check_dates(self.timeline, [*between, *within], self.scanned_at)
 
     @cached_property
@@ -119,15 +119,15 @@ class Snapshot:
         return dated_segments(self.timeline.recorded_segments, self.dating.faults)
 
     @property
-    def _whole_segments(self) -> Iterator[Segment]:
-        """Those bags that have every message that was recorded."""
+    def whole_segments(self) -> Iterator[Segment]:
+        """The bags that a correct clock dated, and that have every message that was recorded."""
         return filter(None, (segment.unthinned for segment in self._dated_segments))
 
     @cached_property
     def _periods(self) -> dict[str, Ns]:
         """The usual period of each topic; not of logs, whose lines come when something happens."""
         by_topic: dict[str, list[Pacing]] = {}
-        for segment in self._whole_segments:
+        for segment in self.whole_segments:
             for topic, pacing in segment.pacings.items():
                 by_topic.setdefault(topic, []).append(pacing)
         is_log = self.timeline.is_log
@@ -139,7 +139,7 @@ class Snapshot:
     def _runs(self) -> dict[str, Spans]:
         """By topic, when bags hold it; see `silences`."""
         by_topic: dict[str, list[tuple[Ns, Ns]]] = {}
-        for segment in self._whole_segments:
+        for segment in self.whole_segments:
             for topic, runs in segment.runs.items():
                 by_topic.setdefault(topic, []).extend(runs)
         return {topic: united(runs, SHORTEST_NS) for topic, runs in by_topic.items()}

@@ -135,6 +135,11 @@ class Timeline:
         return self._recordings[topic]
 
     @cached_property
+    def handed_over(self) -> frozenset[str]:
+        """The folders of bags with a `handover.json`; of those of a lake all."""
+        return frozenset(chain.from_iterable(segment.handed_over for segment in self.segments))
+
+    @cached_property
     def bags(self) -> Bags:
         """All bags, in order."""
         return Bags(segment.bags for segment in self.segments)

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from ros2_memory.core.bag_summary import BagSummary, TopicSummary
 from ros2_memory.core.model import BagFile, BagState
 from ros2_memory.index.segment import Segment
-from ros2_memory.index.split_order import split_names_of, split_of, steps_of
+from ros2_memory.index.split_order import split_names_of, split_of, stem_of, steps_of
+from ros2_memory.index.timeline import Timeline
 
 S = 10**9
 
@@ -31,7 +32,7 @@ def in_parts(bags: list[BagFile], size: int) -> list[Segment]:
 
 
 def steps(bags: list[BagFile], size: int = 256) -> list[tuple[str, str, int]]:
-    found = steps_of(in_parts(bags, size))
+    found = steps_of(Timeline(in_parts(bags, size)))
     return [(step.before.path.name, step.after.path.name, step.by) for step in found]
 
 
@@ -67,9 +68,9 @@ def test_steps_are_those_between_neighbours_however_the_history_is_parted(
 )
 def test_the_names_of_bags_say_together_what_each_says_alone(names: list[str]) -> None:
     bags = [bag(name, 0, 1) for name in names]
-    series, positions, numbers = split_names_of(bag.file for bag in bags)
-    said = [(series[at], number) for at, number in zip(positions, numbers, strict=True)]
-    assert said == [split_of(bag.file) or (bag.file, -1) for bag in bags]
+    stems, positions, numbers = split_names_of(bag.file for bag in bags)
+    said = [(stems[at].series, number) for at, number in zip(positions, numbers, strict=True)]
+    assert said == [split_of(bag.file) or (stem_of(bag.file), -1) for bag in bags]
 
 
 def test_dates_with_microseconds_are_numbers_of_splits() -> None:
