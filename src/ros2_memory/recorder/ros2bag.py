@@ -63,8 +63,7 @@ class Ros2BagRecorder(Recorder):
             recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
-        required: topics without which recording counts as failed: a name or a glob in `topic`, and
-            in `min_hz` the least messages a second.
+        required: topics without which recording counts as failed.
         chunk_bytes: size of an MCAP chunk before compression.
         housekeeper: repairs and deletes.
         own: the list of the recordings that were made here.
@@ -87,7 +86,7 @@ class Ros2BagRecorder(Recorder):
         setup_files: Sequence[Path],
         latched_topics: Sequence[str],
         repeat_latched: Sequence[str],
-        required: Sequence[Mapping[str, str | float]],
+        required: Sequence[Required],
         chunk_bytes: int,
         housekeeper: Housekeeping,
         own: OwnRecordings,
@@ -102,8 +101,7 @@ class Ros2BagRecorder(Recorder):
         self._chunk_bytes = chunk_bytes
         self._keep_open = tuple(keep_open)
         self._checked = False
-        wanted = [Required(str(entry["topic"]), float(entry["min_hz"])) for entry in required]
-        topics = (entry.topic for entry in wanted if "*" not in entry.topic)
+        topics = (entry.topic for entry in required if "*" not in entry.topic)
         by_setting = dict.fromkeys(topics, "recording.required")
         self._topics = TopicsFile(topics_file, {**by_setting, **excluding})
         self._ros = Installation("ros2", {}, frozenset())
@@ -129,7 +127,7 @@ class Ros2BagRecorder(Recorder):
             own=own,
             reception=self._reception,
             background=background,
-            required=wanted,
+            required=required,
             simulated=use_sim_time,
             advice=lambda: advice_on_silence(self._ros.env),
         )
