@@ -57,7 +57,6 @@ class Sources:
     """Returns, called with a key such as `server.port`, who set it: a phrase that follows "set".
 
     Args:
-        folder: the configuration directory.
         overrides: the assignments of variables and overrides; later wins.
         appended: by key, the variable that appends to what is set otherwise.
     """
@@ -161,11 +160,6 @@ def parse_overrides(
     command_line: Sequence[str], given: Mapping[str, str], folder: Path
 ) -> list[Override]:
     """Returns the assignments of variables and of the command line; later wins.
-
-    Args:
-        command_line: assignments in Hydra's grammar.
-        given: the environment, without empty variables.
-        folder: the configuration directory.
 
     Raises:
         ConfigError: one of them is not an assignment, holds a token, or names no option of a group.

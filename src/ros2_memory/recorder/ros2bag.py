@@ -50,26 +50,12 @@ class Ros2BagRecorder(Recorder):
     """Records with `ros2 bag record`, and keeps it recording while `tick` is called.
 
     Args:
-        reader: reads splits that are closed.
-        bag_dir: where to record; it is made where it does not exist.
-        topics_file: `topics.yaml`, see `process.topics`.
-        split_duration_s: length of one bag file, whole seconds.
-        session_duration_s: how long one recording lasts before the next takes over.
-        use_sim_time: whether log times come from `/clock`.
-        queue_mb: what the queues of all topics together may take, in MiB.
-        min_free_gb: what must be free on the disk for recording to continue, in 10^9 bytes.
-        setup_files: bash files that make the ROS environment.
         latched_topics: topics whose publishers are transient local; all of their messages are
             recorded, however many there are.
         repeat_latched: `topic` or `topic=depth`, whose last messages begin every split, if the
             distribution can do that. Their log times may lie long before the split.
-        required: topics without which recording counts as failed.
-        chunk_bytes: size of an MCAP chunk before compression.
-        housekeeper: repairs and deletes.
-        own: the list of the recordings that were made here.
         keep_open: file descriptors that `ros2 bag record` inherits.
         excluding: the topics by which `recording.exclude_when` excludes, each with its rule.
-        background: does what takes a while, of the housekeeper, too.
     """
 
     def __init__(
